@@ -40,24 +40,24 @@ ID = "SSAD/Driving-v0"
 def episodes_of(
     scenarios: str | Path | Sequence[str | Path], *, seed: int = 0
 ) -> tuple[list[Episode], Mapping[str, LaneGraph]]:
-    """Concrete episodes of scenario sets, and the lane graphs of their towns.
+    """Build concrete episodes of scenario sets, and load the lane graphs of their towns.
 
     Args:
         scenarios: Names of sets or files.
         seed: Seed of the episodes.
 
     Returns:
-        The episodes; and lane graphs by the name of the town.
+        The episodes, and lane graphs by name of the town.
 
     Raises:
-        UnknownNameError: There is no such set, file or town.
+        UnknownNameError: A set, file or town does not exist.
         ConfigError: A scenario is not valid.
         RouteError: An episode cannot be built.
     """
-    refs = [scenarios] if isinstance(scenarios, (str, Path)) else list(scenarios)
-    found = [scenario for ref in refs for scenario in load_scenarios(ref)]
-    graphs = {town: _town(town) for town in sorted({s.town for s in found})}
-    return [_built(s, graphs[s.town], seed) for s in found], graphs
+    references = [scenarios] if isinstance(scenarios, (str, Path)) else list(scenarios)
+    loaded = [scenario for reference in references for scenario in load_scenarios(reference)]
+    graphs = {town: _town(town) for town in sorted({member.town for member in loaded})}
+    return [_built(member, graphs[member.town], seed) for member in loaded], graphs
 
 
 MOST_EPISODES = 5000  # kept in a process
@@ -65,7 +65,7 @@ _episodes: dict[str, Episode] = {}
 
 
 def _built(scenario: Scenario, graph: LaneGraph, seed: int) -> Episode:
-    """The episode of a scenario, built once a process."""
+    """Return the episode of a scenario, built once per process."""
     key = digest("episode", safeio.dump_json(asdict(scenario)), seed, id(graph))
     if key not in _episodes:
         if len(_episodes) >= MOST_EPISODES:
@@ -80,7 +80,7 @@ def _town(name: str) -> LaneGraph:
 
 
 def make(*, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, **options: Any) -> SingleEnv:
-    """One scene; `options` go to `ssad.world.env.SingleEnv` (observation, action, device)."""
+    """Return a single environment; `options` go to `ssad.world.env.SingleEnv` (observation, action, device)."""
     from ssad.world.env import SingleEnv
 
     return SingleEnv(*episodes_of(scenarios, seed=episode_seed), **{"policies": make_system} | options)
@@ -89,9 +89,10 @@ def make(*, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, 
 def make_vec(
     *, num_envs: int = 1, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, **options: Any
 ) -> VectorEnv:
-    """`num_envs` scenes in one batch; `options` go to `ssad.world.env.VectorEnv`."""
+    """Return `num_envs` scenes in one batch; `options` go to `ssad.world.env.VectorEnv`."""
     from ssad.world.env import VectorEnv
 
+    # gymnasium.make_vec passes it; all scenes are already one batch.
     options.pop("vectorization_mode", None)
     return VectorEnv(*episodes_of(scenarios, seed=episode_seed), num_envs, **{"policies": make_system} | options)
 
@@ -99,7 +100,11 @@ def make_vec(
 def make_sb3(
     *, num_envs: int = 1, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, **options: Any
 ) -> SB3VecEnv:
-    """`num_envs` scenes as a `VecEnv` of stable-baselines3; `options` as for `make_vec`. ConfigError without it."""
+    """Return `num_envs` scenes as a stable-baselines3 `VecEnv`; `options` as for `make_vec`.
+
+    Raises:
+        ConfigError: stable-baselines3 is not installed.
+    """
     try:
         from ssad.world.sb3 import SB3VecEnv
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""`ssad export SCENARIO... OUT` and the imports of other formats."""
+"""Commands of `ssad export SCENARIO... OUT` and of the imports of other formats."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 
 
 class Format(StrEnum):
-    """What scenarios can be exported to."""
+    """Formats to which scenarios can be exported."""
 
     openscenario = "openscenario"
     leaderboard = "leaderboard"
@@ -27,7 +27,7 @@ class ExportGroup(TyperGroup):
     """Commands of `ssad export`; arguments that begin with none of them are scenarios."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the name of the command for scenarios where it was left out."""
+        """Insert the name of the command for scenarios if it was left out."""
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
             args = ["scenarios", *args]
         return super().parse_args(ctx, args)
@@ -61,16 +61,16 @@ def export_scenarios(
     from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1
     from ssad.scenarios.dynamic import load_scenarios
 
-    chosen = [scenario for ref in scenarios for scenario in load_scenarios(ref)]
+    selected = [scenario for reference in scenarios for scenario in load_scenarios(reference)]
     writers: dict[Format, Callable[..., tuple[list[Path], list[str]]]] = {
         Format.openscenario: export_openscenario,
         Format.leaderboard: export_leaderboard,
         Format.leaderboard1: export_leaderboard1,
         Format.commonroad: partial(export_commonroad, system=system),
     }
-    written, lost = writers[to](chosen, out, seed=seed)
-    print(f"{len(chosen)} scenarios: {len(written)} files written to {out}")
-    told("not carried over", lost)
+    files, omissions = writers[to](selected, out, seed=seed)
+    print(f"{len(selected)} scenarios: {len(files)} files written to {out}")
+    told("not carried over", omissions)
 
 
 def import_openscenario(
@@ -85,11 +85,11 @@ def import_openscenario(
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
-    found = read_openscenario(file, map_name=on)
-    save_scenarios(out, found.scenario)
-    scenario = found.scenario
+    imported = read_openscenario(file, map_name=on)
+    save_scenarios(out, imported.scenario)
+    scenario = imported.scenario
     print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
-    told("not carried over", found.lost)
+    told("not carried over", imported.lost)
 
 
 def import_leaderboard(
@@ -104,10 +104,12 @@ def import_leaderboard(
     from ssad.scenarios.dynamic import save_scenarios
 
     check_yaml(out)
-    found, lost = read_leaderboard(file)
-    save_scenarios(out, found)
-    print(f"{len(found)} scenarios on {', '.join(sorted({s.town for s in found}))}; written to {out}")
-    told("not carried over", lost)
+    imported, omissions = read_leaderboard(file)
+    save_scenarios(out, imported)
+    print(
+        f"{len(imported)} scenarios on {', '.join(sorted({scenario.town for scenario in imported}))}; written to {out}"
+    )
+    told("not carried over", omissions)
 
 
 def import_commonroad(
@@ -128,16 +130,16 @@ def import_commonroad(
     from ssad.world.roads import import_map, town_names
 
     check_yaml(out)
-    found = read_commonroad(file, town=out.stem, map_name=on)
-    town = found.scenario.town
-    if not found.known:
+    imported = read_commonroad(file, town=out.stem, map_name=on)
+    town = imported.scenario.town
+    if not imported.known:
         if town_names().get(town) == "built-in":
             raise ConfigError(f"'{town}' is a built-in town; choose another name for {out}")
-        save_graph(found.graph, out.with_suffix(".npz"))
+        save_graph(imported.graph, out.with_suffix(".npz"))
         import_map(out.with_suffix(".npz"), town, home())
-    save_scenarios(out, found.scenario)
-    print(f"scenario {found.scenario.name}: {len(found.scenario.actors)} actors in {town}; written to {out}")
-    told("not carried over", found.lost)
+    save_scenarios(out, imported.scenario)
+    print(f"scenario {imported.scenario.name}: {len(imported.scenario.actors)} actors in {town}; written to {out}")
+    told("not carried over", imported.lost)
 
 
 def import_scenic(
@@ -160,35 +162,35 @@ def import_scenic(
 
     check_yaml(out)
     program = load_program(file, on)
-    found = []
-    failed: list[str] = []
-    lost: list[str] = []
-    for number in range(seed, seed + count):
+    sampled = []
+    failures: list[str] = []
+    omissions: list[str] = []
+    for sample_seed in range(seed, seed + count):
         try:
-            drawn = sample(program, number, steps=steps)
+            program_sample = sample(program, sample_seed, steps=steps)
         except MissingExtraError:
             raise
         except SSADError as error:
-            failed.append(str(error))
+            failures.append(str(error))
             continue
-        found.append(drawn.scenario)
-        lost += drawn.lost
-    if not found:
-        raise ConfigError(failed[0])
-    save_scenarios(out, found)
-    print(f"{len(found)} scenarios in {program.town}; written to {out}")
-    told("not sampled", failed)
-    told("not carried over", lost)
+        sampled.append(program_sample.scenario)
+        omissions += program_sample.lost
+    if not sampled:
+        raise ConfigError(failures[0])
+    save_scenarios(out, sampled)
+    print(f"{len(sampled)} scenarios in {program.town}; written to {out}")
+    told("not sampled", failures)
+    told("not carried over", omissions)
 
 
 def check_yaml(out: Path) -> None:
-    """ConfigError where a scenario file would not end in .yaml."""
+    """Raise ConfigError if a scenario file does not end in .yaml."""
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a scenario file ends in .yaml")
 
 
 def told(what: str, lines: Sequence[str]) -> None:
     """Print lines under a heading, each once, with how often it came."""
-    counted = {line: lines.count(line) for line in lines}
-    for line, count in counted.items():
+    line_counts = {line: lines.count(line) for line in lines}
+    for line, count in line_counts.items():
         print(f"{what}: {line}{f' ({count} scenarios)' if count > 1 else ''}")

@@ -1,4 +1,4 @@
-"""`ssad shift` and `ssad score`: parse the options, show progress, print the outcome."""
+"""`ssad shift` and `ssad score`: parse the options, show progress, print the result."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
 
 
 def severities(text: str) -> tuple[Strength, ...]:
-    """Severities from the text of --severity, such as "1,3" or "random".
+    """Parse the severities of --severity, such as "1,3" or "random".
 
     Raises:
-        ConfigError: The text is neither.
+        ConfigError: A part is neither a severity nor "random".
     """
-    found: list[Strength] = []
-    for part in (p.strip() for p in text.split(",")):
-        if part == "random":
-            found.append("random")
-        elif part in ("0", "1", "2", "3", "4", "5"):
-            found.append(int(part))
+    result: list[Strength] = []
+    for word in (item.strip() for item in text.split(",")):
+        if word == "random":
+            result.append("random")
+        elif word in ("0", "1", "2", "3", "4", "5"):
+            result.append(int(word))
         else:
             raise ConfigError(f"--severity {text}: expected comma-separated numbers from 1 to 5, or random")
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(result))
 
 
 def shift_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The shifts of --shifts; ["all"] means those of the paper.
+    """Resolve the names of --shifts; ["all"] means the shifts of the paper.
 
     Raises:
-        UnknownNameError: There is no such shift.
+        UnknownNameError: A shift does not exist.
     """
     if list(names) == ["all"]:
         return tuple(SHIFTS)
@@ -74,7 +74,7 @@ def shift_folder(
         shifts: See `shift_names`.
         severity: See `severities`.
         version: Version of the dataset; None: the only one.
-        split: Split whose scenes are written; None: none is chosen.
+        split: Split whose scenes are written; None: no split.
         scenes: Names of the scenes.
         workers: See `materialise`.
         ray: See `materialise`.
@@ -89,38 +89,39 @@ def shift_folder(
         StoreError: See `materialise`.
     """
     with NuScenes(source, version) as data:
-        chosen = tuple(scenes) or (tuple(scenes_of_split(source, data.version, split)) if split else ())
+        scene_names = tuple(scenes) or (tuple(scenes_of_split(source, data.version, split)) if split else ())
         version = data.version
         if split:
-            known = {record.name for record in data.scenes()}
-            chosen = tuple(name for name in chosen if name in known)
-            if not chosen:
+            # An official split may name scenes that this version does not have.
+            available = {record.name for record in data.scenes()}
+            scene_names = tuple(name for name in scene_names if name in available)
+            if not scene_names:
                 raise ConfigError(
                     f"{source}: version {version} has no scene of the split '{split}'; choose another --split"
                 )
-    options = Options(source, out, version, shift_names(shifts), severities(severity), scenes=chosen, **settings)
+    options = Options(source, out, version, shift_names(shifts), severities(severity), scenes=scene_names, **settings)
     try:
-        with Live("shift", 1, 0, console=Console(stderr=True), unit="scenes") as live:
-            written = materialise(options, workers=workers, ray=ray, progress=live.show)
+        with Live("shift", 1, 0, console=Console(stderr=True), unit="scenes") as display:
+            roots = materialise(options, workers=workers, ray=ray, progress=display.show)
     except KeyboardInterrupt:
         print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
         return 130
-    failed = 0
-    for root in written:
-        failed += root.failed
-        line = f"{root.root}: {root.shifted} files shifted, {root.linked} linked unchanged, "
-        line += f"{100 * root.applied:.0f} % of the images changed"
-        print(line + (f", {root.failed} failed" if root.failed else ""))
+    failure_count = 0
+    for root in roots:
+        failure_count += root.failed
+        report = f"{root.root}: {root.shifted} files shifted, {root.linked} linked unchanged, "
+        report += f"{100 * root.applied:.0f} % of the images changed"
+        print(report + (f", {root.failed} failed" if root.failed else ""))
         for reason in root.reasons[:3]:
             print(f"  {reason}")
         if len(root.reasons) > 3:
             print(f"  ... and {len(root.reasons) - 3} more: see {root.root / 'manifest'}")
-    if failed:
+    if failure_count:
         print(
-            f"{failed} files failed, so their roots are incomplete and cannot be scored; "
+            f"{failure_count} files failed, so their roots are incomplete and cannot be scored; "
             "fix these files in the dataset and repeat the command"
         )
-    return int(failed > 0)
+    return int(failure_count > 0)
 
 
 def shift_picture_folder(
@@ -133,11 +134,11 @@ def shift_picture_folder(
     ray: str | None,
     settings: Mapping[str, Any],
 ) -> int:
-    """Shift the pictures of a folder that is no nuScenes root, and print one line for each new folder.
+    """Shift the pictures of a folder that is not a nuScenes root, and print one line for each new folder.
 
     Args:
         source: The folder.
-        out: Folder of the new ones.
+        out: Folder of the new folders.
         shifts: See `shift_names`.
         severity: See `severities`.
         workers: See `shift_pictures`.
@@ -154,52 +155,56 @@ def shift_picture_folder(
         raise unknown_name("calibration", settings["calibration"], get_args(Calibration))
     if settings["subsampling"] not in SUBSAMPLING:
         raise unknown_name("subsampling", settings["subsampling"], SUBSAMPLING)
-    chosen, strengths = picture_shifts(shift_names(shifts)), severities(severity)
+    possible_shifts, strengths = picture_shifts(shift_names(shifts)), severities(severity)
     try:
-        with Live("shift", 1, 0, console=Console(stderr=True), unit="pictures") as live:
-            written = shift_pictures(
+        with Live("shift", 1, 0, console=Console(stderr=True), unit="pictures") as display:
+            folders = shift_pictures(
                 source,
                 out,
-                shifts=chosen,
+                shifts=possible_shifts,
                 severities=strengths,
                 settings=settings,
                 workers=workers,
                 ray=ray,
-                progress=live.show,
+                progress=display.show,
             )
     except KeyboardInterrupt:
         print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
         return 130
-    left_out = [name for name in shift_names(shifts) if name not in chosen]
-    if left_out:
-        print(f"left out, since they need boxes in space: {', '.join(left_out)}")
-    for one in written:
-        told = f"{one.root}: {one.shifted} pictures shifted, {one.linked} other files linked unchanged, "
-        told += f"{100 * one.applied:.0f} % of the pictures changed"
-        print(told + (f", {len(one.reasons)} failed" if one.reasons else ""))
-        for reason in one.reasons[:3]:
+    skipped_shifts = [name for name in shift_names(shifts) if name not in possible_shifts]
+    if skipped_shifts:
+        print(f"left out, since they need boxes in space: {', '.join(skipped_shifts)}")
+    for folder in folders:
+        report = f"{folder.root}: {folder.shifted} pictures shifted, {folder.linked} other files linked unchanged, "
+        report += f"{100 * folder.applied:.0f} % of the pictures changed"
+        print(report + (f", {len(folder.reasons)} failed" if folder.reasons else ""))
+        for reason in folder.reasons[:3]:
             print(f"  {reason}")
-    return int(any(one.reasons for one in written))
+    return int(any(folder.reasons for folder in folders))
 
 
 def verify_folder(out: Path) -> int:
-    """Compare a root, or all roots in a folder, with their manifests; exit code 1 if files differ.
+    """Compare a root, or all roots in a folder, with their manifests.
+
+    Returns:
+        The exit code: 1 if files differ.
 
     Raises:
-        StoreError: There is nothing to compare, or it cannot be read.
+        StoreError: The folder holds no root, or a root cannot be read.
     """
     roots = [out] if (out / PAGE).is_file() or (out / "manifest").is_dir() else sorted(out.glob("*/manifest"))
+    # An incomplete root has no manifest.json yet, so roots are found by their manifest folders.
     roots = [root.parent if root.name == "manifest" and root != out else root for root in roots]
     if not roots:
         raise StoreError(f"{out}: not written by ssad shift; give its OUT folder, or one root in it")
-    bad = 0
+    mismatch_count = 0
     for root in roots:
-        count, problems = verify(root)
-        bad += len(problems)
-        print(f"{root}: {count} files, {len(problems)} differ from the manifest")
+        file_count, problems = verify(root)
+        mismatch_count += len(problems)
+        print(f"{root}: {file_count} files, {len(problems)} differ from the manifest")
         for problem in problems[:5]:
             print(f"  {problem}")
-    return int(bad > 0)
+    return int(mismatch_count > 0)
 
 
 def write_contact_sheets(
@@ -219,10 +224,10 @@ def write_contact_sheets(
 
     Args:
         source: The image, or a nuScenes root.
-        out: Where the sheets are written.
+        out: Output folder of the sheets.
         version: Version of the dataset; None: the only one.
         channel: Name of the camera.
-        split: Must be None: a contact sheet is not of a split.
+        split: Must be None: a contact sheet has no split.
         scenes: Name of the scene, at most one, for a dataset; none: the first.
         boxes: Boxes in the image, see `parse_box`.
         severity: See `severities`; the first one is used.
@@ -243,47 +248,49 @@ def write_contact_sheets(
         raise unknown_name("calibration", calibration, get_args(Calibration))
     strength = severities(severity)[0]
     rectangles = [parse_box(text) for text in boxes]
-    level = 3 if strength == "random" else int(strength)
-    kind: Calibration = "paper" if calibration == "paper" else "physical"
-    first, second = write_sheets(
+    severity_level = 3 if strength == "random" else int(strength)
+    checked_calibration: Calibration = "paper" if calibration == "paper" else "physical"
+    shift_sheet, severity_sheet = write_sheets(
         source,
         out,
         version=version,
         channel=channel,
         scene=next(iter(scenes), None),
         boxes=rectangles,
-        severity=level,
+        severity=severity_level,
         seed=seed,
-        calibration=kind,
+        calibration=checked_calibration,
     )
-    print(f"all shifts: {first}\nall severities: {second}")
+    print(f"all shifts: {shift_sheet}\nall severities: {severity_sheet}")
 
 
 def checked(root: Path) -> Callable[[dict[str, Any], GroundTruth], dict[str, Any]]:
-    """A check for `score_results` that refuses to score clean data as shifted, or the other way round.
+    """Return a check for `score_results` that refuses to score clean data as shifted, or shifted data as clean.
 
-    A shifted root must match its manifest. If the results name the data that they were made from (`ssad_manifest` in
-    their meta), these must be the same data. The check returns what is known of the data.
+    A shifted root must match its manifest. Results may name the data they were made on (`ssad_manifest` in
+    their meta); these must then be the same data. The check returns a description of the data.
     """
 
     def check(meta: dict[str, Any], truth: GroundTruth) -> dict[str, Any]:
-        said = meta.get("ssad_manifest")
+        stated_digest = meta.get("ssad_manifest")
         if read_manifest(root) is None:
-            if said not in (None, "clean"):
+            if stated_digest not in (None, "clean"):
                 raise FormatError(
-                    f"the results were made on shifted data (manifest {said}), but {root} is a clean dataset; "
+                    f"the results were made on shifted data (manifest {stated_digest}), but {root} is a clean dataset; "
                     "give the shifted folder as --dataroot"
                 )
             return {"data": "clean"}
         manifest = check_manifest(root, truth.scenes)
-        mine = manifest_digest(root)
-        if said is not None and said != mine:
-            seen = "clean data" if said == "clean" else f"other data (manifest {said})"
+        actual_digest = manifest_digest(root)
+        if stated_digest is not None and stated_digest != actual_digest:
+            stated_data = "clean data" if stated_digest == "clean" else f"other data (manifest {stated_digest})"
             raise FormatError(
-                f"the results were made on {seen}, not on {root} (manifest {mine}); "
+                f"the results were made on {stated_data}, not on {root} (manifest {actual_digest}); "
                 "give the data that they were made on as --dataroot"
             )
         assert manifest is not None
-        return {"data": "shifted", "manifest": mine, "stated": said is not None} | dict(manifest["identity"])
+        return {"data": "shifted", "manifest": actual_digest, "stated": stated_digest is not None} | dict(
+            manifest["identity"]
+        )
 
     return check

@@ -1,4 +1,4 @@
-"""`ssad train`: one short function a command. Heavy imports are inside them, so that --help is quick."""
+"""`ssad train`: one short function per command. Heavy imports are local, so --help is fast."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Data types, protocols and small tools that every other package may use."""
+"""Data types, protocols and small tools shared by all other packages."""

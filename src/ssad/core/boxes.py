@@ -1,17 +1,17 @@
-"""3D boxes in the world, and the conventions of others by name.
+"""3D boxes in the world, and the box conventions of other formats.
 
 ================  ===================================  ==============================  ===========  ==========
-who               frame                                origin                          size         turn
+format            frame                                origin                          size         rotation
 ================  ===================================  ==============================  ===========  ==========
-`WorldBoxes`      world: x east, y north, z up         middle                          l, w, h      quaternion
-nuScenes          world                                middle                          w, l, h      quaternion
-`Solids`          camera: x right, y down, z forward   middle                          l, h, w      yaw
-mmdetection3d     camera                               middle of the bottom            l, h, w      yaw
-KITTI             camera                               middle of the bottom            h, w, l      rotation_y
+`WorldBoxes`      world: x east, y north, z up         centre                          l, w, h      quaternion
+nuScenes          world                                centre                          w, l, h      quaternion
+`Solids`          camera: x right, y down, z forward   centre                          l, h, w      yaw
+mmdetection3d     camera                               centre of the bottom            l, h, w      yaw
+KITTI             camera                               centre of the bottom            h, w, l      rotation_y
 ================  ===================================  ==============================  ===========  ==========
 
-Length lies along where the box looks, width to its left, height up. Yaw in the camera's frame turns about its y axis:
-0 looks along x, positive from z towards x; KITTI's rotation_y is the same.
+Length lies along the box's heading, width to its left, height up. Yaw in the camera's frame turns about its y axis:
+0 points along x, positive from z towards x; KITTI's rotation_y is the same.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64
 
-NEAR = 0.1  # m in front of a camera at which boxes are cut
+NEAR = 0.1  # m; corners nearer to the camera are moved there before projection
 UNIT_CORNERS: F64 = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
@@ -34,7 +34,7 @@ class WorldBoxes:
     """N boxes in the world, as columns.
 
     Attributes:
-        centre: Middle [N, 3], m.
+        centre: Centre [N, 3], m.
         size_lwh: Size along the box's x (forward), y (left) and z (up) [N, 3], m.
         rotation: Quaternions (w, x, y, z) of these axes [N, 4].
         velocity: [N, 2 or 3], m/s; NaN where unknown.
@@ -54,30 +54,30 @@ class WorldBoxes:
         return self.size_lwh[:, size_columns("lwh", "wlh")]
 
     def axes(self) -> F64:
-        """Axes [N, 3, 3] of the boxes as columns: forward, left, up."""
+        """Return the axes [N, 3, 3] of the boxes as columns: forward, left, up."""
         return quaternion_to_matrix(self.rotation)
 
     def corners(self) -> F64:
-        """Corners [N, 8, 3] in the order of `UNIT_CORNERS`."""
+        """Return the corners [N, 8, 3] in the order of `UNIT_CORNERS`."""
         local: F64 = UNIT_CORNERS * self.size_lwh[:, None]
         return np.asarray(np.einsum("nij,nkj->nki", self.axes(), local) + self.centre[:, None])
 
     def take(self, index: npt.NDArray[Any]) -> Self:
-        """The rows that `index` (positions or a mask) names."""
+        """Return the rows selected by `index` (positions or a mask)."""
         rows = np.arange(len(self))[index]
-        columns: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        columns: dict[str, Any] = {column_field.name: getattr(self, column_field.name) for column_field in fields(self)}
         for name, column in columns.items():
-            columns[name] = tuple(column[i] for i in rows) if isinstance(column, tuple) else column[rows]
+            columns[name] = tuple(column[row] for row in rows) if isinstance(column, tuple) else column[rows]
         return type(self)(**columns)
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedBoxes(WorldBoxes):
-    """Boxes of known objects.
+    """Boxes of identified objects.
 
     Attributes:
-        instance: who each is, over time and sensors.
-        visible: [N] least fraction that is seen over all cameras, 1 where unknown.
+        instance: Identity of each object, over time and sensors.
+        visible: [N] lower bound of the visible fraction over all cameras, 1 where unknown.
     """
 
     instance: tuple[str, ...]
@@ -85,7 +85,7 @@ class TrackedBoxes(WorldBoxes):
 
     @staticmethod
     def empty() -> TrackedBoxes:
-        """No boxes."""
+        """Return no boxes."""
         return TrackedBoxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), (), np.zeros(0))
 
 
@@ -103,9 +103,9 @@ def hulls(corners: F64, intrinsic: F64, size: tuple[int, int]) -> F64:
     """
     local = corners.copy()
     local[..., 2] = np.maximum(local[..., 2], NEAR)
-    flat = local @ intrinsic.T
-    place = flat[..., :2] / flat[..., 2:]
-    return np.concatenate([np.clip(place.min(1), 0, size), np.clip(place.max(1), 0, size)], 1)
+    homogeneous = local @ intrinsic.T
+    pixels = homogeneous[..., :2] / homogeneous[..., 2:]
+    return np.concatenate([np.clip(pixels.min(1), 0, size), np.clip(pixels.max(1), 0, size)], 1)
 
 
 def size_columns(given: str, wanted: str) -> list[int]:
@@ -114,19 +114,20 @@ def size_columns(given: str, wanted: str) -> list[int]:
 
 
 def bottom_centre(centre: Any, size_lhw: Any) -> Any:
-    """Middle of the bottom [N, 3] of boxes in a camera's frame: where mmdetection3d and KITTI place them."""
-    bottom = centre + 0.0
-    bottom[..., 1] += 0.5 * size_lhw[..., 1]
-    return bottom
+    """Return the centre of the bottom [N, 3] of boxes in a camera's frame, the origin of mmdetection3d and KITTI."""
+    # A copy, for arrays and tensors alike.
+    bottom_point = centre + 0.0
+    bottom_point[..., 1] += 0.5 * size_lhw[..., 1]
+    return bottom_point
 
 
 def camera_axes(yaw: F64) -> F64:
-    """Axes [N, 3, 3] (forward, left, up, as columns) in the camera's frame of boxes that stand upright in it."""
-    cos, sin, none = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
+    """Return the axes [N, 3, 3] (forward, left, up, as columns) of upright boxes in the camera's frame."""
+    cos, sin, zeros = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
     up = np.tile([0.0, -1.0, 0.0], (len(yaw), 1))
-    return np.stack([np.stack([cos, none, -sin], -1), np.stack([sin, none, cos], -1), up], -1)
+    return np.stack([np.stack([cos, zeros, -sin], -1), np.stack([sin, zeros, cos], -1), up], -1)
 
 
 def camera_yaw(forward: F64) -> F64:
-    """Yaw [N] in the camera's frame of boxes that look along `forward` [N, 3]."""
+    """Return the yaw [N] in the camera's frame of boxes that point along `forward` [N, 3]."""
     return np.asarray(np.arctan2(-forward[:, 2], forward[:, 0]))

@@ -1,8 +1,8 @@
-"""What detectors are told and what they answer, in tensors. Importing this does not import torch.
+"""Inputs and outputs of detectors, as tensors. Importing this does not import torch.
 
 Shape letters: B images, P places (all cells, anchors and levels of a detector, one after the other), C classes,
-N objects, Q true objects. 2D boxes are x1, y1, x2, y2 in pixels of the picture that was handed in, at pixel edges
-(pixel 0 spans 0 to 1). 3D boxes stand in the camera frame (x right, y down, z forward), metres and radians:
+N objects, Q true objects. 2D boxes are x1, y1, x2, y2 in pixels of the image passed in, at pixel edges
+(pixel 0 spans 0 to 1). 3D boxes are in the camera frame (x right, y down, z forward), metres and radians:
 size is length, height, width (along x, y, z at yaw 0), yaw turns about the y axis as in mmdetection3d and KITTI
 (yaw 0: the length along x; positive from z towards x).
 """
@@ -45,7 +45,7 @@ class Truth:
         box: 2D boxes [Q, 4].
         solid: 3D boxes; None for 2D detection.
         intrinsic: Camera matrix [3, 3]; None for 2D detection.
-        crowd: Objects that count neither as found nor as missed because they are too small or too hidden [Q] bool.
+        crowd: Objects that count neither as detected nor as missed, being too small or too occluded [Q] bool.
     """
 
     label: Tensor
@@ -57,12 +57,13 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """The objects found in one image, best first.
+    """The objects detected in one image, best first.
 
     Attributes:
         score: Confidence in 0..1 [N].
         label: Index into the detector's classes [N].
-        box: 2D boxes [N, 4]; for 3D, the hull of the projected corners unless the detector predicts 2D boxes itself.
+        box: 2D boxes [N, 4]; for 3D, the hull of the projected corners unless the detector predicts 2D boxes
+            itself.
         solid: 3D boxes; None for 2D detection.
     """
 
@@ -78,15 +79,15 @@ class Dense:
 
     Attributes:
         logit: Class logits [B, P, C].
-        quality: Logit whose sigmoid multiplies the class score (objectness, centreness) [B, P]; None for a detector
-            without.
+        quality: Logit whose sigmoid multiplies the class score (objectness, centreness) [B, P]; None for
+            detectors without one.
         box: 2D boxes [B, P, 4].
-        place: x, y of the cell's middle [P, 2], pixels.
+        place: x, y of the cell's centre [P, 2], pixels.
         stride: Stride of each place [P], pixels.
-        level: Index of the map that each place comes from [P].
+        level: Index of the map of each place [P].
         maps: The detector's own maps by name, as its source returns them.
         features: Maps of trunk or neck [B, K, h, w], finest first, for attention-based attacks.
-        size: Height and width of the picture.
+        size: Height and width of the image.
     """
 
     logit: Tensor

@@ -1,20 +1,20 @@
-"""The seams of the closed loop: simulators, what they tell about their state, and the drivers that act in them.
+"""Interfaces of the closed loop: simulators, their state, and the drivers that act in them.
 
-A class need not inherit from a protocol: it is enough that it has these attributes and methods. A package offers its
-drivers by name through entry points, and `ssad list` shows them; without a package, a name of the form
-"module:object" is imported from the working folder:
+A class need not inherit from a protocol: having its attributes and methods is enough. A package offers its drivers by
+name through entry points, and `ssad list` shows them; without a package, a name of the form "module:object" is
+imported from the working folder:
 
     [project.entry-points."ssad.systems"]
     careful = "my_package.driver:Careful"
 
     ssad run quick --set systems=[careful,my_driver:Driver]
 
-Shape letters: B scenes, A agents of a scene (agent 0 is the ego), N rows of what a driver sees, R points of all routes,
+Shape letters: B scenes, A agents of a scene (agent 0 is the ego), N rows of an observation, R points of all routes,
 L lanes of all towns, S signals of a town. Units are metres, seconds and radians. The world frame is right-handed (x
 east, y north, z up); an agent's frame is x forward, y left.
 
-What every implementation owes its callers: a result must not depend on which scenes share its batch, nor on the order
-in which batches come; and what is random comes from `ssad.core.seeding` alone.
+Requirements on every implementation: a result must not depend on the scenes that share its batch, nor on the order of
+batches; all randomness comes from `ssad.core.seeding`.
 """
 
 from __future__ import annotations
@@ -62,28 +62,28 @@ class RoadTables:
 
 @dataclass(frozen=True)
 class WorldState:
-    """Where everybody is and how the egos fare: plain arrays that any simulator can fill.
+    """Positions of all agents and progress of the egos: plain arrays that any simulator can fill.
 
-    They may be views that hold until the next step; whoever keeps them makes copies.
+    They may be views that are valid until the next step; copy them to keep them.
 
     Attributes:
         time: [B] s since the episode began.
         pose: [B, A, 3] x, y, yaw of the centre of the body.
         speed: [B, A] m/s along the heading, negative in reverse.
         accel: [B, A] m/s^2 along the heading.
-        active: [B, A] whether somebody is there.
+        active: [B, A] whether the agent is present.
         kind: [B, A] `ssad.core.types.AgentKind`; NONE: an empty slot.
         size: [B, A, 2] length and width, m.
         control: [B, A, 4] throttle, brake, steer and reverse of the last step.
-        controller: [B, A] `ssad.core.types.Controller`: who drives now.
+        controller: [B, A] `ssad.core.types.Controller` that drives now.
         policy: [B, A] number of the driver that acts for the agent, -1 none.
-        target_speed: [B, A] m/s that an agent should drive at where nothing hinders it.
+        target_speed: [B, A] desired speed of the agent on a free road, m/s.
         touch: [B, A] int64, agents touched now: one bit an agent.
         lane: [B, A] lane under the centre, -1 off the road.
-        route: [B, A, 2] first point of the agent's route in `roads` and number of points; 0 points: it has none.
+        route: [B, A, 2] first point of the agent's route in `roads` and number of points; 0 points: no route.
         progress: [B, A] nearest point of the route, counted from its first.
         roads: Routes and lanes.
-        signals: Gives `signal`, when somebody asks for it.
+        signals: Function that returns `signal`, called on first use.
         contact: [B] `ssad.core.types.Contact` bits of the ego's contacts that began in this step.
         contact_agent: [B] agent that the ego touched first in this step, -1 none.
         off_road: [B] whether the ego's centre is off the road.
@@ -94,8 +94,8 @@ class WorldState:
         lane_invasion: [B] lane markings crossed in this step.
         red_light: [B] red lights run in this step.
         stop_sign: [B] stop signs run in this step; None in a world without stop signs.
-        note: [B, A] what a selector has noted on an agent (`Choice.note`), 0 at the start; None in a simulator that
-            keeps no notes.
+        note: [B, A] note of a selector on an agent (`Choice.note`), 0 at the start; None in a simulator without
+            notes.
     """
 
     time: F64
@@ -134,7 +134,7 @@ class WorldState:
 
 
 class LaneRelation(IntEnum):
-    """Where another agent's lane lies, as seen from the agent that looks."""
+    """Position of another agent's lane relative to the observing agent."""
 
     ELSEWHERE = 0
     SAME = 1
@@ -145,9 +145,9 @@ class LaneRelation(IntEnum):
 
 @dataclass(frozen=True)
 class Observation:
-    """What a driver sees at one step: N agents that it drives, in scenes of their own or together in one.
+    """Input of a driver at one step: N agents that it drives, each in a scene of its own or several in one scene.
 
-    The arrays are copies; to change them changes nothing in the world.
+    The arrays are copies; changing them does not change the world.
 
     Attributes:
         scene: [N] scene of each row.
@@ -156,19 +156,20 @@ class Observation:
         speed: [N] m/s along the agent's heading, negative in reverse.
         accel: [N] m/s^2 along the agent's heading.
         pose: [N, 3] x, y, yaw of the agent in the world frame.
-        target_speed: [N] m/s that the agent should drive at where nothing hinders it.
-        route: [N, 40, 2] the next 40 m of the route in the agent's frame, a point a metre; past its end the last point
-            is repeated. Without a route: straight on.
+        target_speed: [N] desired speed of the agent on a free road, m/s.
+        route: [N, 40, 2] the next 40 m of the route in the agent's frame, a point a metre; beyond its end the
+            last point is repeated. Without a route: straight on.
         lane_offset: [N] m from the route to the agent, positive to the left.
-        heading_error: [N] rad from the route's heading to the agent's, positive where the agent points further left.
-        others: [N, 16, 7] the agents within 60 m, nearest first, in the agent's frame: x, y, yaw, speed along their own
-            heading, length, width, and kind (`ssad.core.types.AgentKind`). Rows that are not needed are 0, kind too.
+        heading_error: [N] rad from the route's heading to the agent's, positive where the agent points further
+            left.
+        others: [N, 16, 7] the agents within 60 m, nearest first, in the agent's frame: x, y, yaw, speed along
+            their own heading, length, width, and kind (`ssad.core.types.AgentKind`). Unused rows are 0, kind too.
         others_lane: [N, 16] `LaneRelation` of these agents.
-        signal: [N, 2] state of the next signal on the route (`ssad.core.types.SignalState`) and metres to its stop
-            line. Without a signal: 0 (off) and 1e6.
+        signal: [N, 2] state of the next signal on the route (`ssad.core.types.SignalState`) and metres to its
+            stop line. Without a signal: 0 (off) and 1e6.
         done: [N] whether the episode has ended; the control is then ignored.
-        readings: What the sensors that the driver asked for show, [N, ...] each; `truth` a `Belief` of N rows. Each is
-            read when it is first looked up, which must be before the driver returns.
+        readings: Readings of the driver's sensors by name, [N, ...] each; `truth` is a `Belief` of N rows. Each
+            is read on first access, which must be before the driver returns.
     """
 
     scene: I32
@@ -190,33 +191,33 @@ class Observation:
 
 @dataclass(frozen=True)
 class Belief:
-    """What the Autopilot plans over: K others around each ego, in the world frame, as a perceiver sees them.
+    """Input of the Autopilot's planner: K other objects around each ego, in the world frame, as perceived.
 
-    Pose, speed, size and kind are enough. What is None is made up from them: an object drives on along the lane under
-    it, straight on where lanes part, at its speed; walkers, and who is on no lane that goes its way, move straight on;
-    vehicles are relied on to give way, walkers and things are not.
+    Pose, speed, size and kind are enough. Missing fields are derived from them: an object drives on along the
+    lane under it, straight on at forks, at its speed; walkers, and objects on no lane in their direction, move
+    straight on; vehicles are assumed to give way, walkers and static objects are not.
 
     Attributes:
         pose: [B, K, 3] x, y, yaw of the centre of the body.
         speed: [B, K] m/s along its heading, negative in reverse.
         size: [B, K, 2] length and width, m.
-        kind: [B, K] `ssad.core.types.AgentKind`; NONE: the row is not used, and its other values do not count.
-        forecast: [B, K, 8, 3] x, y, yaw where it will be in 0.5, 1, ... 4 s.
-        way: [B, K, 4] m from its centre to where it would wait (the stop line before it, or the junction) and to the
-            next junction (0 inside; 1e6: none), how it turns there (0 straight, 1 right, 2 left; 3 more with a stop or
-            yield sign), and m that its path ahead leaves the straight line along its heading.
+        kind: [B, K] `ssad.core.types.AgentKind`; NONE: the row is unused, and its other values do not count.
+        forecast: [B, K, 8, 3] predicted x, y, yaw in 0.5, 1, ... 4 s.
+        way: [B, K, 4] m from its centre to its waiting point (the stop line before it, or the junction) and to
+            the next junction (0 inside; 1e6: none), its turn there (0 straight, 1 right, 2 left; 3 more with a
+            stop or yield sign), and m until its path leaves the straight line along its heading.
         line_signal: [B, K] signal of the stop line before it, -1 none.
-        stood: [B, K] s that it has been at rest while wanting to go. None: as long as earlier beliefs have had somebody
-            at rest where it is.
-        gives_way: [B, K] whether it can be relied on to give way to those who go first.
-        change: [B, K, 2] turn signal of a lane change (1 left, -1 right, 0 none), and 1 while it passes somebody on an
-            oncoming lane. None: nobody changes lane.
-        height: [B, K] m, of the road under it: who is on, or below, a bridge does not count. None: of the lane under
-            it; NaN: not known.
-        signal: [B, S] `ssad.core.types.SignalState` of the signals of the scene's town, -1: as it is. None: all as
-            they are.
-        stop_sign: [B] 1 if it knows of the stop sign that it comes to next, 0 if it does not and drives on. Where the
-            map has none, nothing makes it stop. None: it knows all signs of the map.
+        stood: [B, K] s that it has been at rest while wanting to go. None: derived from earlier beliefs with an
+            object at rest in its place.
+        gives_way: [B, K] whether it is expected to give way to those with priority.
+        change: [B, K, 2] turn signal of a lane change (1 left, -1 right, 0 none), and 1 while it overtakes on an
+            oncoming lane. None: no lane changes.
+        height: [B, K] m, of the road under it; objects on or below a bridge do not count. None: height of the
+            lane under it; NaN: unknown.
+        signal: [B, S] `ssad.core.types.SignalState` of the signals of the scene's town, -1: true state. None: all
+            true.
+        stop_sign: [B] 1 if the ego knows of the next stop sign, 0 if not and it drives on. Without a sign in the
+            map, nothing makes it stop. None: all signs of the map are known.
     """
 
     pose: F32
@@ -234,10 +235,10 @@ class Belief:
     stop_sign: U8 | None = None
 
     def keep(self, mask: Bool) -> Self:
-        """Forget objects.
+        """Remove objects.
 
         Args:
-            mask: [B, K] those that stay.
+            mask: [B, K] objects to keep.
 
         Returns:
             The same belief without the others.
@@ -245,35 +246,35 @@ class Belief:
         return replace(self, kind=np.where(mask, self.kind, np.int32(AgentKind.NONE)))
 
     def rows(self, scenes: Scenes) -> Self:
-        """Pick scenes.
+        """Select scenes.
 
         Args:
-            scenes: N of them.
+            scenes: N scene numbers.
 
         Returns:
             The belief of these scenes, [N, K]; its arrays are copies.
         """
-        given = {f.name: getattr(self, f.name) for f in fields(self)}
-        which = np.asarray(scenes, np.int64)
-        return replace(self, **{name: value[which] for name, value in given.items() if value is not None})
+        field_values = {belief_field.name: getattr(self, belief_field.name) for belief_field in fields(self)}
+        scene_index = np.asarray(scenes, np.int64)
+        return replace(self, **{name: value[scene_index] for name, value in field_values.items() if value is not None})
 
 
 @runtime_checkable
 class Driver(Protocol):
-    """What drives an agent, ten times a second: the ego, or any other vehicle, cyclist or walker.
+    """Controls an agent ten times a second: the ego, or any other vehicle, cyclist or walker.
 
-    A driver that has an attribute `target_speed` (m/s) drives at that speed instead of the episode's; one that has an
-    attribute `sensors` (names) finds their readings in `Observation.readings`. A short class may leave out `name` and
-    `controller`: `ssad.drivers.make_system` fills them in. `ssad.world.check.check_driver` holds an implementation to
-    what is said here.
+    A driver with an attribute `target_speed` (m/s) drives at that speed instead of the episode's; one with an
+    attribute `sensors` (names) gets their readings in `Observation.readings`. A minimal class may omit `name` and
+    `controller`: `ssad.drivers.make_system` fills them in. `ssad.world.check.check_driver` tests an
+    implementation against this protocol.
 
     Attributes:
-        name: What tables call it.
-        controller: EXTERNAL: `act` is called at each step. AUTOPILOT and FOLLOW run inside the world, and `act` is
-            never called.
+        name: Name in tables.
+        controller: EXTERNAL: `act` is called at each step. AUTOPILOT and FOLLOW run inside the world, and `act`
+            is never called.
 
     Example:
-        A driver that brakes for what is ahead and steers for a point 6 m down its route::
+        A driver that brakes for objects ahead and steers for a point 6 m down its route::
 
             class Careful:
                 def reset(self, episodes): ...
@@ -290,18 +291,18 @@ class Driver(Protocol):
     controller: Controller
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """Forget the past; called once before each batch.
+        """Discard all memory; called once before each batch.
 
         Args:
             episodes: The B episodes that are driven next; `Observation.scene` counts them.
         """
 
     def act(self, view: Observation) -> F32:
-        """Choose the controls of all agents that it drives, for the next step.
+        """Choose the controls of all driven agents for the next step.
 
         Args:
-            view: What these N agents see now. A driver of one agent number gets one row a scene, in order; one that
-                takes agents over gets a row for each that it drives at this moment.
+            view: Observations of these N agents. A driver of one agent number gets one row a scene, in order; one
+                that takes agents over gets a row for each agent that it drives at this moment.
 
         Returns:
             [N, 3] throttle in [0, 1], brake in [0, 1] and steer in [-1, 1] (left positive, 1: wheels at full lock).
@@ -313,17 +314,17 @@ class Driver(Protocol):
 
 @runtime_checkable
 class Believer(Protocol):
-    """A driver of egos whose controller is AUTOPILOT: what it believes goes into the Autopilot's planner.
+    """A driver of egos whose controller is AUTOPILOT: its belief is the input of the Autopilot's planner.
 
     It works in simulators that are a `Planner`.
     """
 
     def believe(self, view: Observation) -> Belief:
-        """Say what is around the egos, before each step.
+        """Return the perceived surroundings of the egos, before each step.
 
         Args:
-            view: What the N egos see now, one row a scene, in order. The sensor `truth` shows a `Belief` [N, K] that
-                holds everybody, with all that the Autopilot of the background traffic knows of them.
+            view: Observations of the N egos, one row a scene, in order. The sensor `truth` reads a `Belief` [N, K] of
+                all agents, with all that the Autopilot of the background traffic knows of them.
 
         Returns:
             The belief [N, K] of each row; K may change from step to step. Rows of ended episodes do not count.
@@ -335,18 +336,18 @@ class Planner(Protocol):
     """A simulator whose Autopilot plans over a belief."""
 
     def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
-        """Hand in what egos believe; it is in force until the next one, or until the scene starts again.
+        """Set the belief of egos; it holds until the next call, or until the scene starts again.
 
         Args:
             belief: [B, K]. None: the truth again.
-            scenes: [B] whose egos believe it; None: all.
+            scenes: [B] scenes whose egos it applies to; None: all.
 
         Raises:
-            ConfigError: An array is of another shape, or a number that counts is not finite.
+            ConfigError: An array is of another shape, or a used number is not finite.
         """
 
     def truth(self) -> Belief:
-        """Tell the truth as a belief: handed in as it is, nobody drives otherwise.
+        """Return the truth as a belief: passed to `believe` unchanged, it changes no motion.
 
         Returns:
             [B, A]; row i is agent i, and the row of the ego itself is not used.
@@ -355,9 +356,9 @@ class Planner(Protocol):
 
 @runtime_checkable
 class Simulator(Protocol):
-    """A place where episodes run, B scenes at once.
+    """Runs episodes, B scenes at once.
 
-    `ssad.world.check.check_simulator` holds an implementation to this.
+    `ssad.world.check.check_simulator` tests an implementation against this protocol.
 
     Attributes:
         dt: Seconds of a step.
@@ -373,25 +374,25 @@ class Simulator(Protocol):
 
     @property
     def assigned(self) -> I32:
-        """The number of the episode that each scene runs, [B]."""
+        """Number of the episode that each scene runs, [B]."""
 
     @property
     def graphs(self) -> Mapping[str, LaneGraph]:
-        """The lane graph of each town that the episodes name."""
+        """Lane graph of each town that the episodes name."""
 
     def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
-        """Start scenes again; everybody is driven by what the episode says.
+        """Start scenes again; every agent gets the driver of its episode.
 
         Args:
             scenes: Numbers of the scenes; None: all of them.
-            episodes: For each of these scenes the number of the episode that it runs from now on; None: the same again.
+            episodes: Number of the next episode of each of these scenes; None: the same again.
 
         Raises:
             ConfigError: There is no such episode.
         """
 
     def step(self, controls: npt.ArrayLike | None = None) -> None:
-        """Advance every running scene by `dt`; those that have ended stay as they are.
+        """Advance every running scene by `dt`; ended scenes do not change.
 
         Args:
             controls: [B, A, 3] or [B, A, 4] as `Driver.act` returns them; agents whose controller is not EXTERNAL
@@ -402,29 +403,29 @@ class Simulator(Protocol):
         """
 
     def state(self) -> WorldState:
-        """Tell where everybody is.
+        """Return the positions of all agents and the progress of the egos.
 
         Returns:
             The state of all scenes, ended ones too.
         """
 
     def ended(self) -> I32:
-        """Tell which scenes have ended.
+        """Return which scenes have ended.
 
         Returns:
-            [B] 0 while an episode runs, else why it ended, an index into `ssad.core.types.ENDS`.
+            [B] 0 while an episode runs, else the reason of its end, an index into `ssad.core.types.ENDS`.
         """
 
     def take(
         self, agents: Bool, controller: Controller | None, *, policy: int = -1, target_speed: float | None = None
     ) -> None:
-        """Let somebody else drive agents from now on, until they are given back or the scene starts again.
+        """Change the controller of agents, until they are given back or the scene starts again.
 
         Args:
-            agents: [B, A] whom. Who sleeps wakes up.
-            controller: Who drives; None gives them back to what their episode says.
-            policy: Number of the driver, for who reads the state.
-            target_speed: Their target speed from now on, m/s; None: as it is.
+            agents: [B, A] agents to take over. Sleeping ones wake up.
+            controller: New controller; None gives them back to that of their episode.
+            policy: Number of the driver, for readers of the state.
+            target_speed: Their target speed from now on, m/s; None: unchanged.
 
         Raises:
             ConfigError: The simulator has no such controller, or the mask is of another shape.
@@ -433,42 +434,42 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class Reproducible(Protocol):
-    """A simulator in which what happens in a scene depends on its episode and its controls alone, to the bit."""
+    """A simulator in which a scene depends on its episode and its controls alone, to the bit."""
 
     def snapshot(self) -> Any:
-        """Keep all that changes.
+        """Save all changing state.
 
         Returns:
-            What `restore` of the same simulator takes.
+            An argument for `restore` of the same simulator.
         """
 
     def restore(self, snapshot: Any) -> None:
-        """Go on from an earlier moment, to the bit.
+        """Continue from an earlier moment, to the bit.
 
         Args:
-            snapshot: What `snapshot` returned.
+            snapshot: Result of `snapshot`.
 
         Raises:
             ConfigError: The snapshot is of a simulator of another size.
         """
 
     def hashes(self) -> list[str]:
-        """Sum up the state.
+        """Hash the state of each scene.
 
         Returns:
-            B texts over all that changes in a scene, whatever its place in the batch: equal where scenes are equal to
-            the bit.
+            B texts over all that changes in a scene, independent of its place in the batch: equal where scenes are
+            equal to the bit.
         """
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a selector with a memory decides at one step; its memory is in the simulator, with the rest of the state.
+    """Decision of a selector with memory at one step; the simulator stores the memory with the rest of its state.
 
     Attributes:
-        agents: [B, A] whom its driver drives at the next step.
-        note: [B, A] what it finds in `WorldState.note` at the step after.
-        remove: [B, A] who leaves the scene.
+        agents: [B, A] agents that the selector's driver drives at the next step.
+        note: [B, A] value of `WorldState.note` at the step after.
+        remove: [B, A] agents that leave the scene.
     """
 
     agents: Bool
@@ -478,17 +479,17 @@ class Choice:
 
 @runtime_checkable
 class NoteKeeper(Protocol):
-    """A simulator that keeps notes of selectors on agents, in its snapshots and hashes, until a scene starts again."""
+    """A simulator that stores selectors' notes on agents, in its snapshots and hashes, until a scene starts again."""
 
     def keep_note(self, note: I32) -> None:
-        """Keep a note on every agent.
+        """Store a note on every agent.
 
         Args:
             note: [B, A].
         """
 
     def remove(self, agents: Bool) -> None:
-        """Take agents out of their scenes, until these start again.
+        """Remove agents from their scenes, until these start again.
 
         Args:
             agents: [B, A].
@@ -516,16 +517,16 @@ Generators = Sequence[np.random.Generator]
 
 
 class Perturbation(Protocol):
-    """What changes the pictures that a driver gets, the same open loop and closed loop."""
+    """Changes the images that a driver receives, in the open loop and in the closed loop alike."""
 
     def apply(self, frames: Frames, victim: Any, truth: Any, generators: Generators) -> Frames:
-        """Change pictures.
+        """Change images.
 
         Args:
             frames: [N, C, H, W].
-            victim: Who looks at them: a driver or a detector.
-            truth: What is true at that moment: in the loop a `WorldState`.
-            generators: One for each picture, so that none depends on its batch.
+            victim: The driver or detector that receives them.
+            truth: Truth of that moment: in the loop a `WorldState`.
+            generators: One for each image, so that no image depends on its batch.
 
         Returns:
             [N, C, H, W].

@@ -1,4 +1,4 @@
-"""Errors that a user can cause and fix. Each ends in one line (what, where, what to do) and exit code 2."""
+"""Errors that a user can cause and fix. Each is one line (problem, place, remedy) and ends with exit code 2."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class SSADError(Exception):
     The command line prints the message alone and ends with exit code 2.
 
     Args:
-        message: What is wrong, where (file, line, key), and what to do. It becomes one line.
+        message: The problem, its place (file, line, key), and the remedy. It becomes one line.
     """
 
     def __init__(self, message: str) -> None:
@@ -33,10 +33,10 @@ class UnknownNameError(ConfigError):
 
 
 class MissingExtraError(ConfigError):
-    """What was asked for needs packages of an extra that are not installed.
+    """A request needs packages of an extra that is not installed.
 
     Args:
-        what: What was asked for, such as "system 'ppo'".
+        subject: The requested object, such as "system 'ppo'".
         package: A package of `EXTRA_OF` that is missing.
     """
 
@@ -47,7 +47,7 @@ class MissingExtraError(ConfigError):
         )
 
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
-        """So that a worker can send it home."""
+        """Make the error picklable, so that worker processes can raise it in the parent."""
         return MissingExtraError, self._given
 
 
@@ -85,12 +85,12 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
     hint = f"; closest: {', '.join(close)}" if close else ""
-    everything = f"see: ssad list {kind}s" if kind in LISTED else f"known: {', '.join(names) or 'none'}"
-    return UnknownNameError(f"unknown {kind} '{name}'{hint} ({everything})")
+    all_names = f"see: ssad list {kind}s" if kind in LISTED else f"known: {', '.join(names) or 'none'}"
+    return UnknownNameError(f"unknown {kind} '{name}'{hint} ({all_names})")
 
 
 def install_extra(extra: str) -> str:
-    """Say how to install an optional dependency here, for the end of a message.
+    """Return instructions for installing an optional dependency, for the end of a message.
 
     Args:
         extra: Name in `[project.optional-dependencies]` of pyproject.toml.
@@ -100,19 +100,19 @@ def install_extra(extra: str) -> str:
     """
     if (Path(__file__).resolve().parents[3] / "pyproject.toml").is_file():
         return f"in the checkout of SSAD run: pip install '.[{extra}]' (with uv: uv sync --inexact --extra {extra})"
-    pip = importlib.util.find_spec("pip") is not None
-    tool = f"{sys.executable} -m pip install" if pip else f"uv pip install --python {sys.executable}"
-    return f"run: {tool} {' '.join(repr(package) for package in packages_of(extra)) or extra}"
+    has_pip = importlib.util.find_spec("pip") is not None
+    installer = f"{sys.executable} -m pip install" if has_pip else f"uv pip install --python {sys.executable}"
+    return f"run: {installer} {' '.join(repr(package) for package in packages_of(extra)) or extra}"
 
 
 def packages_of(extra: str) -> list[str]:
-    """The requirements of an extra, as the installed package states them, such as "torch>=2.15.0"."""
+    """Return the requirements of an extra as stated by the installed package, such as "torch>=2.15.0"."""
     try:
-        stated = [text.partition(";") for text in requires("ssad-testbed") or ()]
+        requirements = [requirement.partition(";") for requirement in requires("ssad-testbed") or ()]
     except PackageNotFoundError:
         return []
-    wanted = re.compile(rf"""extra\s*==\s*['"]{re.escape(extra)}['"]""")
-    return [name.strip() for name, _, marker in stated if wanted.search(marker)]
+    extra_marker = re.compile(rf"""extra\s*==\s*['"]{re.escape(extra)}['"]""")
+    return [package_name.strip() for package_name, _, marker in requirements if extra_marker.search(marker)]
 
 
 EXTRA_OF = {"torch": "perception", "torchvision": "perception", "scenic": "scenic"}

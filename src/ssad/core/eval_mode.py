@@ -1,4 +1,4 @@
-"""The mode of a network's parts."""
+"""Temporary eval mode of a network."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from torch import nn
 
 @contextmanager
 def evaluating(module: nn.Module) -> Iterator[None]:
-    """Every part in eval mode within the block, then each in the mode it had, whatever was done in the block."""
-    modes = [(part, part.training) for part in module.modules()]
-    for part, _ in modes:
-        part.training = False
+    """Set all submodules to eval mode within the block, and restore the mode of each afterwards."""
+    # Each submodule by itself: frozen norms of a network in training are in eval mode already.
+    modes = [(submodule, submodule.training) for submodule in module.modules()]
+    for submodule, _ in modes:
+        submodule.training = False
     try:
         yield
     finally:
-        for part, mode in modes:
-            part.training = mode
+        for submodule, mode in modes:
+            submodule.training = mode

@@ -44,16 +44,16 @@ class Frame:
 
     Attributes:
         camera: The camera.
-        scene: Key of what is drawn once for a scene, such as weather.
-        sample: Key of what is drawn once for a file, such as sensor noise.
+        scene: Key of random quantities drawn once for a scene, such as weather.
+        sample: Key of random quantities drawn once for a file, such as sensor noise.
         time: s.
         ego_to_world: [4, 4].
         ego_velocity: World frame [3], m/s.
         boxes: Objects.
         depth: Depth along the optical axis [h, w], m, in any resolution (0: unknown, inf: sky).
         points: LiDAR returns in the camera frame [P, 3], from which depth is filled in where `depth` is None.
-        sun: Share of the sun's disc that is visible, where another camera of the same moment sees it; None: unknown, so
-            that each picture is judged by itself.
+        sun: Visible share of the sun's disc, where another camera of the same moment sees it; None: unknown, so
+            each image is judged by itself.
     """
 
     camera: Camera
@@ -83,14 +83,14 @@ class SweepFrame:
 
 @dataclass(frozen=True, slots=True)
 class StandingObject:
-    """A thing that stands still in the world over a whole scene.
+    """An object that stands still in the world over a whole scene.
 
     Attributes:
-        kind: A kind of `ssad.rendering.bodies`.
+        kind: A kind of `ssad.assets.bodies`.
         style: A style of that kind.
-        seed: Seed of its looks.
+        seed: Seed of its appearance.
         size: Length, width, height, m.
-        place: Middle of its base in the world, m.
+        place: Centre of its base in the world, m.
         yaw: rad.
         level: Lowest severity at which it is present.
     """
@@ -106,15 +106,15 @@ class StandingObject:
 
 @dataclass(frozen=True, slots=True)
 class SceneContext:
-    """What is constant over a scene and drawn or measured once.
+    """Quantities that are constant over a scene and drawn or measured once.
 
     Attributes:
         scene: Key of the scene.
         light: Brightness of the sky in [0, 1], for airlight and flakes, which are dark at night.
         heading: Heading of the ego in the world at the start of the scene, rad.
         start: First time of the scene, s.
-        sun: Unit vector towards the sun in the world, where it was chosen so that it is visible; None: drawn.
-        objects: Objects of no class that stand on the road; None: drawn for each picture by itself.
+        sun: Unit vector towards the sun in the world, chosen so that it is visible; None: drawn.
+        objects: Unclassified objects that stand on the road; None: drawn for each image by itself.
     """
 
     scene: str = ""
@@ -127,7 +127,7 @@ class SceneContext:
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """What a shift did to one file: applied or not, how (plain data), and what was skipped and why."""
+    """Result of a shift on one file: applied or not, its parameters (plain data), and skipped parts with counts."""
 
     applied: bool
     details: Mapping[str, Any] = field(default_factory=dict)
@@ -135,5 +135,5 @@ class Applied:
 
 
 def camera_to_world(frame: Frame) -> F64:
-    """4 x 4 pose of the camera of a frame in the world."""
+    """Return the 4 x 4 pose of the camera of a frame in the world."""
     return np.asarray(frame.ego_to_world @ frame.camera.to_ego, np.float64)

@@ -28,7 +28,7 @@ from ssad.core.types import Episode, EpisodeTrace, Scenario
 
 @dataclass(frozen=True)
 class Base:
-    """What a generator starts from: a scenario, and what happens in it when nobody interferes.
+    """Starting point of a generator: a scenario, and its undisturbed course.
 
     Attributes:
         episode: The scenario made concrete, with the seed that all its rollouts share.
@@ -42,20 +42,21 @@ class Base:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario, with what its author left at the defaults filled in."""
+        """The scenario, with the author's defaults filled in."""
         return self.episode.scenario
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Something to be tried: a scenario, or drivers that take agents of it over.
+    """A candidate to be simulated: a scenario, or drivers that take over its agents.
 
     Attributes:
         scenario: The scenario.
-        adversaries: Names of the agents whose motion the generator has chosen; with none named, and no drivers, all
-            others of the ego's that move.
-        drivers: Whom to drive -> who drives. Who is taken over at any moment is an adversary. Proposals that run side
-            by side share a driver by sharing this mapping; its selectors see the scenes of all of them.
+        adversaries: Names of the agents whose motion the generator has chosen; without names and drivers, all
+            moving agents other than the ego.
+        drivers: Selector -> driver of the selected agents. An agent that is taken over at any moment is an
+            adversary. Proposals that run side by side share a driver by sharing this mapping; its selectors see
+            the scenes of all of them.
     """
 
     scenario: Scenario
@@ -65,24 +66,25 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a proposal. What was not measured is None.
+    """Result of a proposal; unmeasured values are None.
 
     Attributes:
-        proposal: What was tried.
-        failure: Why it could not be run, in one line ("": it was).
-        trace: What happened.
+        proposal: The proposal.
+        failure: Reason why it could not be run, in one line ("" if it ran).
+        trace: Trace of the episode.
         adversaries: Numbers of the agents that are adversaries in the trace.
         collision: Whether the ego touched an adversary.
-        time: Of that contact, s.
-        impact_speed: How fast the two bodies moved against each other then, m/s.
-        ego_speed: Of the ego then, m/s.
-        gap: Least distance of the ego's body from an adversary's, m; 0 if they touched. None: no adversary was there.
+        time: Time of that contact, s.
+        impact_speed: Relative speed of the two bodies then, m/s.
+        ego_speed: Speed of the ego then, m/s.
+        gap: Minimum distance of the ego's body from an adversary's, m; 0 if they touched. None: no adversary
+            present.
         off_road: Whether an adversary that is a vehicle was on the road and left it.
-        hit_others: Whether an adversary touched somebody else than the ego.
-        acceleration: Largest of an adversary that is a vehicle, along its heading or across, m/s^2, as a mean over half
-            a second.
+        hit_others: Whether an adversary touched an agent other than the ego.
+        acceleration: Largest acceleration of an adversary that is a vehicle, along its heading or across, m/s^2,
+            as a mean over half a second.
         jerk: Largest change of that along its heading, likewise, m/s^3.
-        within_limits: Whether all of them kept to what their bodies and a hard-braking driver can do.
+        within_limits: Whether all adversaries kept to the limits of their bodies and of a hard-braking driver.
     """
 
     proposal: Proposal
@@ -102,15 +104,15 @@ class Outcome:
 
     @property
     def valid(self) -> bool:
-        """Whether the ego touched an adversary that stayed on the road and hit nobody else."""
+        """True if the ego touched an adversary that stayed on the road and hit no other agent."""
         return self.collision and not self.off_road and not self.hit_others
 
     @property
     def danger(self) -> float:
-        """One number for searches that want one, more is worse for the ego.
+        """Scalar objective for searches; larger is worse for the ego.
 
-        At a distance it is minus the least gap in m (at least -100; also what failed). A collision adds a tenth of the
-        impact speed in m/s, but one off the road or with others besides counts as a gap of 1 m.
+        Without a collision it is minus the minimum gap in m (at least -100, also for failures). A collision adds a
+        tenth of the impact speed in m/s, but one off the road or with further agents counts as a gap of 1 m.
         """
         if self.collision:
             return 0.1 * (self.impact_speed or 0.0) if self.valid else -1.0
@@ -122,23 +124,23 @@ class Generator(Protocol):
     """A search for dangerous scenarios, in B bases side by side.
 
     Attributes:
-        name: What tables call it.
+        name: Name in tables.
     """
 
     name: str
 
     def ask(self, count: int) -> Sequence[Sequence[Proposal]]:
-        """Propose what to try next.
+        """Propose the next candidates.
 
         Args:
-            count: How many rollouts each base may spend on it at most.
+            count: Maximum number of rollouts for each base.
 
         Returns:
-            For each of the B bases 0 to `count` proposals; none: it has nothing more to try there.
+            For each of the B bases 0 to `count` proposals; none: the search has nothing left to try there.
         """
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Learn what came of it; called once after each `ask`.
+        """Learn from the outcomes; called once after each `ask`.
 
         Args:
             outcomes: For each base, those of its proposals in their order.
@@ -146,7 +148,7 @@ class Generator(Protocol):
 
 
 class GeneratorFactory(Protocol):
-    """Makes a generator: what the names of generators mean. A class with this constructor is one."""
+    """Creates a generator: the meaning of a generator's name. A class with this constructor is one."""
 
     def __call__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> Generator:
         """Begin a search.
@@ -154,11 +156,11 @@ class GeneratorFactory(Protocol):
         Args:
             bases: B of them.
             seeds: Root of the random numbers of each base.
-            budget: Rollouts that each base has in all.
+            budget: Total number of rollouts for each base.
 
         Returns:
             The generator, which has not been asked yet.
 
         Raises:
-            ConfigError: There is nothing in a base that it could change.
+            ConfigError: A base has nothing that the generator could change.
         """

@@ -12,7 +12,7 @@ ArrayLike = npt.ArrayLike
 
 
 def rotate(xy: ArrayLike, angle: ArrayLike) -> Floats:
-    """Vectors xy [..., 2] turned counter-clockwise by angle [...]."""
+    """Rotate vectors xy [..., 2] counter-clockwise by angle [...]."""
     vector = _floats(xy)
     turn = _floats(angle)
     cos, sin = np.cos(turn), np.sin(turn)
@@ -21,44 +21,44 @@ def rotate(xy: ArrayLike, angle: ArrayLike) -> Floats:
 
 
 def cross(a: ArrayLike, b: ArrayLike) -> npt.NDArray[Any]:
-    """Cross products [..., 3] of vectors [..., 3], to the bit as `np.cross` gives them, in a fifth of its time."""
+    """Return cross products [..., 3] of vectors [..., 3], equal to `np.cross` to the bit, in a fifth of its time."""
     u, v = np.asarray(a), np.asarray(b)
-    found = np.empty(np.broadcast_shapes(u.shape, v.shape), np.result_type(u, v))
-    x, y, z = (u[..., k] for k in range(3))
-    p, q, r = (v[..., k] for k in range(3))
-    found[..., 0] = y * r - z * q
-    found[..., 1] = z * p - x * r
-    found[..., 2] = x * q - y * p
-    return found
+    product = np.empty(np.broadcast_shapes(u.shape, v.shape), np.result_type(u, v))
+    x, y, z = (u[..., axis] for axis in range(3))
+    p, q, r = (v[..., axis] for axis in range(3))
+    product[..., 0] = y * r - z * q
+    product[..., 1] = z * p - x * r
+    product[..., 2] = x * q - y * p
+    return product
 
 
 def to_local(pose: ArrayLike, xy: ArrayLike) -> Floats:
-    """World points xy [..., 2] in the frame of pose [..., 3] (x, y, yaw): x forward, y left."""
+    """Return world points xy [..., 2] in the frame of pose [..., 3] (x, y, yaw): x forward, y left."""
     frame = _floats(pose)
     offset: Floats = np.subtract(_floats(xy), frame[..., :2])
     return rotate(offset, -frame[..., 2])
 
 
 def to_world(pose: ArrayLike, xy: ArrayLike) -> Floats:
-    """Points xy [..., 2] of the frame pose [..., 3] (x, y, yaw) in the world frame; undoes `to_local`."""
+    """Return points xy [..., 2] of the frame pose [..., 3] (x, y, yaw) in the world frame; inverse of `to_local`."""
     frame = _floats(pose)
     return np.asarray(rotate(xy, frame[..., 2]) + frame[..., :2])
 
 
 def corners(x: ArrayLike, y: ArrayLike, yaw: ArrayLike, length: ArrayLike, width: ArrayLike) -> Floats:
-    """Corners [..., 4, 2] of boxes: front left, rear left, rear right, front right (counter-clockwise)."""
-    x_, y_, yaw_, length_, width_ = np.broadcast_arrays(*(_floats(v) for v in (x, y, yaw, length, width)))
-    along = 0.5 * length_[..., None] * np.array([1.0, -1.0, -1.0, 1.0], length_.dtype)
-    across = 0.5 * width_[..., None] * np.array([1.0, 1.0, -1.0, -1.0], width_.dtype)
-    offset = rotate(np.stack([along, across], axis=-1), yaw_[..., None])
+    """Return corners [..., 4, 2] of boxes: front left, rear left, rear right, front right (counter-clockwise)."""
+    x_, y_, yaw_, length_, width_ = np.broadcast_arrays(*(_floats(value) for value in (x, y, yaw, length, width)))
+    forward = 0.5 * length_[..., None] * np.array([1.0, -1.0, -1.0, 1.0], length_.dtype)
+    left = 0.5 * width_[..., None] * np.array([1.0, 1.0, -1.0, -1.0], width_.dtype)
+    offset = rotate(np.stack([forward, left], axis=-1), yaw_[..., None])
     return np.asarray(offset + np.stack([x_, y_], axis=-1)[..., None, :])
 
 
 def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
-    """Distance between oriented boxes, 0 where they overlap.
+    """Return the distance between oriented boxes, 0 where they overlap.
 
-    Two convex shapes that do not overlap are nearest at a corner of one of them, so eight point-to-box distances and a
-    separating-axis test suffice.
+    Two convex shapes that do not overlap are nearest at a corner of one of them, so eight point-to-box distances
+    and a separating-axis test suffice.
 
     Args:
         a: Boxes [..., 5]: x, y, yaw, length, width.
@@ -68,23 +68,24 @@ def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
         Distances [...].
     """
     first, second = np.broadcast_arrays(_floats(a), _floats(b))
-    one = corners(*(first[..., i] for i in range(5)))
-    two = corners(*(second[..., i] for i in range(5)))
-    two_local = to_local(first[..., None, :3], two)
-    one_local = to_local(second[..., None, :3], one)
+    first_corners = corners(*(first[..., column] for column in range(5)))
+    second_corners = corners(*(second[..., column] for column in range(5)))
+    two_local = to_local(first[..., None, :3], second_corners)
+    one_local = to_local(second[..., None, :3], first_corners)
     half_first, half_second = 0.5 * first[..., None, 3:5], 0.5 * second[..., None, 3:5]
     gap = np.minimum(_point_to_box(two_local, half_first), _point_to_box(one_local, half_second))
-    apart = _separated(two_local, half_first) | _separated(one_local, half_second)
-    return np.where(apart, gap, 0.0).astype(gap.dtype)
+    is_separated = _separated(two_local, half_first) | _separated(one_local, half_second)
+    return np.where(is_separated, gap, 0.0).astype(gap.dtype)
 
 
 def in_polygon(points: ArrayLike, corners: ArrayLike) -> npt.NDArray[np.bool_]:
-    """Whether points [n, 2] lie in a polygon [m, 2] (even-odd rule)."""
+    """Return whether points [n, 2] lie in a polygon [m, 2] (even-odd rule)."""
     x, y = np.asarray(points).T[:, :, None]
     (ax, ay), (bx, by) = np.asarray(corners).T, np.roll(corners, -1, axis=0).T
     crosses = (ay > y) != (by > y)
-    at = ax + (y - ay) / np.where(by == ay, 1.0, by - ay) * (bx - ax)
-    return np.asarray((crosses & (x < at)).sum(axis=1) % 2 == 1)
+    # Level edges never count as crossed, so the 1.0 only avoids a division by 0.
+    crossing_x = ax + (y - ay) / np.where(by == ay, 1.0, by - ay) * (bx - ax)
+    return np.asarray((crosses & (x < crossing_x)).sum(axis=1) % 2 == 1)
 
 
 def _point_to_box(points: Floats, half: Floats) -> Floats:
@@ -94,13 +95,13 @@ def _point_to_box(points: Floats, half: Floats) -> Floats:
 
 
 def _separated(points: Floats, half: Floats) -> npt.NDArray[np.bool_]:
-    """Whether an axis of the box at the origin separates it from the hull of the points."""
+    """Return whether an axis of the box at the origin separates it from the hull of the points."""
     low, high = points.min(axis=-2), points.max(axis=-2)
     extent = half[..., 0, :]
     return np.asarray(((low > extent) | (high < -extent)).any(axis=-1))
 
 
 def _floats(value: ArrayLike) -> Floats:
-    """As a floating array; whole numbers become float64."""
+    """Return the value as a floating array; whole numbers become float64."""
     array = np.asarray(value)
     return array if np.issubdtype(array.dtype, np.floating) else array.astype(np.float64)

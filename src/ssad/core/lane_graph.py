@@ -21,14 +21,14 @@ MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
 
 
 class SignKind(IntEnum):
-    """What a sign at a junction says."""
+    """Meaning of a sign at a junction."""
 
     STOP = 0
     YIELD = 1
 
 
 class Marking(IntEnum):
-    """What is painted between a lane and its neighbour. Only BROKEN may be crossed."""
+    """Marking between a lane and its neighbour. Only BROKEN may be crossed."""
 
     NONE = 0  # nothing painted or nothing known
     BROKEN = 1
@@ -129,17 +129,18 @@ class LaneGraph:
     def __post_init__(self) -> None:
         for name, dtype in _DTYPES.items():
             value = np.ascontiguousarray(getattr(self, name), dtype)
+            # The caller's array would otherwise become read-only.
             if value is getattr(self, name) and value.flags.writeable:
                 value = value.copy()
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         _check(self)
         length = self.s[self.offset[1:] - 1]
-        source = np.repeat(np.arange(self.lanes, dtype=np.int32), np.diff(self.succ_offset))
-        order = np.argsort(self.succ, kind="stable")
-        count = np.bincount(self.succ, minlength=self.lanes)
-        before = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
-        for name, value in (("length", length), ("pred", source[order]), ("pred_offset", before)):
+        predecessors = np.repeat(np.arange(self.lanes, dtype=np.int32), np.diff(self.succ_offset))
+        by_successor = np.argsort(self.succ, kind="stable")
+        pred_counts = np.bincount(self.succ, minlength=self.lanes)
+        pred_offsets = np.concatenate([[0], np.cumsum(pred_counts)]).astype(np.int32)
+        for name, value in (("length", length), ("pred", predecessors[by_successor]), ("pred_offset", pred_offsets)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
@@ -150,54 +151,57 @@ class LaneGraph:
 
     @cached_property
     def kept(self) -> dict[Any, Any]:
-        """What was worked out from these lanes and is asked for again."""
+        """Cache of results derived from these lanes."""
         return {}
 
     def points(self, lane: int) -> slice:
-        """The slice of the point arrays that holds a lane's centre line."""
+        """Return the slice of the point arrays that holds a lane's centre line."""
         return slice(int(self.offset[lane]), int(self.offset[lane + 1]))
 
     def successors(self, lane: int) -> I32:
-        """Lanes that traffic can enter from the end of a lane."""
+        """Return the lanes that traffic can enter from the end of a lane."""
         return self.succ[self.succ_offset[lane] : self.succ_offset[lane + 1]]
 
     def predecessors(self, lane: int) -> I32:
-        """Lanes from which traffic enters a lane."""
+        """Return the lanes from which traffic enters a lane."""
         return self.pred[self.pred_offset[lane] : self.pred_offset[lane + 1]]
 
     def crosswalk(self, index: int) -> F32:
-        """Corners [., 2] of a crosswalk."""
+        """Return the corners [., 2] of a crosswalk."""
         return self.crosswalk_xy[self.crosswalk_offset[index] : self.crosswalk_offset[index + 1]]
 
     def at(self, lane: int, s: float) -> tuple[float, float, float, float]:
-        """x, y, yaw and width at arc length s of a lane (s is held inside the lane)."""
-        part = self.points(lane)
-        along = self.s[part]
-        i = min(max(int(along.searchsorted(s, side="right")) - 1, 0), len(along) - 2)
-        t = float(min(max((s - along[i]) / max(float(along[i + 1] - along[i]), 1e-9), 0.0), 1.0))
-        i += part.start
-        x, y = (1.0 - t) * self.xy[i] + t * self.xy[i + 1]
-        turn = (float(self.yaw[i + 1] - self.yaw[i]) + np.pi) % (2 * np.pi) - np.pi
-        width = (1.0 - t) * float(self.width[i]) + t * float(self.width[i + 1])
-        return float(x), float(y), float(self.yaw[i]) + t * turn, width
+        """Return x, y, yaw and width at arc length s of a lane; s is clamped to the lane."""
+        lane_points = self.points(lane)
+        arc_lengths = self.s[lane_points]
+        point = min(max(int(arc_lengths.searchsorted(s, side="right")) - 1, 0), len(arc_lengths) - 2)
+        t = float(
+            min(max((s - arc_lengths[point]) / max(float(arc_lengths[point + 1] - arc_lengths[point]), 1e-9), 0.0), 1.0)
+        )
+        point += lane_points.start
+        x, y = (1.0 - t) * self.xy[point] + t * self.xy[point + 1]
+        yaw_change = (float(self.yaw[point + 1] - self.yaw[point]) + np.pi) % (2 * np.pi) - np.pi
+        width = (1.0 - t) * float(self.width[point]) + t * float(self.width[point + 1])
+        return float(x), float(y), float(self.yaw[point]) + t * yaw_change, width
 
     def along(self, lane: int, s: npt.ArrayLike) -> F64:
-        """Rows [n, 4] of x, y, yaw and width at arc lengths s [n] of a lane: what `at` gives for each, to the bit."""
-        part = self.points(lane)
-        along = self.s[part]
-        place = np.asarray(s, np.float32)
-        i = np.clip(np.searchsorted(along, place, side="right") - 1, 0, len(along) - 2)
-        step = np.maximum(along[i + 1] - along[i], np.float32(1e-9))
-        t = np.clip((place - along[i]) / step, 0.0, 1.0).astype(np.float64)
-        i += part.start
-        before, after = ((1.0 - t).astype(np.float32)[:, None], t.astype(np.float32)[:, None])
-        xy = before * self.xy[i] + after * self.xy[i + 1]
-        turn = ((self.yaw[i + 1] - self.yaw[i]).astype(np.float64) + np.pi) % (2 * np.pi) - np.pi
-        width = (1.0 - t) * self.width[i].astype(np.float64) + t * self.width[i + 1].astype(np.float64)
-        return np.column_stack([xy, self.yaw[i].astype(np.float64) + t * turn, width])
+        """Return rows [n, 4] of x, y, yaw and width at arc lengths s [n] of a lane, equal to `at` to the bit."""
+        lane_points = self.points(lane)
+        arc_lengths = self.s[lane_points]
+        positions = np.asarray(s, np.float32)
+        point = np.clip(np.searchsorted(arc_lengths, positions, side="right") - 1, 0, len(arc_lengths) - 2)
+        step = np.maximum(arc_lengths[point + 1] - arc_lengths[point], np.float32(1e-9))
+        t = np.clip((positions - arc_lengths[point]) / step, 0.0, 1.0).astype(np.float64)
+        point += lane_points.start
+        # float32 weights: `at` multiplies float32 points by Python floats, which numpy does in float32.
+        start_weight, end_weight = ((1.0 - t).astype(np.float32)[:, None], t.astype(np.float32)[:, None])
+        xy = start_weight * self.xy[point] + end_weight * self.xy[point + 1]
+        yaw_change = ((self.yaw[point + 1] - self.yaw[point]).astype(np.float64) + np.pi) % (2 * np.pi) - np.pi
+        width = (1.0 - t) * self.width[point].astype(np.float64) + t * self.width[point + 1].astype(np.float64)
+        return np.column_stack([xy, self.yaw[point].astype(np.float64) + t * yaw_change, width])
 
     def divided(self, lane: int) -> bool:
-        """Whether no lane of the other way lies beside those of a lane's own way: a one-way road, or a median."""
+        """Return whether no oncoming lane lies beside those of a lane's direction: a one-way road, or a median."""
         while (left := int(self.left[lane])) >= 0 and self.same_direction(lane, left):
             lane = left
         return left < 0 or self.kind[left] != LaneType.DRIVING
@@ -208,16 +212,16 @@ class LaneGraph:
 
 
 def no_signals() -> dict[str, Any]:
-    """The arrays of a `LaneGraph` without signals, stop lines and crosswalks, by name."""
-    none = np.zeros(0, np.int32)
+    """Return the arrays of a `LaneGraph` without signals, stop lines and crosswalks, by name."""
+    empty = np.zeros(0, np.int32)
     return {
         "signal_xy": np.zeros((0, 2), np.float32),
         "signal_yaw": np.zeros(0, np.float32),
-        "signal_junction": none,
-        "signal_phase": none,
+        "signal_junction": empty,
+        "signal_phase": empty,
         "signal_virtual": np.zeros(0, bool),
-        "stop_signal": none,
-        "stop_lane": none,
+        "stop_signal": empty,
+        "stop_lane": empty,
         "stop_s": np.zeros(0, np.float32),
         "crosswalk_offset": np.zeros(1, np.int32),
         "crosswalk_xy": np.zeros((0, 2), np.float32),
@@ -233,20 +237,20 @@ _PER = {
     "G": ("sign_kind", "sign_yaw"),
     "R": ("rule_sign", "rule_lane", "rule_s"),
 }
-# older files lack them: such a town has no signs
+# absent from older files, whose towns have no signs
 _OPTIONAL = frozenset({"sign_kind", "sign_xy", "sign_yaw", "rule_sign", "rule_lane", "rule_s"})
 
 
 def _check(graph: LaneGraph) -> None:
-    """Refuse arrays that contradict each other; MapError names the first that does."""
+    """Raise MapError for arrays that contradict each other; it names the first."""
 
     def require(ok: bool, what: str) -> None:
         if not ok:
             raise MapError(f"town '{graph.name}': {what}; bake the map again with ssad import map")
 
-    for name in ("xy", "signal_xy", "crosswalk_xy", "sign_xy"):
-        value = getattr(graph, name)
-        require(value.ndim == 2 and value.shape[1] == 2, f"{name} is not [n, 2]")
+    for array_name in ("xy", "signal_xy", "crosswalk_xy", "sign_xy"):
+        value = getattr(graph, array_name)
+        require(value.ndim == 2 and value.shape[1] == 2, f"{array_name} is not [n, 2]")
     size = {
         "P": len(graph.xy),
         "L": len(graph.kind),
@@ -255,22 +259,25 @@ def _check(graph: LaneGraph) -> None:
         "G": len(graph.sign_xy),
         "R": len(graph.rule_sign),
     }
-    for letter, names in _PER.items():
-        for name in names:
-            require(getattr(graph, name).shape == (size[letter],), f"{name} does not have {size[letter]} rows")
-    for name in (name for name, dtype in _DTYPES.items() if dtype == np.float32):
-        require(bool(np.isfinite(getattr(graph, name)).all()), f"{name} holds a number that is not finite")
-    for name, rows, total in (
+    for dimension, array_names in _PER.items():
+        for array_name in array_names:
+            require(
+                getattr(graph, array_name).shape == (size[dimension],),
+                f"{array_name} does not have {size[dimension]} rows",
+            )
+    for array_name in (array_name for array_name, dtype in _DTYPES.items() if dtype == np.float32):
+        require(bool(np.isfinite(getattr(graph, array_name)).all()), f"{array_name} holds a number that is not finite")
+    for array_name, rows, total in (
         ("offset", size["L"], size["P"]),
         ("succ_offset", size["L"], len(graph.succ)),
         ("crosswalk_offset", len(graph.crosswalk_offset) - 1, len(graph.crosswalk_xy)),
     ):
-        value = getattr(graph, name)
-        good = value.shape == (rows + 1,) and len(value) > 0 and value[0] == 0 and value[-1] == total
-        require(bool(good and (np.diff(value) >= 0).all()), f"{name} does not partition its rows")
+        value = getattr(graph, array_name)
+        is_partition = value.shape == (rows + 1,) and len(value) > 0 and value[0] == 0 and value[-1] == total
+        require(bool(is_partition and (np.diff(value) >= 0).all()), f"{array_name} does not partition its rows")
     require(size["L"] > 0, "it has no lane")
     require(bool((np.diff(graph.offset) >= 2).all()), "a lane has fewer than two points")
-    for name, low, high in (
+    for array_name, low, high in (
         ("left", -1, size["L"]),
         ("right", -1, size["L"]),
         ("succ", 0, size["L"]),
@@ -281,18 +288,19 @@ def _check(graph: LaneGraph) -> None:
         ("rule_sign", 0, size["G"]),
         ("rule_lane", 0, size["L"]),
     ):
-        value = getattr(graph, name)
-        require(bool(((value >= low) & (value < high)).all()), f"{name} points outside the table")
-    inner = np.ones(size["P"] - 1, bool)
-    inner[graph.offset[1:-1] - 1] = False
-    require(bool((np.diff(graph.s)[inner] > 0).all()), "s does not grow along a lane")
+        value = getattr(graph, array_name)
+        require(bool(((value >= low) & (value < high)).all()), f"{array_name} points outside the table")
+    within_lane = np.ones(size["P"] - 1, bool)
+    # Arc length restarts at each lane, so steps between lanes do not count.
+    within_lane[graph.offset[1:-1] - 1] = False
+    require(bool((np.diff(graph.s)[within_lane] > 0).all()), "s does not grow along a lane")
     require(bool((graph.kind == LaneType.DRIVING).any()), "it has no drivable lane")
 
 
 def town_file(town: str) -> str:
-    """The name of the file that a results folder keeps a town in: a town that is itself a file lies anywhere."""
-    plain = Path(town).name == town
-    return f"{town}.npz" if plain else f"{Path(town).stem}-{hashlib.sha256(town.encode()).hexdigest()[:8]}.npz"
+    """Return the name of a town's file in a results folder; a town may itself be the path of a file."""
+    is_plain_name = Path(town).name == town
+    return f"{town}.npz" if is_plain_name else f"{Path(town).stem}-{hashlib.sha256(town.encode()).hexdigest()[:8]}.npz"
 
 
 def save_graph(graph: LaneGraph, path: Path | str) -> None:
@@ -301,35 +309,38 @@ def save_graph(graph: LaneGraph, path: Path | str) -> None:
     Raises:
         StoreError: The file cannot be written.
     """
+    # A text array, since npz has no place for metadata.
     header = np.array([f"ssad-lane-graph {FORMAT}", graph.name])
     save_npz(path, {"header": header} | {name: getattr(graph, name) for name in _DTYPES})
 
 
 def load_graph(path: Path | str) -> LaneGraph:
-    """Read what `save_graph` wrote.
+    """Read a lane graph written by `save_graph`.
 
     Raises:
         MapError: The file is missing, broken, too large, or not a lane graph.
     """
-    source, mend = Path(path), "bake the map again with ssad import map"
+    source, remedy = Path(path), "bake the map again with ssad import map"
     try:
         arrays = load_npz(source, limit=MAX_FILE)
     except FormatError as error:
-        raise MapError(f"{error}; {mend}") from None
+        raise MapError(f"{error}; {remedy}") from None
     header = arrays.pop("header", None)
     if header is None or header.shape != (2,) or str(header[0]) != f"ssad-lane-graph {FORMAT}":
-        raise MapError(f"{source}: not a baked town of format {FORMAT}; {mend}")
-    wrong = ", ".join(sorted((set(_DTYPES) - _OPTIONAL - set(arrays)) | (set(arrays) - set(_DTYPES))))
-    if wrong:
-        raise MapError(f"{source}: missing or unknown arrays: {wrong}; {mend}")
+        raise MapError(f"{source}: not a baked town of format {FORMAT}; {remedy}")
+    wrong_names = ", ".join(sorted((set(_DTYPES) - _OPTIONAL - set(arrays)) | (set(arrays) - set(_DTYPES))))
+    if wrong_names:
+        raise MapError(f"{source}: missing or unknown arrays: {wrong_names}; {remedy}")
     for name, value in arrays.items():
         if value.dtype != _DTYPES[name]:
-            raise MapError(f"{source}: array {name} is {value.dtype}; {mend}")
+            raise MapError(f"{source}: array {name} is {value.dtype}; {remedy}")
     return LaneGraph(name=str(header[1]), **arrays)
 
 
 def equal(a: LaneGraph, b: LaneGraph) -> bool:
     """Whether two graphs hold the same numbers."""
     return a.name == b.name and all(
-        np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(LaneGraph) if f.name != "name"
+        np.array_equal(getattr(a, graph_field.name), getattr(b, graph_field.name))
+        for graph_field in fields(LaneGraph)
+        if graph_field.name != "name"
     )

@@ -1,4 +1,4 @@
-"""Lanes as strips to draw: what the page's replay and the videos share."""
+"""Lanes as strips for drawing, shared by the page's replay and the videos."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LAYERS = {
 
 @dataclass(frozen=True)
 class Strip:
-    """A lane to draw: index, layer, whether it lies in a junction, its left and right edge [N, 2] m."""
+    """A lane to draw: index, layer, whether it is in a junction, and its left and right edge [N, 2] m."""
 
     lane: int
     layer: int
@@ -38,19 +38,21 @@ class Strip:
 
 
 def strips(graph: LaneGraph) -> list[Strip]:
-    """All lanes that are drawn, bottom layer first."""
-    out = []
+    """Return all lanes that are drawn, bottom layer first."""
+    lane_strips = []
     for lane in range(len(graph.kind)):
         layer = LAYERS.get(LaneType(int(graph.kind[lane])))
         if layer is None:
             continue
-        span = graph.points(lane)
-        xy = graph.xy[span].astype(np.float64)
-        normal = np.stack([-np.sin(graph.yaw[span]), np.cos(graph.yaw[span])], 1)
-        half = 0.5 * graph.width[span, None]
-        inside = bool(graph.junction[lane] >= 0)
-        out.append(Strip(lane, layer, inside, thin(xy + normal * half), thin(xy - normal * half)))
-    return sorted(out, key=lambda strip: strip.layer)
+        lane_points = graph.points(lane)
+        xy = graph.xy[lane_points].astype(np.float64)
+        normal = np.stack([-np.sin(graph.yaw[lane_points]), np.cos(graph.yaw[lane_points])], 1)
+        half_width = 0.5 * graph.width[lane_points, None]
+        in_junction = bool(graph.junction[lane] >= 0)
+        lane_strips.append(
+            Strip(lane, layer, in_junction, thin(xy + normal * half_width), thin(xy - normal * half_width))
+        )
+    return sorted(lane_strips, key=lambda strip: strip.layer)
 
 
 def junction_areas(graph: LaneGraph, drawn: Sequence[Strip], *, scale: float = 5.0) -> list[F64]:
@@ -58,37 +60,44 @@ def junction_areas(graph: LaneGraph, drawn: Sequence[Strip], *, scale: float = 5
 
     The union is taken on a raster of `scale` pixels a metre, slits under 1 m closed.
     """
-    out = []
+    areas = []
+    # An odd size, so that the kernel has a central pixel.
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(scale) | 1, int(scale) | 1))
     for junction in np.unique(graph.junction[graph.junction >= 0]):
-        rings = [s.ring for s in drawn if graph.junction[s.lane] == junction and s.layer == LAYERS[LaneType.DRIVING]]
+        rings = [
+            strip.ring
+            for strip in drawn
+            if graph.junction[strip.lane] == junction and strip.layer == LAYERS[LaneType.DRIVING]
+        ]
         if not rings:
             continue
-        low = np.min([r.min(axis=0) for r in rings], axis=0) - 2.0
-        size = np.ceil((np.max([r.max(axis=0) for r in rings], axis=0) + 2.0 - low) * scale).astype(int)
+        origin = np.min([outline.min(axis=0) for outline in rings], axis=0) - 2.0
+        size = np.ceil((np.max([outline.max(axis=0) for outline in rings], axis=0) + 2.0 - origin) * scale).astype(int)
         mask = np.zeros((size[1], size[0]), np.uint8)
         for ring in rings:
-            cv2.fillPoly(mask, [np.round((ring - low) * scale).astype(np.int32)], 1)
+            cv2.fillPoly(mask, [np.round((ring - origin) * scale).astype(np.int32)], 1)
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        out += [thin(c[:, 0].astype(np.float64) / scale + low, 0.15) for c in contours if len(c) > 8]
-    return out
+        areas += [
+            thin(contour[:, 0].astype(np.float64) / scale + origin, 0.15) for contour in contours if len(contour) > 8
+        ]
+    return areas
 
 
 def thin(xy: F64, tolerance: float = 0.04) -> F64:
     """A polyline without the points that leave its shape within `tolerance` m (Douglas-Peucker)."""
-    keep = np.zeros(len(xy), bool)
-    keep[[0, -1]] = True
+    is_kept = np.zeros(len(xy), bool)
+    is_kept[[0, -1]] = True
     stack = [(0, len(xy) - 1)]
     while stack:
-        a, b = stack.pop()
-        if b - a < 2:
+        first, last = stack.pop()
+        if last - first < 2:
             continue
-        d = xy[b] - xy[a]
-        rest = xy[a + 1 : b] - xy[a]
-        off = np.abs(rest[:, 0] * d[1] - rest[:, 1] * d[0]) / max(float(np.hypot(*d)), 1e-9)
-        k = int(np.argmax(off))
-        if off[k] > tolerance:
-            keep[a + 1 + k] = True
-            stack += [(a, a + 1 + k), (a + 1 + k, b)]
-    return xy[keep]
+        chord = xy[last] - xy[first]
+        offsets = xy[first + 1 : last] - xy[first]
+        deviation = np.abs(offsets[:, 0] * chord[1] - offsets[:, 1] * chord[0]) / max(float(np.hypot(*chord)), 1e-9)
+        farthest = int(np.argmax(deviation))
+        if deviation[farthest] > tolerance:
+            is_kept[first + 1 + farthest] = True
+            stack += [(first, first + 1 + farthest), (first + 1 + farthest, last)]
+    return xy[is_kept]

@@ -1,4 +1,4 @@
-"""What this machine has: devices, cores, versions; and how Warp is started quietly."""
+"""Properties of this machine (devices, cores, versions), and a quiet start of Warp."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ssad.core.version import __version__
 
 
 def cuda_driver() -> bool:
-    """Whether this machine has NVIDIA's driver; asked before Warp is loaded, which warns when there is none."""
+    """Return whether NVIDIA's driver is installed; checked before Warp is loaded, which warns if it is missing."""
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -25,21 +25,21 @@ def cuda_driver() -> bool:
 
 @cache
 def quiet_warp() -> None:
-    """Start Warp, once a process, and keep its banner and its notes about the kernel cache off the terminal."""
+    """Start Warp, once per process, without its banner and its notes about the kernel cache."""
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
     if cuda_driver():
         warp.init()
         return
-    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:  # its native part warns of the missing driver on the descriptor itself
-        os.dup2(null, 2)
+    saved_stderr, null_device = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:  # Warp's native code writes its warning to the descriptor, past sys.stderr
+        os.dup2(null_device, 2)
         warp.init()
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(null)
+        os.dup2(saved_stderr, 2)
+        os.close(saved_stderr)
+        os.close(null_device)
 
 
 def keep_memory(size: int = 1 << 30) -> None:
@@ -75,40 +75,44 @@ def pick_device(wanted: str) -> str:
 
 
 def default_workers() -> int:
-    """One worker a core that this process may use."""
+    """Return the number of workers: one for each core that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def versions(device: str) -> dict[str, str]:
-    """Versions that a record carries."""
-    found = {"ssad": __version__, "python": platform.python_version(), "device": device}
+    """Return the versions that a record carries."""
+    result = {"ssad": __version__, "python": platform.python_version(), "device": device}
     for name in ("numpy", "warp-lang", "torch"):
         try:
-            found[name] = version(name)
+            result[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return result
 
 
 def machine() -> dict[str, str]:
-    """What a run was made on: operating system, processor, cores. No name of it or of its user."""
+    """Return the operating system, processor and core count of this machine; neither its name nor its user."""
     name = platform.processor()
-    with contextlib.suppress(OSError):  # Linux says more here
+    with contextlib.suppress(OSError):  # Linux names the processor here
         lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
         name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
-    found = {"system": f"{platform.system()} {platform.machine()}", "processor": name, "cores": str(default_workers())}
-    return {key: value for key, value in found.items() if value}
+    properties = {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": name,
+        "cores": str(default_workers()),
+    }
+    return {key: value for key, value in properties.items() if value}
 
 
 def visible_gpus() -> list[str]:
-    """The CUDA devices that this process may use, as CUDA_VISIBLE_DEVICES names them."""
-    given = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if given is not None:
-        return [name.strip() for name in given.split(",") if name.strip()]
+    """Return the CUDA devices that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    selection = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if selection is not None:
+        return [name.strip() for name in selection.split(",") if name.strip()]
     import warp
 
     quiet_warp()
-    return [str(k) for k in range(warp.get_cuda_device_count())]
+    return [str(index) for index in range(warp.get_cuda_device_count())]
 
 
 # processes that share a GPU: planning a shift and reading pictures is work for the host; and memory of each, bytes
@@ -116,7 +120,7 @@ GPU_WORKERS, GPU_SHARE = 14, 4 << 30
 
 
 def gpu_workers(gpus: int) -> int:
-    """How many processes share so many GPUs (the first ones that are visible)."""
+    """Return the number of processes that share the first `gpus` visible GPUs."""
     if not gpus:
         return 0
     import warp

@@ -1,7 +1,7 @@
 """Names of the nuScenes detection task, in their orders.
 
 Two orders of classes and attributes are in use: that of the official evaluation (nuscenes-devkit 1.2.0; labels of
-tables, results and scores), and that of mmdetection3d 1.4 (labels of 3D detectors, since published weights have it).
+tables, results and scores), and that of mmdetection3d 1.4 (labels of 3D detectors, since published weights use it).
 Sources: nuscenes.org, schema of version 1.0; nuscenes-devkit, detection_cvpr_2019.json; mmdetection3d, nus-mono3d.py,
 nuscenes_metric.py.
 """
@@ -65,7 +65,7 @@ MMDET3D_ATTRIBUTES: Final = (
     "none",
 )
 NO_ATTRIBUTE: Final = MMDET3D_ATTRIBUTES.index("none")
-# what mmdetection3d exports where an attribute does not fit its class; "": a class without attributes
+# mmdetection3d's export for an attribute that does not fit its class; "": a class without attributes
 USUAL_ATTRIBUTE: Final[Mapping[str, str]] = MappingProxyType(
     {
         "car": "vehicle.parked",
@@ -121,5 +121,5 @@ VISIBILITY: Final[Mapping[str, float]] = MappingProxyType({"1": 0.0, "2": 0.4, "
 
 
 def visibility_token(share: float) -> str:
-    """Level of visibility of a share in 0..1: '1' up to 40 %, '2' up to 60, '3' up to 80, '4' above."""
-    return max((token for token, least in VISIBILITY.items() if share > least), default="1")
+    """Return the visibility level of a share in 0..1: '1' up to 40 %, '2' up to 60, '3' up to 80, '4' above."""
+    return max((token for token, lower_bound in VISIBILITY.items() if share > lower_bound), default="1")

@@ -1,4 +1,4 @@
-"""What a pickle would cost, found by following its steps without building anything."""
+"""Cost estimate of a pickle, by following its opcodes without building anything."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pickletools import genops, markobject, opcodes
 
 MOST_STEPS = 5_000_000  # a tensor of a checkpoint takes about 40
 
-_TAKES = {  # of each step: how many values it takes, whether all down to a mark as well, how many it puts back
+_TAKES = {  # of each opcode: values popped, whether also all down to a mark, values pushed
     op.name: (
         op.stack_before.index(markobject) if markobject in op.stack_before else len(op.stack_before),
         markobject in op.stack_before,
@@ -21,20 +21,20 @@ _BRINGS = frozenset({"GET", "BINGET", "LONG_BINGET"})
 
 
 class RefusedError(Exception):
-    """A file asks for what no weights need."""
+    """A file requests something that no weights need."""
 
 
 class Steps:
-    """How much work a file may still ask for."""
+    """Budget of work that a file may still request."""
 
     def __init__(self) -> None:
         self.left = MOST_STEPS
 
     def take(self, count: int) -> None:
-        """Count some more steps.
+        """Subtract steps from the budget.
 
         Raises:
-            RefusedError: There are too many.
+            RefusedError: The budget is exhausted.
         """
         self.left -= count
         if self.left < 0:
@@ -42,50 +42,52 @@ class Steps:
 
 
 def walk(file: io.BytesIO, part: str, steps: Steps) -> None:
-    """Follow the pickle that starts here, and leave the file where it was.
+    """Follow the pickle that starts here, and restore the position of the file.
 
-    A value counts as one step and those of all that it is made of, so that shared parts count each time: small tuples
-    of tuples that are huge when unfolded would be hashed for ages, and tuples that are nested very deeply overflow the
-    interpreter's stack. Lists, dicts and objects, which are never hashed by what they hold, count as one.
+    A value costs one step plus the steps of all its parts, so shared parts count each time: small tuples of
+    tuples that are huge when unfolded would take ages to hash, and very deeply nested tuples overflow the
+    interpreter's stack. Lists, dicts and objects, which are never hashed by their content, cost one step.
 
-    The interpreter makes room for all numbers up to the one under which a value is kept. Picklers count from 0, so a
-    number is always smaller than that of the bytes before it.
+    The interpreter allocates its memo up to the largest index in use. Picklers count from 0, so an index is
+    always smaller than the number of bytes before it.
 
     Args:
-        file: Stands at the start of a pickle.
-        part: What to call the file in an error.
-        steps: Those of this pickle are taken from it.
+        file: Positioned at the start of a pickle.
+        part: Name of the file in an error.
+        steps: Budget from which the steps of this pickle are taken.
 
     Raises:
         RefusedError: It would take too many steps, or too much memory.
-        ValueError: It is none.
+        ValueError: It is no pickle.
     """
-    start = file.tell()
-    stack: list[int] = []  # steps of each value; 0 is a mark
-    kept: dict[int, int] = {}
-    for op, argument, at in genops(file):
+    start_position = file.tell()
+    stack_costs: list[int] = []  # steps of each value; 0 is a mark
+    memo_costs: dict[int, int] = {}
+    for opcode, argument, opcode_position in genops(file):
         try:
-            if op.name in _KEEPS:
-                number = len(kept) if argument is None else int(argument)
-                if number > (at or 0) - start:
+            if opcode.name in _KEEPS:
+                memo_index = len(memo_costs) if argument is None else int(argument)
+                if memo_index > (opcode_position or 0) - start_position:
                     raise RefusedError(
-                        f"byte {at} of {part} keeps a value as number {number:,}, which no pickle of this size needs"
+                        f"byte {opcode_position} of {part} keeps a value as number "
+                        f"{memo_index:,}, which no pickle of this size needs"
                     )
-                kept[number] = stack[-1]
+                memo_costs[memo_index] = stack_costs[-1]
                 continue
-            count, to_mark, puts = _TAKES[op.name]
-            taken = 1
-            while to_mark and (value := stack.pop()):
-                taken += value
-            for _ in range(count):
-                taken += stack.pop()
+            pop_count, pops_to_mark, push_count = _TAKES[opcode.name]
+            cost = 1
+            while pops_to_mark and (value_cost := stack_costs.pop()):
+                cost += value_cost
+            for _ in range(pop_count):
+                cost += stack_costs.pop()
         except IndexError:
-            raise ValueError(f"byte {at} of {part} takes a value that is not there") from None
-        steps.take(taken)
-        if op.name == "MARK":
-            stack.append(0)
-        elif op.name in _BRINGS:
-            stack.append(kept.get(int(argument or 0), 1))
+            raise ValueError(f"byte {opcode_position} of {part} takes a value that is not there") from None
+        steps.take(cost)
+        if opcode.name == "MARK":
+            stack_costs.append(0)
+        elif opcode.name in _BRINGS:
+            # A shared value counts again at each use, since hashing unfolds it.
+            stack_costs.append(memo_costs.get(int(argument or 0), 1))
         else:
-            stack += [1 if op.name in _FILLS else taken] * puts
-    file.seek(start)
+            stack_costs += [1 if opcode.name in _FILLS else cost] * push_count
+    file.seek(start_position)

@@ -33,7 +33,7 @@ MAGIC = 0x1950A86A20F9469CFC6C  # the first number of the older stream
 STREAM = 1001
 DEEPEST = 60
 MOST = 200_000
-MOST_TIMES = 16  # tensors may share their numbers, but all together are at most so many times as large as the file
+MOST_TIMES = 16  # limit of the tensors' total size, in sizes of the file; tensors may share storage
 CONVERT = "convert it where it was made: safetensors.torch.save_file(model.state_dict(), 'weights.safetensors')"
 NESTS = ("ema", "average", "state_dict", "model_state_dict", "model", "module", "net", "weights")
 
@@ -75,7 +75,7 @@ class _Strided:
 
 
 class _Inert:
-    """Stands for an object whose class is not built: its arguments, state and items."""
+    """Placeholder of an object whose class is not built: its arguments, state and items."""
 
     def __new__(cls, *args: Any, **options: Any) -> _Inert:
         self = super().__new__(cls)
@@ -97,23 +97,23 @@ class _Inert:
         self.entries[key] = value
 
     def append(self, value: Any) -> None:
-        """An item of a list."""
+        """Append an item of a list."""
         self.list.append(value)
 
     def extend(self, values: Any) -> None:
-        """Items of a list."""
+        """Append items of a list."""
         self.list.extend(values)
 
 
 class _Table(dict[Any, Any]):
-    """An OrderedDict of the file; what hangs on it besides its items is left out."""
+    """An OrderedDict of the file, without further attributes."""
 
     def __setstate__(self, state: Any) -> None:
         pass
 
 
 class _Maker:
-    """A function that the file may call; it cannot be changed by the file. What it copies counts as steps."""
+    """A function that the file may call but not change; the items it copies count as steps."""
 
     __slots__ = ("_make", "_steps")
 
@@ -129,7 +129,7 @@ class _Maker:
 
 
 def _table(items: Any = ()) -> _Table:
-    """An OrderedDict; Python 2 wrote it with a list of its items. Of those, what has no text for a name is left out."""
+    """Return an OrderedDict from its items (as written by Python 2), without names that are not text."""
     return _Table((name, value) for name, value in items if isinstance(name, str))
 
 
@@ -156,7 +156,7 @@ _MAKERS: dict[str, Callable[..., Any]] = {
 
 
 class _Reader(pickle.Unpickler):
-    """An unpickler that can build tensors to be, plain containers and inert records, and nothing else."""
+    """An unpickler that builds only tensor specifications, plain containers and inert records."""
 
     def __init__(self, file: io.BytesIO, part: str = "the file") -> None:
         self.steps = Steps()
@@ -166,26 +166,27 @@ class _Reader(pickle.Unpickler):
         self.classes: dict[str, type] = {}
 
     def find_class(self, module: str, name: str) -> Any:
-        """Never an object of the running program."""
-        full = f"{module}.{name}"
-        self.names.add(full)
+        """Return a safe stand-in for a class, never an object of the running program."""
+        full_name = f"{module}.{name}"
+        self.names.add(full_name)
         if module.split(".", maxsplit=1)[0] in _ATTACKS or (
             module in {"builtins", "__builtin__"} and name in _ATTACK_CALLS
         ):
-            raise RefusedError(f"it would call {full}, which no weights need")
+            raise RefusedError(f"it would call {full_name}, which no weights need")
         if module in {"torch", "torch.storage"} and name in _KINDS:
             return _KINDS[name]
         if module == "torch" and isinstance(getattr(torch, name, None), torch.dtype):
             return getattr(torch, name)
-        if full in _MAKERS:
-            return _Maker(_MAKERS[full], self.steps)
-        if full not in self.classes:
+        if full_name in _MAKERS:
+            return _Maker(_MAKERS[full_name], self.steps)
+        # One class for each name, so that a file cannot create them without limit.
+        if full_name not in self.classes:
             self.steps.take(500)  # a class is far larger than its name
-            self.classes[full] = type(name, (_Inert,), {"__module__": module})
-        return self.classes[full]
+            self.classes[full_name] = type(name, (_Inert,), {"__module__": module})
+        return self.classes[full_name]
 
     def persistent_load(self, pid: Any) -> Any:
-        """The description of a storage; for a class that comes with its source, the class."""
+        """Return the description of a storage; for a class stored with its source, the class."""
         if isinstance(pid, tuple) and len(pid) == 4 and pid[0] == "module":
             return pid[1]
         if not isinstance(pid, tuple) or len(pid) not in (5, 6) or pid[0] != "storage":
@@ -198,7 +199,7 @@ class _Reader(pickle.Unpickler):
 
 
 class _Numbers:
-    """Reads tensors once the pickle is known."""
+    """Reads tensors once the pickle is loaded."""
 
     def __init__(self, read: Callable[[str], bytes], size: int) -> None:
         self.read = read
@@ -213,54 +214,62 @@ class _Numbers:
         kind = at.kind if isinstance(at.kind, torch.dtype) else storage.kind
         if storage.key not in self.held:
             self.held[storage.key] = torch.frombuffer(bytearray(self.read(storage.key) or b"\0"), dtype=torch.uint8)
-        data = self.held[storage.key]
+        storage_bytes = self.held[storage.key]
         size, stride, offset = at.size, at.stride, at.offset
-        whole = all(type(v) is int and v >= 0 for v in (offset, *size, *stride))
-        if not whole or len(size) != len(stride) or len(size) > 16:
+        is_whole = all(type(number) is int and number >= 0 for number in (offset, *size, *stride))
+        if not is_whole or len(size) != len(stride) or len(size) > 16:
             raise ValueError("a tensor of no shape")
-        count = 1
+        element_count = 1
         for length in size:
-            count *= length
-        if count == 0:
+            element_count *= length
+        if element_count == 0:
             return torch.empty(size, dtype=kind)
-        last = offset + sum((length - 1) * step for length, step in zip(size, stride, strict=True))
-        have = len(data) // kind.itemsize
-        if last >= have or count > have:
+        last_index = offset + sum((length - 1) * step for length, step in zip(size, stride, strict=True))
+        available = len(storage_bytes) // kind.itemsize
+        if last_index >= available or element_count > available:
             raise ValueError("a tensor larger than its storage")
-        self.left -= count * kind.itemsize
+        self.left -= element_count * kind.itemsize
         if self.left < 0:
             raise RefusedError(f"its tensors take more than {MOST_TIMES} times its size or {MAX_BYTES // MIB} MiB")
-        return data[: have * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
+        # A clone: tensors of the file may overlap, and safetensors refuses shared memory.
+        return storage_bytes[: available * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
 
 
 def read_pickled(path: str | Path) -> dict[str, Tensor]:
-    """The state dict in a checkpoint file, alone or nested (`NESTS`, averaged weights first), or of a pickled module.
+    """Return the state dict in a checkpoint file: alone, nested (`NESTS`, averaged weights first), or of a module.
 
     Raises:
         FormatError: The file is truncated, not a checkpoint, hostile, or holds no tensors by name.
     """
     try:
         with open(path, "rb") as file:
-            start = file.read(4)
+            signature = file.read(4)
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
     try:
         with ExitStack() as files:
-            tree, numbers, names = _read_zip(path, files) if start[:2] == b"PK" else _read_stream(path)
+            tree, numbers, names = _read_zip(path, files) if signature[:2] == b"PK" else _read_stream(path)
             state = _state(tree, 0)
             if state is None:
-                about = ", ".join(sorted(n for n in names if n not in _MAKERS and not n.startswith("torch."))[:3])
+                other_names = ", ".join(
+                    sorted(
+                        global_name
+                        for global_name in names
+                        if global_name not in _MAKERS and not global_name.startswith("torch.")
+                    )[:3]
+                )
                 raise FormatError(
-                    f"{path}: holds no state dict (tensors by name){f', but {about}' if about else ''}; {CONVERT}"
+                    f"{path}: holds no state dict (tensors by "
+                    f"name){f', but {other_names}' if other_names else ''}; {CONVERT}"
                 )
             return {name: numbers.tensor(value) for name, value in state}
     except FormatError:
         raise
     except RefusedError as error:
         raise FormatError(f"{path}: refused: {error}; nothing was run") from None
-    except Exception as error:  # what broken bytes raise is without number
-        text = " ".join(str(error).split())[:120] or type(error).__name__
-        raise FormatError(f"{path}: not a readable PyTorch checkpoint: {text}; {CONVERT}") from None
+    except Exception as error:  # broken bytes may raise any exception
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise FormatError(f"{path}: not a readable PyTorch checkpoint: {reason}; {CONVERT}") from None
 
 
 def _read_zip(path: str | Path, files: ExitStack) -> tuple[Any, _Numbers, set[str]]:
@@ -268,28 +277,29 @@ def _read_zip(path: str | Path, files: ExitStack) -> tuple[Any, _Numbers, set[st
     members = {member.filename: member for member in archive.infolist()}
     if any(name.endswith("/constants.pkl") for name in members):
         raise FormatError(f"{path}: a TorchScript program, not weights; {CONVERT}")
-    main = [name for name in members if name.endswith("/data.pkl") and name.count("/") == 1]
-    if len(main) != 1:
+    pickle_names = [name for name in members if name.endswith("/data.pkl") and name.count("/") == 1]
+    if len(pickle_names) != 1:
         raise FormatError(f"{path}: a zip file, but not one that PyTorch wrote")
-    root = main[0].removesuffix("data.pkl")
+    root = pickle_names[0].removesuffix("data.pkl")
     if any(member.compress_type != zipfile.ZIP_STORED for member in members.values()):
         raise FormatError(f"{path}: its parts are compressed, which PyTorch never does")
     size = Path(path).stat().st_size
+    # Overlapping members are how a small zip file expands without compression.
     if sum(member.file_size for member in members.values()) > size:
         raise FormatError(f"{path}: its parts overlap, which PyTorch never does")
-    if members[main[0]].file_size > MAX_PICKLE:
+    if members[pickle_names[0]].file_size > MAX_PICKLE:
         raise FormatError(f"{path}: its description alone is larger than {MAX_PICKLE // MIB} MiB")
     if f"{root}byteorder" in members and archive.read(f"{root}byteorder") != b"little":
         raise FormatError(f"{path}: written by a big-endian machine; {CONVERT}")
-    reader = _Reader(io.BytesIO(archive.read(main[0])), main[0])
+    reader = _Reader(io.BytesIO(archive.read(pickle_names[0])), pickle_names[0])
     return reader.load(), _Numbers(lambda key: archive.read(f"{root}data/{key}"), size), reader.names
 
 
 def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
-    data = read_bytes(path, limit=MAX_BYTES)
-    if data[:1] != b"\x80":
+    content = read_bytes(path, limit=MAX_BYTES)
+    if content[:1] != b"\x80":
         raise FormatError(f"{path}: no PyTorch checkpoint; {CONVERT}")
-    file = io.BytesIO(data)
+    file = io.BytesIO(content)
     if _Reader(file).load() != MAGIC:
         raise FormatError(f"{path}: a Python pickle, not a PyTorch checkpoint; {CONVERT}")
     if _Reader(file).load() != STREAM or not dict(_Reader(file).load()).get("little_endian", True):
@@ -297,26 +307,27 @@ def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
     reader = _Reader(file)
     tree = reader.load()
     keys = _Reader(file).load()
-    kinds = {storage.key: storage for storage in _storages(tree)}
-    places: dict[str, tuple[int, int]] = {}
+    storage_by_key = {storage.key: storage for storage in _storages(tree)}
+    spans: dict[str, tuple[int, int]] = {}
     for key in keys:
         (count,) = struct.unpack("<q", file.read(8))
-        kind = kinds[key].kind if key in kinds else None
-        if not isinstance(kind, torch.dtype) or count < 0 or file.tell() + count * kind.itemsize > len(data):
+        kind = storage_by_key[key].kind if key in storage_by_key else None
+        if not isinstance(kind, torch.dtype) or count < 0 or file.tell() + count * kind.itemsize > len(content):
             raise ValueError(f"storage {key} is cut short or unknown")
-        places[str(key)] = (file.tell(), file.tell() + count * kind.itemsize)
-        file.seek(places[str(key)][1])
-    return tree, _Numbers(lambda key: data[slice(*places[key])], len(data)), reader.names
+        spans[str(key)] = (file.tell(), file.tell() + count * kind.itemsize)
+        file.seek(spans[str(key)][1])
+    return tree, _Numbers(lambda key: content[slice(*spans[key])], len(content)), reader.names
 
 
 def _storages(tree: Any) -> Iterator[_Storage]:
-    """All storages that a tree refers to."""
-    stack, seen = [tree], set()
+    """Yield all storages that a tree refers to."""
+    stack, visited_ids = [tree], set()
     while stack:
         value = stack.pop()
-        if id(value) in seen or isinstance(value, (str, bytes, int, float)):
+        # A pickle can contain cycles.
+        if id(value) in visited_ids or isinstance(value, (str, bytes, int, float)):
             continue
-        seen.add(id(value))
+        visited_ids.add(id(value))
         if isinstance(value, _Storage):
             yield value
         elif isinstance(value, _Strided):
@@ -338,40 +349,47 @@ def _mapping(value: Any) -> Mapping[Any, Any] | None:
 
 
 def _state(tree: Any, depth: int) -> list[tuple[str, _Strided]] | None:
-    """Names and tensors of the first state dict that is found, None if there is none."""
+    """Return names and tensors of the first state dict in a tree, None if there is none."""
     if depth > 4:
         return None
     if isinstance(tree, _Inert) and isinstance(tree.state, dict) and _mapping(tree.state.get("_modules")) is not None:
         return _module(tree)
-    held = _mapping(tree)
-    if held is None:
-        inside = tree.state if isinstance(tree, _Inert) else None  # an object that keeps a model, such as an average
-        return _state(inside, depth + 1) if isinstance(inside, dict) else None
-    named = [(key, value) for key, value in held.items() if isinstance(key, str) and isinstance(value, _Strided)]
-    if named:
-        return named
+    mapping = _mapping(tree)
+    if mapping is None:
+        inner_state = (
+            tree.state if isinstance(tree, _Inert) else None
+        )  # an object that keeps a model, such as an average
+        return _state(inner_state, depth + 1) if isinstance(inner_state, dict) else None
+    named_tensors = [
+        (key, value) for key, value in mapping.items() if isinstance(key, str) and isinstance(value, _Strided)
+    ]
+    if named_tensors:
+        return named_tensors
     for nest in NESTS:
-        found = _state(held[nest], depth + 1) if held.get(nest) is not None else None
-        if found:
-            return found
+        nested_state = _state(mapping[nest], depth + 1) if mapping.get(nest) is not None else None
+        if nested_state:
+            return nested_state
     return None
 
 
 def _module(root: _Inert) -> list[tuple[str, _Strided]]:
-    """Parameters and buffers of a pickled module and its parts, by the names of its state dict."""
-    found: list[tuple[str, _Strided]] = []
+    """Return parameters and buffers of a pickled module and its submodules, by the names of its state dict."""
+    named_tensors: list[tuple[str, _Strided]] = []
     stack: list[tuple[str, Any, int]] = [("", root, 0)]
-    count = 0
+    module_count = 0
     while stack:
         prefix, module, depth = stack.pop()
-        count += 1
-        if depth > DEEPEST or count > MOST:
+        module_count += 1
+        if depth > DEEPEST or module_count > MOST:
             raise ValueError("a module nested without end")
         state = module.state if isinstance(module, _Inert) and isinstance(module.state, dict) else {}
-        for part in ("_parameters", "_buffers"):
-            for name, value in (_mapping(state.get(part)) or {}).items():
+        for attribute in ("_parameters", "_buffers"):
+            for name, value in (_mapping(state.get(attribute)) or {}).items():
                 if isinstance(value, _Strided):
-                    found.append((f"{prefix}{name}", value))
-        children = [(f"{prefix}{n}.", m, depth + 1) for n, m in (_mapping(state.get("_modules")) or {}).items()]
+                    named_tensors.append((f"{prefix}{name}", value))
+        children = [
+            (f"{prefix}{child_name}.", child, depth + 1)
+            for child_name, child in (_mapping(state.get("_modules")) or {}).items()
+        ]
         stack += reversed(children)
-    return found
+    return named_tensors

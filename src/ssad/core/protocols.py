@@ -1,16 +1,16 @@
-"""What a detector must offer so that others can use it. Drivers and simulators have theirs in `ssad.core.driving`.
+"""Protocol of detectors. Those of drivers and simulators are in `ssad.core.driving`.
 
-A class need not inherit from a protocol: it is enough that it has these attributes and methods. A package offers its
-detectors by name through entry points, and `ssad list` shows them; without a package, a name of the form
-"module:object" is imported from the working folder:
+A class need not inherit from a protocol: having its attributes and methods is enough. A package offers its detectors
+by name through entry points, and `ssad list` shows them; without a package, a name of the form "module:object" is
+imported from the working folder:
 
     [project.entry-points."ssad.detectors"]
     my-yolo = "my_package.detector:make"
 
 Shape letters: B images of a batch, P places of a detector. Units are metres, seconds and radians.
 
-What every implementation owes its callers: a result must not depend on which images share its batch, nor on the order
-in which batches come; and what is random comes from `ssad.core.seeding` alone.
+Requirements on every implementation: a result must not depend on the images that share its batch, nor on the order of
+batches; all randomness comes from `ssad.core.seeding`.
 """
 
 from __future__ import annotations
@@ -50,22 +50,22 @@ class Detector(Protocol):
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
-        """Find objects, without gradient.
+        """Detect objects, without gradient.
 
         Args:
             images: [B, 3, H, W].
             intrinsic: [B, 3, 3], for 3D.
-            threshold: Least score of what is returned; None: the detector's own.
+            threshold: Minimum score of the result; None: the detector's own.
 
         Returns:
-            For each image what was found in it, best first, overlaps suppressed as the detector's source does.
+            The detections of each image, best first, overlaps suppressed as in the detector's source.
 
         Raises:
             ConfigError: Images or intrinsics are not of the shape, type or range above.
         """
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Compute the raw outputs, differentiable to the images.
+        """Compute the raw outputs, differentiable with respect to the images.
 
         Args:
             images: [B, 3, H, W].
@@ -79,14 +79,14 @@ class Detector(Protocol):
         """
 
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """Decide which object each location should predict, as in training (target assignment); not differentiable.
+        """Assign an object to each place, as in training (target assignment); not differentiable.
 
         Args:
             dense: Outputs for B images.
-            truth: What is in each of these images.
+            truth: True objects of each of these images.
 
         Returns:
-            Class and object of each location.
+            Class and object of each place.
         """
 
     def losses(

@@ -36,7 +36,7 @@ class Reference:
 
     @staticmethod
     def of(text: str) -> Reference:
-        """Read a reference.
+        """Parse a reference.
 
         Args:
             text: Such as "mine:Mine?checkpoint=a.pt&reach=20@a": values are numbers, true, false or texts.
@@ -44,52 +44,52 @@ class Reference:
         Raises:
             ConfigError: An argument is not KEY=VALUE, or the label is empty.
         """
-        whole, at, label = text.rpartition("@")
-        if not at or "/" in label:
-            whole, label = text, ""
-        elif not label or not whole:
+        target, separator, label = text.rpartition("@")
+        if not separator or "/" in label:
+            target, label = text, ""
+        elif not label or not target:
             raise ConfigError(f"'{text}': expected NAME@LABEL, such as mine:Mine@first")
-        name, _, told = whole.partition("?")
+        name, _, query = target.partition("?")
         options: dict[str, Any] = {}
-        for part in told.split("&") if told else []:
-            key, equals, value = part.partition("=")
+        for argument in query.split("&") if query else []:
+            key, equals, value = argument.partition("=")
             if not equals or not key.isidentifier() or key in options:
                 raise ConfigError(
-                    f"'{text}': expected arguments as in mine:Mine?checkpoint=a.pt&reach=20, not '{part}'"
+                    f"'{text}': expected arguments as in mine:Mine?checkpoint=a.pt&reach=20, not '{argument}'"
                 )
             options[key] = _value(value)
         return Reference(name, options, label)
 
 
 def _value(text: str) -> Any:
-    """An argument's value: true, false, a number, or the text."""
+    """Return an argument's value: true, false, a number, or the text."""
     if text in ("true", "false"):
         return text == "true"
-    for kind in (int, float):
+    for number_type in (int, float):
         try:
-            return kind(text)
+            return number_type(text)
         except ValueError:
             continue
     return text
 
 
 def label_of(text: str) -> str:
-    """What tables call a system: its label, or all that was said.
+    """Return the name of a system in tables: its label, or the whole reference.
 
     Args:
-        text: As `Reference.of` reads it.
+        text: As for `Reference.of`.
 
     Raises:
-        ConfigError: See there.
+        ConfigError: As for `Reference.of`.
     """
     return Reference.of(text).label or text
 
 
 def split_weights(text: str) -> tuple[str, str]:
-    """A detector as a suite writes it, without its weights, and these.
+    """Split the weights from a detector in a suite.
 
     Args:
-        text: NAME or NAME=FILE; what follows a ? are arguments, and no weights.
+        text: NAME or NAME=FILE; text behind a ? are arguments, not weights.
 
     Returns:
         Name with arguments and label; file, "" for none.
@@ -141,33 +141,33 @@ def make(kind: str, name: str, found: Any, options: Mapping[str, Any], needs: Se
         ConfigError: Its maker raises, or it lacks an attribute or a method.
     """
     try:
-        made = found(**options) if callable(found) else found
+        product = found(**options) if callable(found) else found
     except SSADError:
         raise
     except Exception as error:
         raise ConfigError(f"{kind} '{name}': making it failed: {describe(error)}") from error
-    missing = [one for one in needs if not hasattr(made, one)]
+    missing = [member for member in needs if not hasattr(product, member)]
     if missing:
-        lacks = f"of type {type(made).__name__}, lacks {', '.join(missing)}"
-        raise ConfigError(f"{kind} '{name}', {lacks}; it needs {', '.join(needs)}")
-    return made
+        problem = f"of type {type(product).__name__}, lacks {', '.join(missing)}"
+        raise ConfigError(f"{kind} '{name}', {problem}; it needs {', '.join(needs)}")
+    return product
 
 
 def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
     """Import the object behind a name.
 
-    A name with a colon is imported with the working folder on the path, as Python's own command does it.
+    A name with a colon is imported with the working folder on the path, as Python's own command does.
 
     Args:
         kind: Singular noun for messages and for the group of entry points: "system" means `ssad.systems`.
-        table: Built-in names and where they are, as "module:object".
-        name: A name of the table, one that a package offers, or "module:object".
+        table: Built-in names and their objects, as "module:object".
+        name: A name of the table, one offered by a package, or "module:object".
 
     Returns:
-        The object, of whatever type it is.
+        The object, of any type.
 
     Raises:
-        UnknownNameError: Nobody offers the name; the message has the three closest.
+        UnknownNameError: The name is not offered; the message has the three closest.
         MissingExtraError: It needs an extra that is not installed.
         ConfigError: The module of a package or of the user does not import, or does not have the object.
     """
@@ -176,6 +176,7 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
         try:
             return getattr(importlib.import_module(module), attribute)
         except ModuleNotFoundError as error:
+            # Torch and others are optional; name the extra instead of the module.
             raise missing_extra(error, f"{kind} '{name}'") or error from None
     plugins = {point.name: point for point in entry_points(group=f"ssad.{kind}s")}
     if name in plugins:
@@ -186,7 +187,7 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
 
 
 def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
-    """List all names of a kind.
+    """Return all names of a kind.
 
     Args:
         kind: As for `resolve`.
@@ -204,38 +205,47 @@ def _import(kind: str, name: str, target: str) -> Any:
     attribute = attribute.split("[")[0].strip()
     if not module_name or not all(part.isidentifier() for part in module_name.split(".")) or not attribute:
         raise ConfigError(f"{kind} '{name}': expected module:object, such as my_driver:MyDriver")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.insert(0, here)
+    working_folder = str(Path.cwd())
+    # The installed command `ssad`, unlike `python -m`, does not add the working folder.
+    if working_folder not in sys.path:
+        sys.path.insert(0, working_folder)
     try:
         value: Any = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # a script that ends the process is no module
-        why = describe(error) + _hint(error, module_name, here)
-        raise ConfigError(f"{kind} '{name}': importing {module_name} failed: {why}") from error
+        reason = describe(error) + _hint(error, module_name, working_folder)
+        raise ConfigError(f"{kind} '{name}': importing {module_name} failed: {reason}") from error
     for part in attribute.split("."):
         try:
             value = getattr(value, part)
         except AttributeError:
-            close = difflib.get_close_matches(part, [n for n in dir(value) if n[0] != "_"], n=3, cutoff=0.3)
+            close = difflib.get_close_matches(
+                part, [member for member in dir(value) if member[0] != "_"], n=3, cutoff=0.3
+            )
             hint = f"; closest: {', '.join(close)}" if close else ""
             raise ConfigError(f"{kind} '{name}': {module_name} has no '{part}'{hint}") from None
     return value
 
 
 def describe(error: BaseException) -> str:
-    """Put an error into one line.
+    """Describe an error in one line.
 
     Args:
-        error: What was raised.
+        error: The exception.
 
     Returns:
-        Its type, its text, and the innermost file and line that is not of the import machinery.
+        Its type, its text, and the innermost file and line outside the import machinery.
     """
     if isinstance(error, SyntaxError):
         return f"{type(error).__name__}: {error.msg} ({error.filename}:{error.lineno})"
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]
-    own = [f for f in frames if f.filename not in (__file__, importlib.__file__)]
-    where = f" ({own[-1].filename}:{own[-1].lineno})" if own else ""
+    frames = [
+        frame_summary
+        for frame_summary in traceback.extract_tb(error.__traceback__)
+        if not frame_summary.filename.startswith("<frozen")
+    ]
+    user_frames = [
+        frame_summary for frame_summary in frames if frame_summary.filename not in (__file__, importlib.__file__)
+    ]
+    where = f" ({user_frames[-1].filename}:{user_frames[-1].lineno})" if user_frames else ""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}{f': {text}' if text else ''}{where}"
 

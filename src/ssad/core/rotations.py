@@ -1,7 +1,7 @@
 """Rotations: unit quaternions (w, x, y, z), 3 x 3 matrices, yaw, poses. Radians, right-handed; any leading axes.
 
-A matrix takes vectors of the turned frame to the frame it is turned in; its columns are the turned axes. Yaw turns
-about z, counter-clockwise from x.
+A matrix takes vectors of the rotated frame to the parent frame; its columns are the rotated axes. Yaw turns about z,
+counter-clockwise from x.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ Floats = npt.NDArray[np.floating[Any]]
 
 
 def quaternion_to_matrix(quaternion: npt.ArrayLike) -> F64:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] of any length; length 0 is no rotation."""
-    given = np.asarray(quaternion, np.float64)
-    length = np.linalg.norm(given, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(given / np.where(length > 0.0, length, 1.0), -1, 0)
+    """Return rotation matrices [..., 3, 3] of quaternions [..., 4] of any length; length 0 is no rotation."""
+    values = np.asarray(quaternion, np.float64)
+    length = np.linalg.norm(values, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(values / np.where(length > 0.0, length, 1.0), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -30,37 +30,37 @@ def quaternion_to_matrix(quaternion: npt.ArrayLike) -> F64:
 
 
 def matrix_to_quaternion(matrix: npt.ArrayLike) -> F64:
-    """Unit quaternions [..., 4] of rotation matrices [..., 3, 3], to about 1e-8; of the two that of w >= 0."""
-    m = np.asarray(matrix, np.float64)
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    """Return unit quaternions [..., 4] with w >= 0 of rotation matrices [..., 3, 3], to about 1e-8."""
+    rotation = np.asarray(matrix, np.float64)
+    xx, yy, zz = rotation[..., 0, 0], rotation[..., 1, 1], rotation[..., 2, 2]
     squares = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], -1)
-    parts = np.sqrt(np.maximum(squares, 0.0)) / 2
-    # the signs are those of the largest part's products with the others, which are far from 0
-    wx, wy, wz = (m[..., k, j] - m[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1)))
-    yz, zx, xy = (m[..., k, j] + m[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1)))
-    one = np.ones_like(wx)
-    products = np.stack([one, wx, wy, wz, wx, one, xy, zx, wy, xy, one, yz, wz, zx, yz, one], -1)
-    largest = parts.argmax(-1)[..., None, None]
-    sign = np.take_along_axis(products.reshape(*one.shape, 4, 4), largest, -2)[..., 0, :]
-    signed = np.copysign(parts, sign)
+    magnitudes = np.sqrt(np.maximum(squares, 0.0)) / 2
+    # Signs come from the products of the largest component with the others, which are farthest from 0.
+    wx, wy, wz = (rotation[..., k, j] - rotation[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1)))
+    yz, zx, xy = (rotation[..., k, j] + rotation[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1)))
+    unit = np.ones_like(wx)
+    products = np.stack([unit, wx, wy, wz, wx, unit, xy, zx, wy, xy, unit, yz, wz, zx, yz, unit], -1)
+    largest = magnitudes.argmax(-1)[..., None, None]
+    signs = np.take_along_axis(products.reshape(*unit.shape, 4, 4), largest, -2)[..., 0, :]
+    signed = np.copysign(magnitudes, signs)
     return np.asarray(np.where(np.signbit(signed[..., :1]), -signed, signed) + 0.0, np.float64)  # + 0.0: no -0.0
 
 
 def yaw_to_quaternion(yaw: npt.ArrayLike) -> F64:
-    """Quaternions [..., 4] of turns about z by yaw [...]."""
-    half = np.asarray(yaw, np.float64) / 2
-    none = np.zeros_like(half)
-    return np.stack([np.cos(half), none, none, np.sin(half)], -1)
+    """Return quaternions [..., 4] of rotations about z by yaw [...]."""
+    half_angle = np.asarray(yaw, np.float64) / 2
+    zeros = np.zeros_like(half_angle)
+    return np.stack([np.cos(half_angle), zeros, zeros, np.sin(half_angle)], -1)
 
 
 def quaternion_to_yaw(quaternion: npt.ArrayLike) -> F64:
-    """Headings [...] of quaternions [..., 4] of any length: direction of the turned x axis in the plane."""
+    """Return headings [...] of quaternions [..., 4] of any length: direction of the rotated x axis in the plane."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, np.float64), -1, 0)
     return np.asarray(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))
 
 
 def quaternion_product(first: npt.ArrayLike, second: npt.ArrayLike) -> F64:
-    """Products [..., 4] of quaternions [..., 4]: the rotation `second`, then `first`."""
+    """Return products [..., 4] of quaternions [..., 4]: the rotation `second`, then `first`."""
     w, x, y, z = np.moveaxis(np.asarray(first, np.float64), -1, 0)
     s, i, j, k = np.moveaxis(np.asarray(second, np.float64), -1, 0)
     return np.stack(
@@ -82,6 +82,7 @@ def slerp(start: F64, end: F64, share: float) -> F64:
     first = start / np.linalg.norm(start, axis=1, keepdims=True)
     last = end / np.linalg.norm(end, axis=1, keepdims=True)
     cosine = np.sum(first * last, axis=1, keepdims=True)
+    # q and -q are one rotation; the sign selects the shorter arc.
     first = np.where(cosine < 0.0, -first, first)
     cosine = np.abs(cosine)
     angle = np.arccos(np.minimum(cosine, 0.9995))
@@ -92,17 +93,17 @@ def slerp(start: F64, end: F64, share: float) -> F64:
 
 
 def pose_matrix(translation: npt.ArrayLike, quaternion: npt.ArrayLike) -> F64:
-    """Poses [..., 4, 4] of translations [..., 3] and quaternions [..., 4]."""
-    turn = quaternion_to_matrix(quaternion)
-    pose = np.zeros((*turn.shape[:-2], 4, 4))
-    pose[..., :3, :3] = turn
+    """Return poses [..., 4, 4] of translations [..., 3] and quaternions [..., 4]."""
+    rotation = quaternion_to_matrix(quaternion)
+    pose = np.zeros((*rotation.shape[:-2], 4, 4))
+    pose[..., :3, :3] = rotation
     pose[..., :3, 3] = translation
     pose[..., 3, 3] = 1.0
     return pose
 
 
 def upright_pose(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
-    """Pose [4, 4] of something upright."""
+    """Return the pose [4, 4] of an upright object."""
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pose[:3, 3] = x, y, z
@@ -110,7 +111,7 @@ def upright_pose(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
 
 
 def upright_poses(place: F64) -> F64:
-    """Poses [N, 4, 4] of what stands upright at x, y, yaw [N, 3]."""
+    """Return the poses [N, 4, 4] of upright objects at x, y, yaw [N, 3]."""
     pose = np.tile(np.eye(4), (len(place), 1, 1))
     cos, sin = np.cos(place[:, 2]), np.sin(place[:, 2])
     pose[:, 0, 0], pose[:, 0, 1], pose[:, 1, 0], pose[:, 1, 1] = cos, -sin, sin, cos
@@ -119,9 +120,9 @@ def upright_poses(place: F64) -> F64:
 
 
 def wrap_angle(angle: npt.ArrayLike) -> Floats:
-    """Angles brought into [-pi, pi)."""
-    given = np.asarray(angle)
-    value: Floats = given if np.issubdtype(given.dtype, np.floating) else given.astype(np.float64)
+    """Wrap angles into [-pi, pi)."""
+    array = np.asarray(angle)
+    value: Floats = array if np.issubdtype(array.dtype, np.floating) else array.astype(np.float64)
     wrapped = (value + np.pi) % (2.0 * np.pi) - np.pi
     # rounding of the remainder may give exactly +pi
     return np.where(wrapped >= np.pi, -np.pi, wrapped).astype(value.dtype)

@@ -1,7 +1,7 @@
-"""The only door for files that people hand to SSAD, and for files that SSAD writes.
+"""Safe reading of user files and atomic writing of SSAD's own.
 
-Readers refuse what is hostile (YAML bombs, XML entities, pickles, zip bombs) and say file and line. Writers
-are atomic: a reader sees the old file or the whole new one. Every error is an `ssad.core.errors.SSADError`.
+Readers refuse hostile content (YAML bombs, XML entities, pickles, zip bombs) and name file and line. Writers are
+atomic: a reader sees either the old file or the whole new one. Every error is an `ssad.core.errors.SSADError`.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Location = Sequence[str | int]
 
 
 def home() -> Path:
-    """Folder of imported towns and scenarios: $SSAD_HOME, else ~/.local/share/ssad (it need not exist)."""
-    named = os.environ.get("SSAD_HOME")
-    return Path(named).expanduser() if named else Path.home() / ".local" / "share" / "ssad"
+    """Return the folder of imported towns and scenarios: $SSAD_HOME, else ~/.local/share/ssad (it need not exist)."""
+    configured = os.environ.get("SSAD_HOME")
+    return Path(configured).expanduser() if configured else Path.home() / ".local" / "share" / "ssad"
 
 
 def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
@@ -47,17 +47,17 @@ def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
     """
     try:
         with open(path, "rb") as file:
-            # room is made for as much as is asked for: what the file says it has; a pipe is read in parts
-            data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
-            while len(data) <= limit and (part := file.read(MIB)):
-                data += part
+            # read() allocates its argument at once, so ask for the file's size only; a pipe is read in blocks
+            content = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
+            while len(content) <= limit and (block := file.read(MIB)):
+                content += block
     except FileNotFoundError:
         raise FormatError(f"{path}: no such file") from None
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if len(data) > limit:
+    if len(content) > limit:
         raise FormatError(f"{path}: larger than the limit of {limit / MIB:g} MiB")
-    return data
+    return content
 
 
 def read_text(path: str | Path, *, limit: int = 64 * MIB) -> str:
@@ -89,10 +89,10 @@ _RESOLVERS: tuple[tuple[str, str, str], ...] = (
 
 
 def _with_resolvers(base: type) -> Any:
-    """A loader or dumper class with the YAML 1.2 rules of what a plain scalar is."""
+    """Return a loader or dumper class with YAML 1.2's resolution of plain scalars."""
     table: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
-    for tag, pattern, first in _RESOLVERS:
-        for letter in [*first, *([""] if tag.endswith("null") else [])]:
+    for tag, pattern, first_letters in _RESOLVERS:
+        for letter in [*first_letters, *([""] if tag.endswith("null") else [])]:
             table.setdefault(letter, []).append((tag, re.compile(pattern)))
     return type(base.__name__, (base,), {"yaml_implicit_resolvers": table})
 
@@ -106,20 +106,20 @@ class Document:
     lines: Mapping[tuple[str | int, ...], int] = field(default_factory=dict)
 
     def line(self, location: Location = ()) -> int:
-        """Line (from 1) of a key or item such as ("scenarios", 3, "town"), or of what holds it."""
-        place = tuple(location)
-        while place and place not in self.lines:
-            place = place[:-1]
-        return self.lines.get(place, 1)
+        """Return the line (from 1) of a key or item such as ("scenarios", 3, "town"), or of its nearest ancestor."""
+        known_location = tuple(location)
+        while known_location and known_location not in self.lines:
+            known_location = known_location[:-1]
+        return self.lines.get(known_location, 1)
 
     def error(self, location: Location, message: str) -> ConfigError:
-        """A ConfigError that says file, line and key."""
+        """Return a ConfigError that names file, line and key."""
         key = dotted(location)
         return ConfigError(f"{self.name}:{self.line(location)}: {f'{key}: ' if key else ''}{message}")
 
 
 def dotted(location: Location) -> str:
-    """("a", 0, "b") as `a[0].b`."""
+    """Return ("a", 0, "b") as `a[0].b`."""
     text = ""
     for part in location:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
@@ -127,7 +127,7 @@ def dotted(location: Location) -> str:
 
 
 class _Builder:
-    """Turns YAML nodes into plain data; refuses duplicate keys, tags, loops and expansion bombs."""
+    """Converts YAML nodes to plain data; refuses duplicate keys, tags, loops and expansion bombs."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -142,6 +142,7 @@ class _Builder:
     def build(self, node: Any, place: tuple[str | int, ...], repeated: bool) -> Any:
         repeated = repeated or id(node) in self.seen
         if repeated:
+            # Nodes behind aliases are counted, because each use expands them again.
             self.aliased += 1
             if self.aliased > MAX_ALIASED_NODES:
                 raise self.fail(node, f"aliases expand to more than {MAX_ALIASED_NODES} values (a YAML bomb?)")
@@ -158,7 +159,7 @@ class _Builder:
             if node.id == "sequence":
                 if node.tag != "tag:yaml.org,2002:seq":
                     raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
-                return [self.build(child, (*place, i), repeated) for i, child in enumerate(node.value)]
+                return [self.build(child, (*place, index), repeated) for index, child in enumerate(node.value)]
             return self.mapping(node, place, repeated)
         finally:
             self.open.discard(id(node))
@@ -166,43 +167,47 @@ class _Builder:
     def mapping(self, node: Any, place: tuple[str | int, ...], repeated: bool) -> dict[str, Any]:
         if node.tag != "tag:yaml.org,2002:map":
             raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
-        result: dict[str, Any] = {}
+        entries: dict[str, Any] = {}
         for key_node, value_node in node.value:
             if key_node.id != "scalar":
                 raise self.fail(key_node, "a key must be a single word or text")
             if key_node.tag.endswith(":merge"):
                 raise self.fail(key_node, "merge keys (<<) are not supported; write the keys out")
             key = str(key_node.value)
-            if key in result:
+            if key in entries:
                 raise self.fail(key_node, f"key '{key}' appears twice")
             self.lines.setdefault((*place, key), key_node.start_mark.line + 1)
-            result[key] = self.build(value_node, (*place, key), repeated)
-        return result
+            entries[key] = self.build(value_node, (*place, key), repeated)
+        return entries
 
     def scalar(self, node: Any) -> Any:
         text: str = node.value
-        kind = node.tag.removeprefix("tag:yaml.org,2002:")
+        scalar_type = node.tag.removeprefix("tag:yaml.org,2002:")
         try:
-            if kind == "null":
+            if scalar_type == "null":
                 return None
-            if kind == "bool" and text.lower() in ("true", "false"):
+            if scalar_type == "bool" and text.lower() in ("true", "false"):
                 return text.lower() == "true"
-            if kind == "int":
+            if scalar_type == "int":
                 return int(text, 0 if text[:2] in ("0o", "0x") else 10)
-            if kind == "float":
+            if scalar_type == "float":
                 value = float(re.sub(r"\.(?=[in])", "", text.lower()))  # .inf and .nan have a leading dot
                 if math.isnan(value):
                     raise self.fail(node, "NaN is not a value")
                 return value
         except ValueError:
-            raise self.fail(node, f"'{text[:40]}' is not a valid {kind}") from None
-        if kind in ("str", "merge"):
+            raise self.fail(node, f"'{text[:40]}' is not a valid {scalar_type}") from None
+        if scalar_type in ("str", "merge"):
             return text
         raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
 
 
 def parse_yaml_document(text: str, name: str = "<text>") -> Document:
-    """Parse one YAML document; `name` is what errors call it. FormatError with line."""
+    """Parse one YAML document; `name` is its name in errors.
+
+    Raises:
+        FormatError: It is not valid YAML, with the line.
+    """
     import yaml
 
     loader = _with_resolvers(getattr(yaml, "CSafeLoader", yaml.SafeLoader))
@@ -232,7 +237,11 @@ def parse_yaml_document(text: str, name: str = "<text>") -> Document:
 
 
 def parse_yaml(text: str, name: str = "<text>") -> Any:
-    """Plain data of one YAML document. FormatError with line."""
+    """Return the plain data of one YAML document.
+
+    Raises:
+        FormatError: It is not valid YAML, with the line.
+    """
     return parse_yaml_document(text, name).data
 
 
@@ -246,7 +255,7 @@ def read_yaml_document(path: str | Path, *, limit: int = 16 * MIB) -> Document:
 
 
 def dump_yaml(data: Any) -> str:
-    """YAML text that `parse_yaml` reads back to equal data; keys keep their order."""
+    """Return YAML text that `parse_yaml` reads back to equal data; keys keep their order."""
     import yaml
 
     dumper = _with_resolvers(yaml.SafeDumper)
@@ -258,12 +267,12 @@ def dump_yaml(data: Any) -> str:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result = dict(pairs)
-    if len(result) != len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise ValueError(f"key '{twice}' appears twice")
-    return result
+    mapping = dict(pairs)
+    if len(mapping) != len(pairs):
+        visited_keys: set[str] = set()
+        duplicate = next(key for key, _ in pairs if key in visited_keys or visited_keys.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"key '{duplicate}' appears twice")
+    return mapping
 
 
 def _no_constant(text: str) -> float:
@@ -271,7 +280,11 @@ def _no_constant(text: str) -> float:
 
 
 def parse_json(text: str | bytes, name: str = "<text>") -> Any:
-    """Plain data of a JSON text; duplicate keys and NaN are refused. FormatError with line."""
+    """Return the plain data of a JSON text; duplicate keys and NaN are refused.
+
+    Raises:
+        FormatError: It is not valid JSON, with the line.
+    """
     try:
         return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
     except json.JSONDecodeError as error:
@@ -290,24 +303,32 @@ def read_json(path: str | Path, *, limit: int = 256 * MIB) -> Any:
 
 
 def dump_json(data: Any, *, indent: int | None = None) -> str:
-    """Canonical JSON: sorted keys, no spaces (unless `indent`), no NaN. ValueError for other values."""
+    """Return canonical JSON: sorted keys, no spaces (unless `indent`), no NaN.
+
+    Raises:
+        ValueError: A value cannot be written as JSON.
+    """
     separators = (",", ":") if indent is None else (",", ": ")
     return json.dumps(data, sort_keys=True, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
 
 
 def plain(value: Any) -> Any:
-    """Plain JSON data; a number that is not finite (no such event) becomes None."""
+    """Return plain JSON data; a number that is not finite (no such event) becomes None."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(element) for key, element in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [plain(element) for element in value]
     if hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
-    """Root element of an XML text; DTDs, entities and external data are refused. FormatError with line."""
+    """Return the root of an XML text; DTDs, entities and external data are refused.
+
+    Raises:
+        FormatError: It is refused, or not valid XML, with the line.
+    """
     from xml.etree.ElementTree import ParseError
 
     import defusedxml
@@ -339,7 +360,7 @@ def read_xml(path: str | Path, *, limit: int = 256 * MIB) -> Element:
 
 
 def npz_bytes(arrays: Mapping[str, npt.ArrayLike]) -> bytes:
-    """A compressed npz with the same bytes for the same arrays (fixed time stamps, order as given)."""
+    """Return a compressed npz with the same bytes for the same arrays (fixed time stamps, given order)."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for name, value in arrays.items():
@@ -348,6 +369,7 @@ def npz_bytes(arrays: Mapping[str, npt.ArrayLike]) -> bytes:
                 raise TypeError(f"array '{name}' holds Python objects")
             info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             info.compress_type = zipfile.ZIP_DEFLATED
+            # Unix on every platform, since the field is part of the bytes.
             info.create_system = 3
             info.external_attr = 0o644 << 16
             member = io.BytesIO()
@@ -371,10 +393,10 @@ def load_npz(path: str | Path, *, limit: int = 2048 * MIB) -> dict[str, npt.NDAr
     Raises:
         FormatError: The file cannot be read, is too large, or is not such an npz.
     """
-    data = read_bytes(path, limit=limit)
+    content = read_bytes(path, limit=limit)
     arrays: dict[str, npt.NDArray[Any]] = {}
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = archive.infolist()
             if sum(member.file_size for member in members) > limit:
                 raise FormatError(f"{path}: unpacks to more than the limit of {limit / MIB:g} MiB")
@@ -390,25 +412,25 @@ def load_npz(path: str | Path, *, limit: int = 2048 * MIB) -> dict[str, npt.NDAr
 def _read_npy(data: bytes) -> npt.NDArray[Any]:
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read(stream)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read_header(stream)
     if dtype.hasobject:
         raise ValueError("it holds Python objects (a pickle)")
     count = math.prod(shape)
     if count * dtype.itemsize != len(data) - stream.tell():
         raise ValueError("an array is cut short")
-    flat = np.frombuffer(data, dtype=dtype, count=count, offset=stream.tell())
-    return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
+    values = np.frombuffer(data, dtype=dtype, count=count, offset=stream.tell())
+    return values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
 
 
 # ---------------------------------------------------------------- writing
 
 
 def make_folder(path: str | Path) -> Path:
-    """Make a folder with its parents, and check that it is writable.
+    """Create a folder with its parents, and check that it is writable.
 
     Raises:
-        StoreError: It cannot be made or written to.
+        StoreError: It cannot be created or written to.
     """
     folder = Path(path)
     probe = _temporary(folder / "probe")
@@ -421,17 +443,17 @@ def make_folder(path: str | Path) -> Path:
     return folder
 
 
-_TEMPORARY = re.compile(r"\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?")  # what `_temporary` gives
+_TEMPORARY = re.compile(r"\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?")  # names from `_temporary`
 
 
 def _temporary(path: Path) -> Path:
-    """A name beside a path that no other process or thread takes, and that `remove_unfinished` knows."""
+    """Return a path beside `path` that no other process or thread uses, and that `remove_unfinished` recognises."""
     return path.with_name(f".{path.stem}-{os.getpid()}-{os.urandom(4).hex()}.tmp{path.suffix}")
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` (same suffix) that replaces it when the block ends well.
+    """Yield a temporary path beside `path` (same suffix) that replaces it if the block succeeds.
 
     Raises:
         StoreError: The file cannot be written.
@@ -442,6 +464,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         with open(temporary, "rb+") as file:
+            # Before the rename: else a power cut could leave an empty file under the final name.
             os.fsync(file.fileno())
         os.replace(temporary, target)
     except OSError as error:
@@ -452,7 +475,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what killed processes left of `atomic_path` and `make_folder` in a folder; not in those below it."""
+    """Remove files that killed processes left of `atomic_path` and `make_folder` in a folder, not in subfolders."""
     for path in folder.glob(".*") if folder.is_dir() else ():
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)

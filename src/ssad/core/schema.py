@@ -1,4 +1,4 @@
-"""What the schemas of suites share, and the dataclasses whose values suites say."""
+"""Shared schema of suites, and validated construction of dataclasses from their values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)
 
 
 class Schema(BaseModel):
-    """Keys of a suite: no others are known, types are as they stand there, and nothing changes."""
+    """Base of suite sections: unknown keys are refused, types are strict, instances are frozen."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -57,15 +57,15 @@ def checked(
     Raises:
         ConfigError: One line: what, which key, and what is wrong with its value.
     """
-    known = [one.name for one in fields(kind or make) if one.init and one.name != fixed]  # type: ignore[arg-type]
+    settings = [setting.name for setting in fields(kind or make) if setting.init and setting.name != fixed]  # type: ignore[arg-type]
     for key in values:
-        if key not in known:
-            raise ConfigError(f"{what}: there is no setting '{key}'; it has {', '.join(known)}")
+        if key not in settings:
+            raise ConfigError(f"{what}: there is no setting '{key}'; it has {', '.join(settings)}")
     try:
         return make(**values)
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
-        key, shown = ".".join(map(str, problem["loc"])), repr(problem["input"])
+        key, input_text = ".".join(map(str, problem["loc"])), repr(problem["input"])
         text = problem["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it stands in a suite
-        short = shown if len(shown) < 60 else shown[:57] + "..."
-        raise ConfigError(f"{what}: " + (f"{key}={short}: {text}" if key else text)) from None
+        shortened = input_text if len(input_text) < 60 else input_text[:57] + "..."
+        raise ConfigError(f"{what}: " + (f"{key}={shortened}: {text}" if key else text)) from None

@@ -1,7 +1,7 @@
 """The only source of randomness: a key gives a generator, so nothing depends on order, workers or batch size.
 
-A key is a row of plain values, from the general to the particular, such as (root seed, cell key, "traffic"). Its parts
-count with their types: 1, 1.0, True and "1" are four keys.
+A key is a sequence of plain values, from the general to the particular, such as (root seed, cell key, "traffic"). Its
+parts count with their types: 1, 1.0, True and "1" are four keys.
 """
 
 from __future__ import annotations
@@ -12,20 +12,21 @@ import numpy as np
 
 
 def digest(*key: object) -> str:
-    """Turn a key into a name that is the same in every process, on every machine and in every version.
+    """Hash a key to a name that is the same in every process, on every machine and in every version.
 
     Args:
-        *key: Parts whose `repr` says all that there is to them: texts, numbers, tuples of these.
+        *key: Parts that their `repr` describes completely: texts, numbers, tuples of these.
 
     Returns:
         64 hex digits (SHA-256).
     """
+    # The unit separator cannot occur in a repr, so no two keys join to one text.
     text = "\x1f".join(f"{type(part).__name__}:{part!r}" for part in key)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def seed32(*key: object) -> int:
-    """Turn a key into a seed for what takes only a whole number.
+    """Hash a key to a seed for libraries that take a whole number.
 
     Args:
         *key: As for `digest`.
@@ -37,7 +38,7 @@ def seed32(*key: object) -> int:
 
 
 def generator(*key: object) -> np.random.Generator:
-    """Make the generator of a key: a new one at each call, that begins at the same place.
+    """Return the generator of a key: a new one at each call, always in the same initial state.
 
     Args:
         *key: As for `digest`.

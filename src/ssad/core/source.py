@@ -1,4 +1,4 @@
-"""Which source a result depends on: a module, all that it imports, and all that it names to be imported later."""
+"""Source files that a result depends on: a module, its imports, and the modules named for later import."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _STRING = re.compile(r"""["'](\w+(?:\.\w+)+)(?::\w+)?["']""")  # "package.module
 
 
 def source_version(module: str) -> str:
-    """12 hex digits over the source files that a module depends on; see `source_files`."""
+    """Return 12 hex digits over the source files that a module depends on; see `source_files`."""
     files = source_files(module)
     return digest("source", *[part for name, path in sorted(files.items()) for part in (name, _scan(path)[0])])[:12]
 
 
 def source_files(module: str) -> dict[str, Path]:
-    """The files of a module and of all that it leads to, by module name.
+    """Return the files of a module and of its dependencies, by module name.
 
-    Followed are imports, wherever in the text they stand, and strings that name a module (of a package so named, all
-    modules). What is installed elsewhere than beside the module's own top-level package is left out: its version is in
-    run.json.
+    Imports are followed anywhere in the text, and so are strings that name a module (for a package, all its
+    modules). Code installed elsewhere than beside the module's own top-level package is left out: its version is
+    in run.json.
 
     Args:
-        module: full name. Nothing is imported.
+        module: Full name. Nothing is imported.
 
     Returns:
         Module name -> its file; empty where the module has no source.
@@ -39,34 +39,43 @@ def source_files(module: str) -> dict[str, Path]:
     if spec is None or not spec.origin or not spec.origin.endswith(".py"):
         return {}
     base = Path(spec.origin).parent.parent if spec.submodule_search_locations else Path(spec.origin).parent
-    found: dict[str, Path] = {}
+    files_by_module: dict[str, Path] = {}
     queue = [module]
     while queue:
         name = queue.pop()
         path = _file(base, name)
-        if name in found or path is None:
+        if name in files_by_module or path is None:
             continue
-        found[name] = path
+        files_by_module[name] = path
         parent = name.rpartition(".")[0]
         if "." in parent:  # the top-level package's own names are loaded on demand
+            # A package's __init__ runs before its modules.
             queue.append(parent)
         package = name if path.name == "__init__.py" else parent
-        _, imports, named = _scan(path)
-        for dots, origin, names in imports:
-            start = (
-                origin if not dots else ".".join([*package.split(".")[: len(package.split(".")) - dots + 1], origin])
+        _, imports, module_strings = _scan(path)
+        for level, origin, names in imports:
+            target = (
+                origin if not level else ".".join([*package.split(".")[: len(package.split(".")) - level + 1], origin])
             )
-            start = start.strip(".")
-            queue += [start, *(f"{start}.{one}" for one in names)] if start != top else [f"{top}.{n}" for n in names]
-        for text in named:
+            target = target.strip(".")
+            queue += (
+                [target, *(f"{target}.{imported}" for imported in names)]
+                if target != top
+                else [f"{top}.{imported_name}" for imported_name in names]
+            )
+        for text in module_strings:
             queue.append(text)
-            inside = base / Path(*text.split("."))
-            queue += [f"{text}.{one.stem}" for one in inside.glob("[!_]*.py")] if text.startswith(f"{top}.") else []
-    return found
+            package_folder = base / Path(*text.split("."))
+            queue += (
+                [f"{text}.{imported.stem}" for imported in package_folder.glob("[!_]*.py")]
+                if text.startswith(f"{top}.")
+                else []
+            )
+    return files_by_module
 
 
 def _file(base: Path, name: str) -> Path | None:
-    """The file of a module below a folder."""
+    """Return the file of a module below a folder."""
     path = base / Path(*name.split("."))
     for candidate in (path.with_name(path.name + ".py"), path / "__init__.py"):
         if candidate.is_file():
@@ -75,8 +84,9 @@ def _file(base: Path, name: str) -> Path | None:
 
 
 def _scan(path: Path) -> tuple[str, tuple[tuple[int, str, tuple[str, ...]], ...], tuple[str, ...]]:
-    """Hash of a file, its imports (dots, module, names), and the modules that its strings name."""
+    """Return the hash of a file, its imports (dots, module, names), and the modules that its strings name."""
     status = path.stat()
+    # Time and size are part of the cache's key: an edited file is scanned again.
     return _scanned(path, status.st_mtime_ns, status.st_size)
 
 
@@ -84,10 +94,20 @@ def _scan(path: Path) -> tuple[str, tuple[tuple[int, str, tuple[str, ...]], ...]
 def _scanned(
     path: Path, _changed: int, _size: int
 ) -> tuple[str, tuple[tuple[int, str, tuple[str, ...]], ...], tuple[str, ...]]:
-    data = path.read_bytes()
-    text = data.decode("utf-8", "replace")
+    content = path.read_bytes()
+    text = content.decode("utf-8", "replace")
     imports = [
-        (len(m[1]), m[2], tuple(re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", m[3]))) for m in _FROM.finditer(text)
+        (
+            len(import_match[1]),
+            import_match[2],
+            tuple(re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", import_match[3])),
+        )
+        for import_match in _FROM.finditer(text)
     ]
-    imports += [(0, part.split()[0], ()) for m in _IMPORT.finditer(text) for part in m[1].split(",") if part.split()]
-    return hashlib.sha256(data).hexdigest(), tuple(imports), tuple(set(_STRING.findall(text)))
+    imports += [
+        (0, import_clause.split()[0], ())
+        for import_match in _IMPORT.finditer(text)
+        for import_clause in import_match[1].split(",")
+        if import_clause.split()
+    ]
+    return hashlib.sha256(content).hexdigest(), tuple(imports), tuple(set(_STRING.findall(text)))

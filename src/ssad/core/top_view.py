@@ -1,4 +1,4 @@
-"""An episode from above, step by step: what videos, environments and windows show, in the colours of the replay."""
+"""Top view of an episode, step by step, for videos, environments and windows, in the colours of the replay."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ _SHIFT = 4  # OpenCV draws at 1/16 pixel
 
 
 class _Canvas:
-    """World metres to pixels around a moving centre; colours are RGB."""
+    """Maps world metres to pixels around a moving centre; colours are RGB."""
 
     def __init__(self, size: tuple[int, int], scale: float, centre: tuple[float, float]) -> None:
         self.image: Frame = np.full((size[1], size[0], 3), GROUND, np.uint8)
         self.size, self.scale, self.centre = size, scale, centre
 
     def points(self, xy: npt.ArrayLike) -> npt.NDArray[np.int32]:
-        p = (np.asarray(xy, np.float64) - self.centre) * (self.scale, -self.scale)
-        p += (self.size[0] / 2, self.size[1] / 2)
-        return np.round(p * (1 << _SHIFT)).astype(np.int32)
+        # y is flipped: image rows grow downwards, north is up.
+        pixels = (np.asarray(xy, np.float64) - self.centre) * (self.scale, -self.scale)
+        pixels += (self.size[0] / 2, self.size[1] / 2)
+        return np.round(pixels * (1 << _SHIFT)).astype(np.int32)
 
     def fill(self, xy: npt.ArrayLike, colour: tuple[int, int, int]) -> None:
         cv2.fillPoly(self.image, [self.points(xy)], colour, cv2.LINE_AA, _SHIFT)
@@ -47,10 +48,10 @@ class _Canvas:
         cv2.polylines(self.image, [self.points(xy)], closed, colour, width, cv2.LINE_AA, _SHIFT)
 
     def disc(self, x: float, y: float, radius: float, colour: tuple[int, int, int], width: int = -1) -> None:
-        px, py = self.points([[x, y]])[0]
+        pixel_x, pixel_y = self.points([[x, y]])[0]
         cv2.circle(
             self.image,
-            (int(px), int(py)),
+            (int(pixel_x), int(pixel_y)),
             round(radius * self.scale * (1 << _SHIFT)),
             colour,
             width,
@@ -59,25 +60,25 @@ class _Canvas:
         )
 
     def text(self, place: tuple[int, int], words: str, size: float = 0.5) -> None:
-        (width, height), below = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-        corner, other = (place[0] - 5, place[1] - height - 5), (place[0] + width + 5, place[1] + below + 3)
-        cv2.rectangle(self.image, corner, other, (255, 255, 255), -1)
+        (width, height), baseline = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+        corner, opposite = (place[0] - 5, place[1] - height - 5), (place[0] + width + 5, place[1] + baseline + 3)
+        cv2.rectangle(self.image, corner, opposite, (255, 255, 255), -1)
         cv2.putText(self.image, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, (30, 41, 59), 1, cv2.LINE_AA)
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What there is to draw at one time; agent 0 is the ego.
+    """Content of one top view; agent 0 is the ego.
 
     Attributes:
-        pose: [A, 3] x, y (m) and yaw (rad) of the middle of the bodies.
+        pose: [A, 3] x, y (m) and yaw (rad) of the centres of the bodies.
         size: [A, 2] length and width, m.
         kind: [A] `ssad.core.types.AgentKind`.
-        active: [A] whether somebody is there.
+        active: [A] whether the agent is present.
         route: The ego's route [N, 2], m.
-        past: Where the ego was lately [N, 2], m.
+        past: Recent positions of the ego [N, 2], m.
         lamps: x, y (m) and `ssad.core.types.SignalState` of traffic lights.
-        hit: Steps since the ego's first contact; None: there was none.
+        hit: Steps since the ego's first contact; None without one.
         words: Lines in the upper left corner.
     """
 
@@ -93,12 +94,12 @@ class Moment:
 
 
 class TopView:
-    """Draws moments on a town; the roads are prepared once.
+    """Draws top views of a town; the roads are prepared once.
 
     Args:
         graph: The town.
         size: Width and height of a frame, pixels.
-        across: Width of what a frame shows, m.
+        across: Width of the visible area, m.
     """
 
     def __init__(self, graph: LaneGraph, *, size: tuple[int, int] = (960, 540), across: float = 90.0) -> None:
@@ -107,7 +108,7 @@ class TopView:
         self.size, self.scale = size, size[0] / across
 
     def draw(self, moment: Moment) -> Frame:
-        """RGB [H, W, 3] around the ego, north up."""
+        """Return an RGB image [H, W, 3] around the ego, north up."""
         centre = (float(moment.pose[0, 0]), float(moment.pose[0, 1]))
         canvas = _Canvas(self.size, self.scale, centre)
         reach = 0.6 * max(self.size) / self.scale
@@ -128,6 +129,7 @@ class TopView:
             if state in LAMP:
                 canvas.disc(x, y, 0.9, (30, 30, 30))
                 canvas.disc(x, y, 0.65, LAMP[state])
+        # In reverse, so that the ego is drawn last, above all others.
         for agent in reversed(range(len(moment.kind))):
             if moment.active[agent]:
                 _agent(canvas, moment, agent)
@@ -140,8 +142,8 @@ class TopView:
 
 def _agent(canvas: _Canvas, moment: Moment, agent: int) -> None:
     kind = AgentKind(int(moment.kind[agent]))
-    x, y, yaw = (float(v) for v in moment.pose[agent])
-    length, width = (float(v) for v in moment.size[agent])
+    x, y, yaw = (float(coordinate) for coordinate in moment.pose[agent])
+    length, width = (float(coordinate) for coordinate in moment.size[agent])
     if agent == 0 and len(moment.past) > 1:
         canvas.line(moment.past, EGO, 3)
     body = corners(x, y, yaw, length, width)

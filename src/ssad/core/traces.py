@@ -40,41 +40,45 @@ def save_trace(path: str | Path, trace: EpisodeTrace) -> None:
 
 
 def load_trace(path: str | Path) -> EpisodeTrace:
-    """Read a trace; its arrays are read-only. FormatError when the file is broken or of another kind."""
-    data = safeio.load_npz(path)
-    if "meta" not in data:
+    """Read a trace; its arrays are read-only.
+
+    Raises:
+        FormatError: The file is broken or of another kind.
+    """
+    stored = safeio.load_npz(path)
+    if "meta" not in stored:
         raise FormatError(f"{path}: not an episode trace")
-    meta = safeio.parse_json(data.pop("meta").tobytes(), str(path))
+    meta = safeio.parse_json(stored.pop("meta").tobytes(), str(path))
     if not isinstance(meta, dict) or meta.pop("format", None) != FORMAT:
         raise FormatError(f"{path}: an episode trace of another format; run the suite again into a new folder")
-    missing = (set(_META) - set(meta)) | (set(_ARRAYS) - set(data))
-    wrong = [name for name, dtype in _ARRAYS.items() if name in data and data[name].dtype != dtype]
-    if missing or wrong:
-        raise FormatError(f"{path}: not a whole episode trace ({', '.join(sorted(missing) or wrong)})")
-    steps, agents = len(data["accel"]), len(data["kind"])
+    missing = (set(_META) - set(meta)) | (set(_ARRAYS) - set(stored))
+    mistyped = [name for name, dtype in _ARRAYS.items() if name in stored and stored[name].dtype != dtype]
+    if missing or mistyped:
+        raise FormatError(f"{path}: not a whole episode trace ({', '.join(sorted(missing) or mistyped)})")
+    steps, agents = len(stored["accel"]), len(stored["kind"])
     for name in _PER_AGENT:
-        if data[name].shape != (steps, agents):
-            raise FormatError(f"{path}: not a whole episode trace ({name} has shape {data[name].shape})")
+        if stored[name].shape != (steps, agents):
+            raise FormatError(f"{path}: not a whole episode trace ({name} has shape {stored[name].shape})")
     meta["names"], meta["models"] = tuple(meta["names"]), tuple(meta["models"])
-    values: dict[str, Any] = {name: meta[name] for name in _META} | {name: data[name] for name in _ARRAYS}
-    return EpisodeTrace(**values)
+    trace_fields: dict[str, Any] = {name: meta[name] for name in _META} | {name: stored[name] for name in _ARRAYS}
+    return EpisodeTrace(**trace_fields)
 
 
 def trace_hash(trace: EpisodeTrace) -> str:
-    """64 hex digits over every bit of the trace (names, shapes and values), whatever the compression."""
-    total = hashlib.sha256(safeio.dump_json(_meta(trace)).encode())
+    """Return 64 hex digits over every bit of the trace (names, shapes and values), independent of the compression."""
+    hasher = hashlib.sha256(safeio.dump_json(_meta(trace)).encode())
     for name, array in _arrays(trace).items():
-        total.update(f"{name}{array.dtype.str}{array.shape}".encode())
-        total.update(array.tobytes())
-    return total.hexdigest()
+        hasher.update(f"{name}{array.dtype.str}{array.shape}".encode())
+        hasher.update(array.tobytes())
+    return hasher.hexdigest()
 
 
 def motion_hash(trace: EpisodeTrace) -> str:
-    """32 hex digits over how everybody moved, whatever the episode is called: equal in copies of one case."""
-    total = hashlib.sha256(safeio.dump_json([trace.town, trace.dt, *trace.models]).encode())
+    """Return 32 hex digits over the motion of all agents, equal in copies of one case under any name."""
+    hasher = hashlib.sha256(safeio.dump_json([trace.town, trace.dt, *trace.models]).encode())
     for name in _PER_AGENT:
-        total.update(np.ascontiguousarray(getattr(trace, name), _ARRAYS[name]).tobytes())
-    return total.hexdigest()[:32]
+        hasher.update(np.ascontiguousarray(getattr(trace, name), _ARRAYS[name]).tobytes())
+    return hasher.hexdigest()[:32]
 
 
 def first_difference(a: EpisodeTrace, b: EpisodeTrace) -> str | None:
@@ -82,17 +86,25 @@ def first_difference(a: EpisodeTrace, b: EpisodeTrace) -> str | None:
     for name in _META:
         if _meta(a)[name] != _meta(b)[name]:
             return f"{name}: {_meta(a)[name]!r} against {_meta(b)[name]!r}"
-    left, right = _arrays(a), _arrays(b)
-    found: list[tuple[int, str]] = []
+    left_arrays, right_arrays = _arrays(a), _arrays(b)
+    differences: list[tuple[int, str]] = []
     for name in _ARRAYS:
-        x, y = left[name], right[name]
-        if x.shape != y.shape:
-            found.append((min(len(x), len(y)), f"{name}: shape {x.shape} against {y.shape}"))
+        left_array, right_array = left_arrays[name], right_arrays[name]
+        if left_array.shape != right_array.shape:
+            differences.append(
+                (
+                    min(len(left_array), len(right_array)),
+                    f"{name}: shape {left_array.shape} against {right_array.shape}",
+                )
+            )
             continue
-        if x.tobytes() != y.tobytes():
-            step = next(i for i in range(len(x)) if x[i].tobytes() != y[i].tobytes())
-            found.append((step, f"{name}: {x[step]} against {y[step]}"))
-    if not found:
+        # Bytes, since NaN is unequal to itself and 0.0 equals -0.0.
+        if left_array.tobytes() != right_array.tobytes():
+            step = next(
+                row for row in range(len(left_array)) if left_array[row].tobytes() != right_array[row].tobytes()
+            )
+            differences.append((step, f"{name}: {left_array[step]} against {right_array[step]}"))
+    if not differences:
         return None
-    step, text = min(found)
+    step, text = min(differences)
     return " ".join(f"step {step}: {text}".split())

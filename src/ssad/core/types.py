@@ -1,9 +1,9 @@
-"""The frozen data that passes between the parts of SSAD.
+"""Frozen data types shared by all parts of SSAD.
 
 Shape letters used in every docstring: B scenes of a batch, A agents of a scene, T steps, N points of a route,
 L lanes, P points of lane centre lines, S signals, K a small fixed count.
 Frames: world is right-handed, x east, y north, z up, yaw counter-clockwise from east; metres, seconds, radians.
-CARLA's left-handed frame is converted where CARLA's files are read, and nowhere else.
+CARLA's left-handed frame is converted only where CARLA's files are read.
 """
 
 from __future__ import annotations
@@ -25,19 +25,23 @@ _DTYPES = {"F32": np.float32, "F64": np.float64, "I32": np.int32, "U8": np.uint8
 
 
 def array_dtypes(table: Any) -> dict[str, np.dtype[Any]]:
-    """Read from a dataclass which of its fields are arrays.
+    """Return the array fields of a dataclass.
 
     Args:
         table: A dataclass with postponed annotations.
 
     Returns:
-        Name -> dtype of the fields that are given to it and annotated F32, F64, I32, U8 or Bool, in their order.
+        Name -> dtype of the constructor's fields annotated F32, F64, I32, U8 or Bool, in their order.
     """
-    return {f.name: np.dtype(_DTYPES[str(f.type)]) for f in fields(table) if f.init and str(f.type) in _DTYPES}
+    return {
+        table_field.name: np.dtype(_DTYPES[str(table_field.type)])
+        for table_field in fields(table)
+        if table_field.init and str(table_field.type) in _DTYPES
+    }
 
 
 class LaneType(IntEnum):
-    """What a lane is for (OpenDRIVE lane types, folded to those that matter here)."""
+    """Use of a lane (OpenDRIVE lane types, reduced to the relevant ones)."""
 
     NONE = 0
     DRIVING = 1
@@ -49,7 +53,7 @@ class LaneType(IntEnum):
 
 
 class AgentKind(IntEnum):
-    """What an agent is; NONE marks an empty slot of a batch."""
+    """Kind of an agent; NONE marks an empty slot of a batch."""
 
     NONE = 0
     CAR = 1
@@ -62,7 +66,7 @@ class AgentKind(IntEnum):
 
 
 class Contact(IntFlag):
-    """What the ego touches; bits, since it can touch several at once."""
+    """Objects that the ego touches; bits, since it can touch several at once."""
 
     NONE = 0
     VEHICLE = 1
@@ -81,16 +85,16 @@ class SignalState(IntEnum):
 
 
 class Controller(IntEnum):
-    """Who steers an agent.
+    """Source of an agent's controls.
 
     Attributes:
-        NONE: Nobody: it stands still.
-        EXTERNAL: It takes the action given to `World.step`.
-        AUTOPILOT: It follows its route, sees everything and yields.
-        FOLLOW: It keeps its route and target speed and sees nothing.
+        NONE: The agent stands still.
+        EXTERNAL: It takes the action passed to `World.step`.
+        AUTOPILOT: It follows its route, sees all agents and yields.
+        FOLLOW: It keeps its route and target speed and ignores other agents.
         SCRIPT: It runs its phases.
-        PLACED: It is put where `World.place` says; this is how another simulator is mirrored.
-        TRAJECTORY: It is where its rows of time and place have it; this is how a log is replayed.
+        PLACED: It is placed by `World.place`, which mirrors another simulator.
+        TRAJECTORY: It is at the positions of its timed rows, which replays a log.
     """
 
     NONE = 0
@@ -103,7 +107,7 @@ class Controller(IntEnum):
 
 
 class End(IntEnum):
-    """Why an episode ended."""
+    """Reason why an episode ended."""
 
     RUNNING = 0
     COLLISION = 1
@@ -113,7 +117,7 @@ class End(IntEnum):
     MAX_TIME = 5
 
 
-# what traces call these; "" while the episode runs
+# names in traces; "" while the episode runs
 ENDS = tuple("" if end == End.RUNNING else end.name.lower() for end in End)
 
 
@@ -172,11 +176,11 @@ class Actor:
     Without `path` it goes straight along its heading; with it, it follows the polyline (x, y) in metres. Without
     phases it stands still. Vehicles reach their speed by full throttle or full brake, walkers at once.
 
-    With `trajectory`, rows of time s, x, y m and yaw rad, it is where these have it, straight on between them, whatever
-    happens around it; before the first and after the last it is not there.
+    With `trajectory`, rows of time s, x, y m and yaw rad, it follows these positions, linearly interpolated,
+    regardless of the other agents; before the first and after the last row it is absent.
 
-    With `policy`, the name of a driver, that driver acts for it; `path` is then where it wants to go (key points along
-    lanes; a walker's own line), at `target_speed` m/s where nothing hinders it.
+    With `policy`, the name of a driver, that driver controls it; `path` is then its destination (key points along
+    lanes; a walker's own line), at `target_speed` m/s on a free road.
     """
 
     name: str
@@ -191,7 +195,7 @@ class Actor:
 
 @dataclass(frozen=True)
 class SignalPlan:
-    """How the signals of an episode behave: those that face the ego's route, and all the others."""
+    """Behaviour of the signals of an episode: those that face the ego's route, and all the others."""
 
     ego: Literal["program", "off", "red", "green"] = "program"
     others: Literal["program", "off", "red", "green"] = "program"
@@ -204,8 +208,8 @@ class TrafficPlan:
 
     Attributes:
         intensity: Share of the spawn points near the route that get a vehicle.
-        minimum: Least number of vehicles.
-        maximum: Largest number of vehicles.
+        minimum: Minimum number of vehicles.
+        maximum: Maximum number of vehicles.
         wake_distance: Distance of the ego at which a vehicle wakes, m; 0: it is awake from the start.
         draw: Number of the draw of vehicles, which is then the same in every episode; None: the episode's seed.
     """
@@ -219,9 +223,10 @@ class TrafficPlan:
 
 @dataclass(frozen=True)
 class Limits:
-    """What ends an episode besides the end of the route.
+    """Conditions that end an episode besides the end of the route.
 
-    contact says what a contact of the ego does: `end` the episode, only `count`, or `remove` the other agent and go on.
+    contact: effect of a contact of the ego: `end` the episode, only `count`, or `remove` the other agent and go
+    on.
     """
 
     max_steps: int = 300
@@ -232,25 +237,25 @@ class Limits:
 
 @dataclass(frozen=True)
 class Scenario:
-    """What happens, as its author wrote it; round-trips through YAML.
+    """A scenario as its author wrote it; round-trips through YAML.
 
     Attributes:
         name: Name of the scenario.
-        type: Scenario class (`StraightObstacle`, ..., `NaturalJunction`) that turns `route`, `trigger`, `placements`
-            and `parameters` into actors; or `Custom`, which takes `actors` as they are.
+        type: Scenario class (`StraightObstacle`, ..., `NaturalJunction`) that turns `route`, `trigger`,
+            `placements` and `parameters` into actors; or `Custom`, which takes `actors` unchanged.
         town: Name of the town.
         route: Key points (x, y), m; at least two.
         trigger: The place that the scenario is built around.
-        placements: Poses of actors whose place the author fixed.
+        placements: Poses of actors fixed by the author.
         parameters: Values of the class's parameters.
         actors: Actors of a `Custom` scenario.
         signals: Plan of the traffic lights.
         traffic: Background traffic.
-        limits: When the episode ends.
-        target_speed: Of the ego, m/s.
-        seed: Varies what is random in it.
+        limits: End conditions of the episode.
+        target_speed: Target speed of the ego, m/s.
+        seed: Seed of its random parts.
         group: Group that it belongs to in a set.
-        source: Where it comes from.
+        source: Origin of the scenario.
     """
 
     name: str
@@ -293,17 +298,17 @@ class Route:
 
 @dataclass(frozen=True)
 class EpisodeAgent:
-    """One agent of a concrete episode: where it starts and how it is driven.
+    """One agent of a concrete episode: its start and its controller.
 
     Attributes:
         name: Name of the agent.
         model: Name of its model.
-        controller: Who steers it.
-        pose: Where it starts.
-        speed: At the start, m/s.
+        controller: Source of its controls.
+        pose: Start pose.
+        speed: Start speed, m/s.
         target_speed: m/s.
-        phases: What it does under SCRIPT.
-        route: What it follows.
+        phases: Phases under SCRIPT.
+        route: Route to follow.
         wake_distance: Distance of the ego at which it wakes, m; 0: it is awake from the start.
         trajectory: See `Actor`.
         policy: See `Actor`.
@@ -335,8 +340,8 @@ class Episode:
         agents: The ego and all others.
         signal_override: Index of a signal of the town -> forced state, until `override_until`.
         override_until: s.
-        limits: When the episode ends.
-        seed: Varies what is random in it.
+        limits: End conditions of the episode.
+        seed: Seed of its random parts.
     """
 
     key: str
@@ -351,15 +356,15 @@ class Episode:
 
 @dataclass(frozen=True)
 class EpisodeTrace:
-    """What happened in one episode: T rows, for the start and each recorded step; A agents, of which 0 is the ego.
+    """Record of one episode: T rows, for the start and each recorded step; A agents, of which 0 is the ego.
 
     Attributes:
         key: Key of the episode.
         town: Name of the town.
         dt: Time of a step, s.
-        names: Of the agents.
-        models: Of the agents.
-        kind: Of the agents [A].
+        names: Names of the agents.
+        models: Models of the agents.
+        kind: `AgentKind` of the agents [A].
         length: [A], m.
         width: [A], m.
         x: [T, A], m.
@@ -371,7 +376,7 @@ class EpisodeTrace:
         contact: `Contact` bits of contacts that began in this step [T].
         contact_agent: Agent first touched in this step [T]; -1 none, -2 not an agent.
         off_road: [T].
-        route_distance: Least distance to the rest of the route [T], m.
+        route_distance: Minimum distance to the rest of the route [T], m.
         route_complete: [T], percent.
         driven: Distance so far [T], m.
         lane_invasion: Lane markings crossed in this step [T].
@@ -383,7 +388,7 @@ class EpisodeTrace:
         signal_ids: Traffic lights whose states are recorded [S'].
         signal: Their states [T, S'].
         route: The ego's route [N, 2], m.
-        end: Why it ended (`collision`, `complete`, `max_steps`, `max_distance`, `max_time`).
+        end: Reason of the end (`collision`, `complete`, `max_steps`, `max_distance`, `max_time`).
     """
 
     key: str

@@ -1,3 +1,3 @@
-"""The version of SSAD, where every layer can read it."""
+"""Version of SSAD, importable from every layer."""
 
 __version__ = "0.1.0"

@@ -1,1 +1,1 @@
-"""Recorded data: the nuScenes schema, readers and writers."""
+"""Recorded data: the nuScenes schema, its readers and writers, and COCO annotations."""

@@ -1,4 +1,4 @@
-"""`ssad show`: a page to look at a data set in the nuScenes schema, pictures with boxes and LiDAR from above."""
+"""`ssad show`: a page for browsing a data set in the nuScenes schema: pictures with boxes, and LiDAR from above."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 
-WIDTH, REACH, SIDE = 640, 50.0, 640  # pixels of a picture, m around the ego from above, pixels of that
+WIDTH, REACH, SIDE = 640, 50.0, 640  # width of a picture, pixels; range of the view from above, m, and its size, pixels
 BOX, GROUND, EGO = (255, 170, 30), (15, 19, 26), (96, 165, 250)
 ORDER = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
 LOW, HIGH = -0.5, 3.0  # m above the road: the ends of the colours of LiDAR points
@@ -67,25 +67,25 @@ def write_page(
 
     Args:
         data: The data set.
-        out: Folder.
+        out: Output folder.
         scenes: Names of the scenes; none: the first ten.
-        moments: How many samples of each scene are shown at most, spread over it.
-        progress: Called with the number of scenes that are done, and of all.
+        moments: Largest number of samples shown of each scene, spread over its length.
+        progress: Called with the number of finished scenes and of all scenes.
 
     Returns:
         Path of the page.
 
     Raises:
-        ConfigError: There is no such scene.
-        FormatError: The tables are broken. A picture or sweep that cannot be read is named on the page instead.
+        ConfigError: A scene does not exist.
+        FormatError: The tables are broken. An unreadable picture or sweep is named on the page instead.
         StoreError: A file cannot be written.
     """
     names = list(scenes) or [scene.name for scene in data.scenes()][:10]
     make_folder(out / "pictures")
-    shown = []
-    for number, name in enumerate(names):
-        shown.append(_scene(data.root, data.scene(name), out / "pictures", moments))
-        progress(number + 1, len(names))
+    scene_entries = []
+    for index, name in enumerate(names):
+        scene_entries.append(_scene(data.root, data.scene(name), out / "pictures", moments))
+        progress(index + 1, len(names))
     page = (
         jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
         .from_string(PAGE)
@@ -93,7 +93,7 @@ def write_page(
             name=data.root.name,
             version=data.version,
             total=len(data.scenes()),
-            scenes=shown,
+            scenes=scene_entries,
             per=moments,
             side=SIDE,
             reach=f"{REACH:.0f}",
@@ -104,31 +104,38 @@ def write_page(
 
 
 def _scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str, Any]:
-    """What the page says of a scene; its pictures are written."""
-    places = np.unique(np.linspace(0, len(scene.samples) - 1, min(moments, len(scene.samples))).round().astype(int))
+    """Write the pictures of a scene, and return its entry of the page."""
+    sample_indices = np.unique(
+        np.linspace(0, len(scene.samples) - 1, min(moments, len(scene.samples))).round().astype(int)
+    )
+    # The counts are those of the whole scene, not only of the samples shown.
     counts: Counter[str] = Counter()
     for sample in scene.samples:
-        counts.update(CATEGORY_TO_CLASS.get(c) or c for c in scene.annotations(sample.token).category)
-    shown = []
-    for place in places:
-        token = scene.samples[place].token
-        found = scene.annotations(token)
-        frames = {f.channel: f for f in scene.frames if f.sample_token == token and f.key_frame}
-        stem = f"{re.sub(r'[^A-Za-z0-9_-]', '-', scene.record.name)}-{place:03d}"
+        counts.update(
+            CATEGORY_TO_CLASS.get(category) or category for category in scene.annotations(sample.token).category
+        )
+    moment_entries = []
+    for sample_index in sample_indices:
+        token = scene.samples[sample_index].token
+        boxes = scene.annotations(token)
+        frames = {frame.channel: frame for frame in scene.frames if frame.sample_token == token and frame.key_frame}
+        file_stem = f"{re.sub(r'[^A-Za-z0-9_-]', '-', scene.record.name)}-{sample_index:03d}"
         pictures = []
         for channel in [*ORDER, *sorted(set(frames) - set(ORDER))]:
             if channel in frames and frames[channel].modality == "camera":
-                pictures.append(_camera(root, frames[channel], found, folder / f"{stem}-{channel}.jpg"))
-        lidar = next((f for f in frames.values() if f.modality == "lidar"), None)
-        above = ""
+                pictures.append(_camera(root, frames[channel], boxes, folder / f"{file_stem}-{channel}.jpg"))
+        lidar = next((frame for frame in frames.values() if frame.modality == "lidar"), None)
+        view_name = ""
         if lidar is not None:
-            above = f"{stem}-above.jpg"
-            save_picture(folder / above, from_above(root, lidar, found))
-        seconds = (scene.samples[place].timestamp - scene.samples[0].timestamp) / 1e6
-        shown.append({"title": f"{seconds:.1f} s, {len(found)} boxes", "pictures": pictures, "above": above})
-    told = scene.record.description.rstrip(". ")
-    about = f"{told}. {len(scene.samples)} samples.".lstrip(". ")
-    return {"name": scene.record.name, "about": about, "counts": counts.most_common(), "moments": shown}
+            view_name = f"{file_stem}-above.jpg"
+            save_picture(folder / view_name, from_above(root, lidar, boxes))
+        seconds = (scene.samples[sample_index].timestamp - scene.samples[0].timestamp) / 1e6
+        moment_entries.append(
+            {"title": f"{seconds:.1f} s, {len(boxes)} boxes", "pictures": pictures, "above": view_name}
+        )
+    description = scene.record.description.rstrip(". ")
+    summary = f"{description}. {len(scene.samples)} samples.".lstrip(". ")
+    return {"name": scene.record.name, "about": summary, "counts": counts.most_common(), "moments": moment_entries}
 
 
 def _camera(root: Path, frame: SensorFrame, found: Annotations, path: Path) -> dict[str, Any]:
@@ -140,8 +147,8 @@ def _camera(root: Path, frame: SensorFrame, found: Annotations, path: Path) -> d
         image, title = np.zeros((WIDTH * 9 // 16, WIDTH, 3), np.uint8), f"{title}: {error}"
     scale = WIDTH / image.shape[1]
     canvas: U8 = np.asarray(cv2.resize(image, (WIDTH, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA))
-    rows, _, turn = boxes_in_picture(frame, found, hit=False)
-    corners = found.take(rows).corners() @ turn[:3, :3].T + turn[:3, 3]
+    rows, _, world_to_camera = boxes_in_picture(frame, found, hit=False)
+    corners = found.take(rows).corners() @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     draw_edges(canvas, corners, np.asarray(frame.intrinsic, np.float64), scale, colour=BOX, width=1)
     save_picture(path, canvas)
     return {"file": path.name, "title": title, "size": (canvas.shape[1], canvas.shape[0])}
@@ -160,40 +167,43 @@ def from_above(root: Path, lidar: SensorFrame, found: Annotations) -> U8:
     """
     canvas: U8 = np.full((SIDE, SIDE, 3), GROUND, np.uint8)
     try:
-        cloud = read_points(root / lidar.filename)[:, :3].astype(np.float64)
+        sensor_points = read_points(root / lidar.filename)[:, :3].astype(np.float64)
     except SSADError:
-        cloud = np.zeros((0, 3))
-    points = cloud @ lidar.sensor_to_ego[:3, :3].T + lidar.sensor_to_ego[:3, 3]
+        sensor_points = np.zeros((0, 3))
+    points = sensor_points @ lidar.sensor_to_ego[:3, :3].T + lidar.sensor_to_ego[:3, 3]
     points = points[(np.abs(points[:, :2]) < REACH).all(1)]
-    share = np.clip((points[:, 2] - LOW) / (HIGH - LOW), 0, 1) * 255
+    height_levels = np.clip((points[:, 2] - LOW) / (HIGH - LOW), 0, 1) * 255
     if len(points):
-        place = np.clip(_pixels(points), 0, SIDE - 1).astype(int)
-        colours = cv2.applyColorMap(share.astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
-        canvas[place[:, 1], place[:, 0]] = colours[:, 0, ::-1]
-    turn = np.linalg.inv(lidar.ego_to_world)
+        pixels = np.clip(_pixels(points), 0, SIDE - 1).astype(int)
+        colours = cv2.applyColorMap(height_levels.astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
+        canvas[pixels[:, 1], pixels[:, 0]] = colours[:, 0, ::-1]
+    world_to_ego = np.linalg.inv(lidar.ego_to_world)
     if len(found):
-        axes = turn[:3, :3] @ quaternion_to_matrix(found.rotation)
-        centre = found.centre @ turn[:3, :3].T + turn[:3, 3]
-        half = 0.5 * found.size_lwh
-        signs = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
-        corners = centre[:, None] + np.einsum("nij,nkj->nki", axes, signs * half[:, None])
-        nose = centre + np.einsum("nij,nj->ni", axes, half * (1, 0, 0))
-        for ring, middle, ahead in zip(_pixels(corners), _pixels(centre), _pixels(nose), strict=True):
-            cv2.polylines(canvas, [np.round(ring * 16).astype(np.int32)], True, BOX, 1, cv2.LINE_AA, 4)
-            ends = [tuple(int(v) for v in np.round(p * 16)) for p in (middle, ahead)]
-            cv2.line(canvas, ends[0], ends[1], BOX, 1, cv2.LINE_AA, 4)
+        axes = world_to_ego[:3, :3] @ quaternion_to_matrix(found.rotation)
+        centres = found.centre @ world_to_ego[:3, :3].T + world_to_ego[:3, 3]
+        half_size = 0.5 * found.size_lwh
+        corner_signs = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
+        corners = centres[:, None] + np.einsum("nij,nkj->nki", axes, corner_signs * half_size[:, None])
+        front = centres + np.einsum("nij,nj->ni", axes, half_size * (1, 0, 0))
+        # OpenCV takes fixed-point coordinates: 4 fractional bits, hence the factor 16.
+        for outline, centre_pixel, front_pixel in zip(_pixels(corners), _pixels(centres), _pixels(front), strict=True):
+            cv2.polylines(canvas, [np.round(outline * 16).astype(np.int32)], True, BOX, 1, cv2.LINE_AA, 4)
+            endpoints = [
+                tuple(int(coordinate) for coordinate in np.round(pixel * 16)) for pixel in (centre_pixel, front_pixel)
+            ]
+            cv2.line(canvas, endpoints[0], endpoints[1], BOX, 1, cv2.LINE_AA, 4)
     cv2.drawMarker(canvas, (SIDE // 2, SIDE // 2), EGO, cv2.MARKER_TRIANGLE_UP, 14, 2)
     return canvas
 
 
 def _pixels(points: F64) -> F64:
-    """Ego frame (x ahead, y left) to pixels, x ahead up."""
-    flat = SIDE / 2 - np.asarray(points)[..., :2] * (SIDE / 2 / REACH)
-    return np.asarray(flat[..., ::-1], np.float64)
+    """Convert points of the ego frame (x forward, y left) to pixels (x forward is up)."""
+    pixels = SIDE / 2 - np.asarray(points)[..., :2] * (SIDE / 2 / REACH)
+    return np.asarray(pixels[..., ::-1], np.float64)
 
 
 def check_scenes(data: NuScenes, names: Sequence[str]) -> None:
-    """ConfigError for a data set without scenes or a name that is none, before anything is written."""
+    """Raise ConfigError for a data set without scenes, or for an unknown scene name, before anything is written."""
     if not data.scenes():
         raise ConfigError(f"{data.root / data.version}: it has no scene")
     for name in names:

@@ -13,7 +13,7 @@ from ssad.core import safeio
 from ssad.core.errors import FormatError
 from ssad.core.types import F64, I32, Bool
 
-LARGEST: Final = 1 << 30  # bytes of an annotation file
+LARGEST: Final = 1 << 30  # size limit of an annotation file
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,13 +21,13 @@ class CocoImage:
     """One picture with its N boxes.
 
     Attributes:
-        file: The picture.
-        width: Pixels.
-        height: Pixels.
-        about: Everything else that the file says about the picture.
+        file: Path of the picture.
+        width: Width in pixels.
+        height: Height in pixels.
+        about: All further keys of the picture in the file.
         box: x1, y1, x2, y2 in pixels [N, 4].
         label: Index into the set's classes [N].
-        crowd: Boxes that count neither as found nor as missed [N].
+        crowd: Boxes that count neither as detected nor as missed [N].
         target: Boxes of the object that the set is about [N].
     """
 
@@ -61,26 +61,28 @@ def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about
     Returns:
         What is to be written as JSON; ids start at 1.
     """
-    rows: list[dict[str, Any]] = []
-    boxes: list[dict[str, Any]] = []
+    image_rows: list[dict[str, Any]] = []
+    annotation_rows: list[dict[str, Any]] = []
     for number, image in enumerate(images, 1):
-        rows.append({"id": number} | {k: v for k, v in image.items() if k != "objects"})
-        for thing in image["objects"]:
-            x1, y1, x2, y2 = thing["box"]
-            extra = {k: v for k, v in thing.items() if k not in ("label", "box", "pixels", "crowd")}
-            boxes.append(
+        image_rows.append({"id": number} | {key: value for key, value in image.items() if key != "objects"})
+        for scene_object in image["objects"]:
+            x1, y1, x2, y2 = scene_object["box"]
+            extra = {
+                key: value for key, value in scene_object.items() if key not in ("label", "box", "pixels", "crowd")
+            }
+            annotation_rows.append(
                 {
-                    "id": len(boxes) + 1,
+                    "id": len(annotation_rows) + 1,
                     "image_id": number,
-                    "category_id": thing["label"] + 1,
+                    "category_id": scene_object["label"] + 1,
                     "bbox": [x1, y1, x2 - x1, y2 - y1],
-                    "area": thing["pixels"],
-                    "iscrowd": int(thing["crowd"]),
+                    "area": scene_object["pixels"],
+                    "iscrowd": int(scene_object["crowd"]),
                 }
                 | extra
             )
-    kinds = [{"id": k + 1, "name": name, "supercategory": "road"} for k, name in enumerate(classes)]
-    return {"info": dict(about), "images": rows, "annotations": boxes, "categories": kinds}
+    categories = [{"id": key + 1, "name": name, "supercategory": "road"} for key, name in enumerate(classes)]
+    return {"info": dict(about), "images": image_rows, "annotations": annotation_rows, "categories": categories}
 
 
 def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
@@ -88,63 +90,69 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
 
     Args:
         path: The file.
-        images: Folder of the pictures; by default `images` beside the file's folder if there is one, else the file's
-            own folder.
+        images: Folder of the pictures; by default `images` beside the file's folder if it exists, else the
+            file's own folder.
 
     Returns:
         The pictures with their boxes.
 
     Raises:
-        FormatError: Something is missing, malformed, or refers to an image or category that does not exist.
+        FormatError: A part is missing, malformed, or refers to an image or category that does not exist.
     """
-    data = safeio.read_json(path, limit=LARGEST)
-    lists = ("images", "annotations", "categories")
-    if not isinstance(data, dict) or any(not isinstance(data.get(k), list) for k in lists):
+    content = safeio.read_json(path, limit=LARGEST)
+    required_lists = ("images", "annotations", "categories")
+    if not isinstance(content, dict) or any(not isinstance(content.get(key), list) for key in required_lists):
         raise FormatError(f"{path}: no COCO annotations (lists `images`, `annotations` and `categories`)")
-    beside = path.parent.parent / "images"
-    folder = images or (beside if beside.is_dir() else path.parent)
+    default_folder = path.parent.parent / "images"
+    folder = images or (default_folder if default_folder.is_dir() else path.parent)
     try:
-        names = {int(c["id"]): str(c["name"]) for c in data["categories"]}
-        own: dict[int, list[Mapping[str, Any]]] = {int(row["id"]): [] for row in data["images"]}
-        if len(names) < len(data["categories"]) or len(own) < len(data["images"]):
+        class_names = {int(category["id"]): str(category["name"]) for category in content["categories"]}
+        annotations_by_image: dict[int, list[Mapping[str, Any]]] = {
+            int(record["id"]): [] for record in content["images"]
+        }
+        if len(class_names) < len(content["categories"]) or len(annotations_by_image) < len(content["images"]):
             raise FormatError(f"{path}: two images or two categories of one id")
-        for n, row in enumerate(data["annotations"]):
-            if row["image_id"] not in own or row["category_id"] not in names:
-                raise FormatError(f"{path}: annotation {n} belongs to no image or category of the file")
-            own[row["image_id"]].append(row)
-        label_of = {number: k for k, number in enumerate(sorted(names))}
-        pictures = tuple(_image(row, own[int(row["id"])], label_of, folder) for row in data["images"])
+        for index, record in enumerate(content["annotations"]):
+            if record["image_id"] not in annotations_by_image or record["category_id"] not in class_names:
+                raise FormatError(f"{path}: annotation {index} belongs to no image or category of the file")
+            annotations_by_image[record["image_id"]].append(record)
+        # COCO ids may have gaps; labels count from 0 in the order of the ids.
+        label_by_category = {category_id: key for key, category_id in enumerate(sorted(class_names))}
+        pictures = tuple(
+            _image(record, annotations_by_image[int(record["id"])], label_by_category, folder)
+            for record in content["images"]
+        )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: broken COCO annotations ({type(error).__name__}: {error})") from None
-    return CocoSet(tuple(names[number] for number in sorted(names)), pictures)
+    return CocoSet(tuple(class_names[category_id] for category_id in sorted(class_names)), pictures)
 
 
 def _image(
     row: Mapping[str, Any], own: Sequence[Mapping[str, Any]], label_of: Mapping[int, int], folder: Path
 ) -> CocoImage:
     """One picture with its annotations. ValueError, KeyError or TypeError: broken."""
-    what, file = f"image {row['id']}", str(row["file_name"])
+    image_name, file_name = f"image {row['id']}", str(row["file_name"])
     width, height = int(row["width"]), int(row["height"])
     if width < 1 or height < 1:
-        raise ValueError(f"{what}: {width} x {height} pixels")
-    if Path(file).is_absolute() or ".." in Path(file).parts or not file:
-        raise ValueError(f"{what}: file name '{file}' points out of the folder of images")
+        raise ValueError(f"{image_name}: {width} x {height} pixels")
+    if Path(file_name).is_absolute() or ".." in Path(file_name).parts or not file_name:
+        raise ValueError(f"{image_name}: file name '{file_name}' points out of the folder of images")
     box = np.zeros((len(own), 4))
-    for n, thing in enumerate(own):
-        if not isinstance(thing["bbox"], list) or len(thing["bbox"]) != 4:
-            raise ValueError(f"{what}: a bbox that is no list of four numbers")
-        x, y, w, h = (float(v) for v in thing["bbox"])
-        box[n] = x, y, x + w, y + h
+    for index, annotation in enumerate(own):
+        if not isinstance(annotation["bbox"], list) or len(annotation["bbox"]) != 4:
+            raise ValueError(f"{image_name}: a bbox that is no list of four numbers")
+        x, y, box_width, box_height = (float(value) for value in annotation["bbox"])
+        box[index] = x, y, x + box_width, y + box_height
     if not np.isfinite(box).all() or (box[:, 2:] <= box[:, :2]).any():
-        raise ValueError(f"{what}: a box without width or height, or not finite")
-    about = {k: v for k, v in row.items() if k not in ("id", "file_name", "width", "height")}
+        raise ValueError(f"{image_name}: a box without width or height, or not finite")
+    extra = {key: value for key, value in row.items() if key not in ("id", "file_name", "width", "height")}
     return CocoImage(
-        folder / file,
+        folder / file_name,
         width,
         height,
-        about,
+        extra,
         box,
-        np.array([label_of[r["category_id"]] for r in own], np.int32),
-        np.array([bool(r.get("iscrowd", 0)) for r in own], bool),
-        np.array([bool(r.get("target", False)) for r in own], bool),
+        np.array([label_of[entry["category_id"]] for entry in own], np.int32),
+        np.array([bool(entry.get("iscrowd", 0)) for entry in own], bool),
+        np.array([bool(entry.get("target", False)) for entry in own], bool),
     )

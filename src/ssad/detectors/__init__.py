@@ -22,22 +22,22 @@ SHIPPED = Path(__file__).parent / "weights"
 
 
 def detector_names() -> dict[str, str]:
-    """All names -> where they come from."""
+    """Return the origin of every detector, by name."""
     return names("detector", DETECTORS)
 
 
 def make_detector(
     name: str, *, weights: str | Path | None = None, device: str = "cpu", seed: int = 0, **options: Any
 ) -> Any:
-    """A detector by name, frozen and in eval mode on a device.
+    """Return a detector by name, frozen and in eval mode.
 
     Args:
         name: Name of the detector; arguments for its builder may follow, as in "mine:make?checkpoint=a.pt".
-        weights: None: the shipped ones if there are any, else fresh ones; "random": fresh ones from `seed`; else a file
-            (see `ssad.core.checkpoints.load_weights`; darknet's .weights for YOLOv3).
-        device: Where it is put.
-        seed: Of fresh weights.
-        **options: What its builder takes.
+        weights: None for the shipped weights if there are any, else fresh ones; "random" for fresh weights from
+            `seed`; else a file (see `ssad.core.checkpoints.load_weights`; darknet's .weights for YOLOv3).
+        device: Device of the detector.
+        seed: Seed of fresh weights.
+        **options: Options of the detector's builder.
 
     Raises:
         UnknownNameError: There is no such detector.
@@ -45,45 +45,47 @@ def make_detector(
         FormatError: The weights cannot be read, or do not fit.
     """
     reference = Reference.of(name)
-    build = resolve("detector", DETECTORS, reference.name)
-    check_arguments("detector", name, build, more=options)
+    builder = resolve("detector", DETECTORS, reference.name)
+    check_arguments("detector", name, builder, more=options)
     name, options = reference.name, {**reference.options, **options}
     if name not in DETECTORS:
-        made = make("detector", name, build, options, ("task", "classes", "predict"))
-        return made.to(device) if hasattr(made, "to") else made
+        detector = make("detector", name, builder, options, ("task", "classes", "predict"))
+        return detector.to(device) if hasattr(detector, "to") else detector
+    # Imported late: listing detectors must not load torch.
     from ssad.core.checkpoints import fit_state, load_weights
 
     if weights is None and (SHIPPED / f"{name}.json").is_file():
         weights = SHIPPED / f"{name}.safetensors"
     if weights is None or str(weights) == "random":
-        return build(seed=seed, **options).to(device)
+        return builder(seed=seed, **options).to(device)
     path = Path(weights).expanduser()
     state = {} if path.suffix == ".weights" else load_weights(path)
     if name.startswith("yolo"):
         options = (_classes_of(path) if "classes" not in options else {}) | options
     else:
+        # The file decides the form of the yaw branch, so weights of both forms load by one name.
         options = {"heading": "vectors" if any(".heading_convs." in key for key in state) else "bins"} | options
-    made = build(seed=seed, **options)
+    detector = builder(seed=seed, **options)
     if path.suffix == ".weights":
         from ssad.detectors.yolo.darknet import read_darknet
 
-        read_darknet(made, path)
-        return made.to(device)
+        read_darknet(detector, path)
+        return detector.to(device)
     if path.parent == SHIPPED:
         _check_hash(path, state)
-    fit_state(made, state, path)
-    return made.to(device)
+    fit_state(detector, state, path)
+    return detector.to(device)
 
 
 def _classes_of(path: Path) -> dict[str, Any]:
-    """The classes that the card beside weights names, if there is one."""
+    """Return the classes named by the card beside the weights, or nothing without a card."""
     from ssad.core.checkpoints import read_card
 
     return {"classes": read_card(path).classes} if path.with_suffix(".json").is_file() else {}
 
 
 def _check_hash(path: Path, state: dict[str, Any]) -> None:
-    """FormatError: shipped weights that are not those of their card."""
+    """Raise FormatError unless shipped weights have the hash of their card."""
     from ssad.core.checkpoints import hash_state, read_card
     from ssad.core.errors import FormatError
 

@@ -10,10 +10,10 @@ from ssad.detectors.pgd_det import pgd_det
 
 
 def fcos3d_light(**options: Any) -> Mono3D:
-    """See `ssad.detectors.fcos3d.fcos3d`."""
+    """Build the light FCOS3D; options as for `ssad.detectors.fcos3d.fcos3d`."""
     return fcos3d(light=True, **options)
 
 
 def pgd_det_light(**options: Any) -> Mono3D:
-    """See `ssad.detectors.pgd_det.pgd_det`."""
+    """Build the light PGD-Det; options as for `ssad.detectors.pgd_det.pgd_det`."""
     return pgd_det(light=True, **options)

@@ -1,4 +1,4 @@
-"""The conformance test of detectors: what attacks, training and evaluation rely on, tried out."""
+"""Conformance test of detectors: tries out all that attacks, training and evaluation rely on."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ FEW = 0.01  # share of places that may differ in a batch: choices between values
 
 
 class DetectorCheckError(AssertionError):
-    """A detector breaks promises; the message has them all, one a line."""
+    """A detector breaks promises; the message lists all of them, one a line."""
 
 
 def check_detector(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[int, int] = (96, 128)) -> None:
-    """Hold a detector to `ssad.core.protocols.Detector`.
+    """Check a detector against `ssad.core.protocols.Detector`.
 
     Args:
         detector: The detector.
-        intrinsic: Camera matrix [3, 3] of the pictures that are tried, for detectors of task "3d"; None: a focal length
-            of 0.8 times the width.
-        size: Height and width of these pictures, which are random; others follow.
+        intrinsic: Camera matrix [3, 3] of the test images, for detectors of task "3d"; None for a focal length of
+            0.8 times the width.
+        size: Height and width of the random test images; other sizes follow.
 
     Raises:
-        DetectorCheckError: The detector breaks promises; the message has every one of them.
+        DetectorCheckError: The detector breaks promises; the message lists every one of them.
     """
     faults = find_faults(detector, intrinsic=intrinsic, size=size)
     if faults:
@@ -43,7 +43,7 @@ def check_detector(detector: Any, *, intrinsic: Tensor | None = None, size: tupl
 
 
 def find_faults(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[int, int] = (96, 128)) -> list[str]:
-    """The promises that a detector breaks, a sentence each; none for one that keeps them."""
+    """Return the broken promises of a detector, a sentence each; an empty list if it keeps all."""
     return list(each_fault(detector, intrinsic=intrinsic, size=size))
 
 
@@ -59,12 +59,12 @@ def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[in
         A sentence for each broken promise.
     """
     if not isinstance(detector, Detector):
-        wanted = ("name", "task", "classes", "predict", "dense", "assign", "losses")
-        missing = [name for name in wanted if not hasattr(detector, name)]
+        required_members = ("name", "task", "classes", "predict", "dense", "assign", "losses")
+        missing = [name for name in required_members if not hasattr(detector, name)]
         yield f"it lacks {', '.join(missing)} of ssad.core.protocols.Detector"
         return
     trial = CheckCase(detector, size, intrinsic)
-    for part in (
+    for run_check in (
         _check_names,
         _check_dense,
         check_places,
@@ -81,13 +81,13 @@ def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[in
         _check_sizes,
         _check_refusals,
     ):
-        told = len(trial.faults)
-        name = part.__name__.strip("_").removeprefix("check_").replace("_", " ")
+        fault_count = len(trial.faults)
+        name = run_check.__name__.strip("_").removeprefix("check_").replace("_", " ")
         with trial.guarded(name), torch.random.fork_rng(devices=[]):
             # not the state that a caller left: where he has seeded with 0, a detector that does so too changes nothing
             torch.default_generator.manual_seed(seed32("check_detector", name))
-            part(trial)
-        yield from trial.faults[told:]
+            run_check(trial)
+        yield from trial.faults[fault_count:]
 
 
 # ---------------------------------------------------------------- the promises
@@ -100,11 +100,18 @@ def _check_names(trial: CheckCase) -> None:
     task: Any = detector.task
     need(task in ("2d", "3d"), 'task is "2d" or "3d"')
     classes: Any = detector.classes
-    named = isinstance(classes, tuple) and len(classes) > 0 and all(isinstance(one, str) for one in classes)
-    need(named and len(set(classes)) == len(classes), "classes are a tuple of distinct names, at least one")
-    learning = [n for root in modules_of(detector) for n, p in root.named_parameters() if p.requires_grad]
-    if not any(root.training for root in modules_of(detector)):
-        need(not learning, f"parameters are frozen outside training; {learning[:1]} has requires_grad")
+    are_names = (
+        isinstance(classes, tuple) and len(classes) > 0 and all(isinstance(class_name, str) for class_name in classes)
+    )
+    need(are_names and len(set(classes)) == len(classes), "classes are a tuple of distinct names, at least one")
+    trainable = [
+        parameter_name
+        for module in modules_of(detector)
+        for parameter_name, parameter in module.named_parameters()
+        if parameter.requires_grad
+    ]
+    if not any(module.training for module in modules_of(detector)):
+        need(not trainable, f"parameters are frozen outside training; {trainable[:1]} has requires_grad")
 
 
 def _check_dense(trial: CheckCase) -> None:
@@ -122,14 +129,22 @@ def _check_dense(trial: CheckCase) -> None:
     level = dense.level
     need(level.shape == (count,) and not level.is_floating_point(), "Dense.level is [P], whole numbers")
     need(tuple(dense.size) == trial.size, "Dense.size is height and width of the pictures")
-    parts = [dense.logit, dense.box, dense.place, *([] if dense.quality is None else [dense.quality])]
-    need(all(bool(p.isfinite().all()) for p in parts), "what Dense holds is finite")
-    need(all(p.dtype in (torch.float32, torch.float64) for p in parts), "what Dense holds is float32 or float64")
+    outputs = [dense.logit, dense.box, dense.place, *([] if dense.quality is None else [dense.quality])]
+    need(all(bool(output.isfinite().all()) for output in outputs), "what Dense holds is finite")
+    need(
+        all(output.dtype in (torch.float32, torch.float64) for output in outputs),
+        "what Dense holds is float32 or float64",
+    )
     maps: Any = dense.maps
-    lists = all(isinstance(v, list) and all(isinstance(t, Tensor) for t in v) for v in maps.values())
-    need(lists, "Dense.maps holds lists of tensors by name")
-    need(all(f.ndim == 4 and len(f) == BATCH for f in dense.features), "Dense.features are [B, K, h, w]")
-    heights = [f.shape[2] for f in dense.features]
+    are_lists = all(
+        isinstance(tensors, list) and all(isinstance(tensor, Tensor) for tensor in tensors) for tensors in maps.values()
+    )
+    need(are_lists, "Dense.maps holds lists of tensors by name")
+    need(
+        all(feature.ndim == 4 and len(feature) == BATCH for feature in dense.features),
+        "Dense.features are [B, K, h, w]",
+    )
+    heights = [feature.shape[2] for feature in dense.features]
     need(heights == sorted(heights, reverse=True), "Dense.features are ordered finest first")
 
 
@@ -145,31 +160,36 @@ def _check_gradient(trial: CheckCase) -> None:
         trial.need(bool(gradient.isfinite().all()), f"the gradient of Dense.{name} is finite")
         limit = torch.tensor(dense.size[::-1], device=value.device)
         inside = ((dense.box[0, :, :2] > 0) & (dense.box[0, :, 2:] < limit)).any()  # all may be cut at the border
-        reaches = bool(gradient[0].any()) or (name == "box" and not bool(inside))
-        trial.need(reaches, f"the gradient of Dense.{name} reaches the image")
+        reaches_image = bool(gradient[0].any()) or (name == "box" and not bool(inside))
+        trial.need(reaches_image, f"the gradient of Dense.{name} reaches the image")
         trial.need(not bool(gradient[1].any()), f"Dense.{name} of an image does not depend on the others")
 
 
 def _check_predict(trial: CheckCase) -> None:
     need, images = trial.need, trial.images()
     need(len(trial.predict(images)) == BATCH, "predict answers for each image")
-    least = usual_threshold(trial, images)
-    everything = trial.predict(images, threshold=least)
-    some = False
-    for found in everything:
-        some |= len(found.score) > 0
-        for kept, promise in promises(found, classes=len(trial.detector.classes), three=trial.three, least=least):
-            need(kept, promise)
-    need(some, "predict finds something when the threshold is low")
-    for few, found in zip(trial.predict(images, threshold=0.5 * (1 + least)), everything, strict=True):
-        need(bool((few.score >= 0.5 * (1 + least)).all()), "no score lies under the threshold")
-        need(len(few.score) <= len(found.score), "a higher threshold finds no more")
-    again = trial.predict(images, threshold=least)
-    same = all(
-        torch.equal(a.score, b.score) and torch.equal(a.box, b.box) for a, b in zip(everything, again, strict=True)
+    threshold = usual_threshold(trial, images)
+    batch_detections = trial.predict(images, threshold=threshold)
+    any_detection = False
+    for detections in batch_detections:
+        any_detection |= len(detections.score) > 0
+        for holds, promise in promises(
+            detections, classes=len(trial.detector.classes), three=trial.three, least=threshold
+        ):
+            need(holds, promise)
+    need(any_detection, "predict finds something when the threshold is low")
+    for stricter, detections in zip(
+        trial.predict(images, threshold=0.5 * (1 + threshold)), batch_detections, strict=True
+    ):
+        need(bool((stricter.score >= 0.5 * (1 + threshold)).all()), "no score lies under the threshold")
+        need(len(stricter.score) <= len(detections.score), "a higher threshold finds no more")
+    repeated = trial.predict(images, threshold=threshold)
+    identical = all(
+        torch.equal(first.score, second.score) and torch.equal(first.box, second.box)
+        for first, second in zip(batch_detections, repeated, strict=True)
     )
-    need(same, "the same images give the same detections")
-    need(len(trial.predict(images.double(), threshold=least)) == BATCH, "float64 images are taken")
+    need(identical, "the same images give the same detections")
+    need(len(trial.predict(images.double(), threshold=threshold)) == BATCH, "float64 images are taken")
 
 
 def promises(found: Detections, *, classes: int, three: bool, least: float = 0.0) -> Iterator[tuple[bool, str]]:
@@ -182,8 +202,8 @@ def promises(found: Detections, *, classes: int, three: bool, least: float = 0.0
     yield bool(((found.score >= least) & (found.score <= 1)).all()), "scores lie between the threshold and 1"
     yield bool((found.score.diff() <= 0).all()), "detections come best first"
     yield bool(((found.label >= 0) & (found.label < classes)).all()), "labels are within classes"
-    ordered = bool((found.box[:, 2:] >= found.box[:, :2]).all()) and bool(found.box.isfinite().all())
-    yield ordered, "boxes are x1, y1, x2, y2, finite, x1 <= x2 and y1 <= y2"
+    is_ordered = bool((found.box[:, 2:] >= found.box[:, :2]).all()) and bool(found.box.isfinite().all())
+    yield is_ordered, "boxes are x1, y1, x2, y2, finite, x1 <= x2 and y1 <= y2"
     yield not found.score.requires_grad and not found.box.requires_grad, "predict keeps no gradient"
     if found.solid is not None:
         yield from _solid_promises(found.solid, count)
@@ -201,37 +221,47 @@ def _solid_promises(solid: Solids, count: int) -> Iterator[tuple[bool, str]]:
         value = getattr(solid, name)
         yield tuple(value.shape) == shape, f"Solids.{name} is {['N', *shape[1:]]}"
         finite = not value.is_floating_point() or bool(value.isfinite().all())
+        # A detector may leave the velocity unknown, as NaN.
         yield finite or name == "velocity", f"Solids.{name} is finite"
     yield bool((solid.size_lhw > 0).all()), "sizes are above 0"
-    inside = bool(((solid.attribute >= 0) & (solid.attribute < len(MMDET3D_ATTRIBUTES))).all())
-    yield inside, "attributes are within ssad.core.nuscenes_names.MMDET3D_ATTRIBUTES"
+    valid_attribute = bool(((solid.attribute >= 0) & (solid.attribute < len(MMDET3D_ATTRIBUTES))).all())
+    yield valid_attribute, "attributes are within ssad.core.nuscenes_names.MMDET3D_ATTRIBUTES"
 
 
 def _check_batch(trial: CheckCase) -> None:
     images = trial.images()
     with torch.no_grad():
-        together = trial.dense(images)
-        turned = trial.dense(images.flip(0))
-        alone = [trial.dense(images[k : k + 1]) for k in range(BATCH)]
+        batch_dense = trial.dense(images)
+        reversed_dense = trial.dense(images.flip(0))
+        single_denses = [trial.dense(images[image_index : image_index + 1]) for image_index in range(BATCH)]
     for name in ("logit", "quality", "box"):
-        whole = getattr(together, name)
-        if whole is None:
+        batch_values = getattr(batch_dense, name)
+        if batch_values is None:
             continue
-        for k in range(BATCH):
-            for other in (getattr(alone[k], name)[0], getattr(turned, name)[BATCH - 1 - k]):
-                fits = other.shape == whole[k].shape and _apart(whole[k], other) <= FEW
-                trial.need(fits, f"Dense.{name} of an image does not depend on its batch")
-    least = usual_threshold(trial, images)
-    both = trial.predict(images, threshold=least)
-    for k in range(BATCH):
-        (single,) = trial.predict(images[k : k + 1], threshold=least)
-        trial.need(_alike(both[k], single), "detections of an image do not depend on its batch")
+        for image_index in range(BATCH):
+            for single_values in (
+                getattr(single_denses[image_index], name)[0],
+                getattr(reversed_dense, name)[BATCH - 1 - image_index],
+            ):
+                agrees = (
+                    single_values.shape == batch_values[image_index].shape
+                    and _apart(batch_values[image_index], single_values) <= FEW
+                )
+                trial.need(agrees, f"Dense.{name} of an image does not depend on its batch")
+    threshold = usual_threshold(trial, images)
+    batch_detections = trial.predict(images, threshold=threshold)
+    for image_index in range(BATCH):
+        (single_detections,) = trial.predict(images[image_index : image_index + 1], threshold=threshold)
+        trial.need(
+            _alike(batch_detections[image_index], single_detections),
+            "detections of an image do not depend on its batch",
+        )
 
 
 def _apart(a: Tensor, b: Tensor) -> float:
     """The share of rows that differ by more than rounding."""
-    far = (a - b).abs() > RTOL * (1 + b.abs())
-    return float(far.reshape(len(far), -1).any(-1).double().mean()) if far.numel() else 0.0
+    differs = (a - b).abs() > RTOL * (1 + b.abs())
+    return float(differs.reshape(len(differs), -1).any(-1).double().mean()) if differs.numel() else 0.0
 
 
 def _alike(a: Detections, b: Detections) -> bool:
@@ -241,9 +271,9 @@ def _alike(a: Detections, b: Detections) -> bool:
         return len(a.score) == len(b.score)
     if not torch.allclose(a.score[:count], b.score[:count], rtol=RTOL, atol=1e-5):
         return False
-    near = (a.box[:count, None] - b.box).abs().amax(-1) < 2.0  # pixels
-    match = near & (a.label[:count, None] == b.label)
-    return float(match.any(1).double().mean()) > 0.6
+    is_near = (a.box[:count, None] - b.box).abs().amax(-1) < 2.0  # pixels
+    is_match = is_near & (a.label[:count, None] == b.label)
+    return float(is_match.any(1).double().mean()) > 0.6
 
 
 def _check_losses(trial: CheckCase) -> None:
@@ -252,60 +282,77 @@ def _check_losses(trial: CheckCase) -> None:
     dense = trial.dense(images)
     assignment: Assignment = detector.assign(dense, truth)
     count = dense.logit.shape[1]
-    shaped = assignment.label.shape == assignment.owner.shape == (BATCH, count)
-    if not need(shaped, "Assignment.label and owner are [B, P]"):
+    shapes_agree = assignment.label.shape == assignment.owner.shape == (BATCH, count)
+    if not need(shapes_agree, "Assignment.label and owner are [B, P]"):
         return
-    for row, owner, one in zip(assignment.label, assignment.owner, truth, strict=True):
-        owned = owner >= 0
-        need(bool(((row >= -2) & (row < len(detector.classes))).all()), "Assignment.label is -2, -1 or a class")
-        need(bool((owner < len(one.label)).all()) and bool((owner >= -1).all()), "Assignment.owner is -1 or an object")
-        need(torch.equal(owned, row >= 0), "places with an owner have a class, others have none")
-        need(bool((row[owned] == one.label[owner[owned]]).all()), "a place has the class of its owner")
-        need(not len(one.label) or bool(owned.any()), "some place answers for a large object")
-    held = (assignment.label, *assignment.extra.values())
-    need(not any(value.requires_grad for value in held), "no gradient flows through assign")
-    batch = detector.losses(dense, assignment)
-    each = detector.losses(dense, assignment, reduction="image")
-    need(batch.keys() == each.keys() and bool(batch), "losses have the same names for both reductions")
-    need(all(v.shape == () for v in batch.values()), 'losses are scalars for "batch"')
-    need(all(v.shape == (BATCH,) for v in each.values()), 'losses are [B] for "image"')
-    finite = all(bool(v.isfinite().all()) for v in (*batch.values(), *each.values()))
+    for labels, owner, image_truth in zip(assignment.label, assignment.owner, truth, strict=True):
+        has_owner = owner >= 0
+        need(bool(((labels >= -2) & (labels < len(detector.classes))).all()), "Assignment.label is -2, -1 or a class")
+        need(
+            bool((owner < len(image_truth.label)).all()) and bool((owner >= -1).all()),
+            "Assignment.owner is -1 or an object",
+        )
+        need(torch.equal(has_owner, labels >= 0), "places with an owner have a class, others have none")
+        need(
+            bool((labels[has_owner] == image_truth.label[owner[has_owner]]).all()), "a place has the class of its owner"
+        )
+        need(not len(image_truth.label) or bool(has_owner.any()), "some place answers for a large object")
+    tensors = (assignment.label, *assignment.extra.values())
+    need(not any(value.requires_grad for value in tensors), "no gradient flows through assign")
+    batch_losses = detector.losses(dense, assignment)
+    image_losses = detector.losses(dense, assignment, reduction="image")
+    need(
+        batch_losses.keys() == image_losses.keys() and bool(batch_losses),
+        "losses have the same names for both reductions",
+    )
+    need(all(loss.shape == () for loss in batch_losses.values()), 'losses are scalars for "batch"')
+    need(all(loss.shape == (BATCH,) for loss in image_losses.values()), 'losses are [B] for "image"')
+    finite = all(bool(loss.isfinite().all()) for loss in (*batch_losses.values(), *image_losses.values()))
+    # The second of the three test images has no objects.
     need(finite, "losses are finite, also for an image without objects")
-    for name, values in (("batch", batch), ("image", each)):
-        total = torch.stack([v.sum() for v in values.values()]).sum()
+    for name, values in (("batch", batch_losses), ("image", image_losses)):
+        total = torch.stack([loss.sum() for loss in values.values()]).sum()
         (gradient,) = torch.autograd.grad(total, images, retain_graph=True)
         need(bool(gradient.isfinite().all()), f'the gradient of the "{name}" losses is finite')
-        reached = gradient.flatten(1).any(1)
-        told = [k for k, one in enumerate(truth) if len(one.label)]
-        need(bool(reached[told].all()), f'the gradient of the "{name}" losses reaches every image with objects')
-    for k in range(BATCH):
+        reached_images = gradient.flatten(1).any(1)
+        images_with_objects = [image_index for image_index, image_truth in enumerate(truth) if len(image_truth.label)]
+        need(
+            bool(reached_images[images_with_objects].all()),
+            f'the gradient of the "{name}" losses reaches every image with objects',
+        )
+    for image_index in range(BATCH):
         with torch.no_grad():
-            lone = trial.dense(images[k : k + 1])
-            single = detector.losses(lone, detector.assign(lone, truth[k : k + 1]))
-        for name, value in single.items():
-            same = torch.allclose(value, each[name][k].detach(), rtol=10 * RTOL, atol=1e-4)
-            need(same, f'"image" losses are those of each image alone ({name})')
+            single_dense = trial.dense(images[image_index : image_index + 1])
+            single_losses = detector.losses(
+                single_dense, detector.assign(single_dense, truth[image_index : image_index + 1])
+            )
+        for name, value in single_losses.items():
+            agrees = torch.allclose(value, image_losses[name][image_index].detach(), rtol=10 * RTOL, atol=1e-4)
+            need(agrees, f'"image" losses are those of each image alone ({name})')
     with torch.no_grad():
-        none = trial.dense(images)
-        empty = detector.losses(none, detector.assign(none, trial.truth((0, 0, 0))))
-        moved = trial.dense((images * 0.9).clamp(0, 1))
-        kept = detector.losses(moved, assignment)
-    need(all(bool(v.isfinite()) for v in empty.values()), "losses are finite without any object")
-    need(all(bool(v.isfinite()) for v in kept.values()), "a frozen assignment serves other pictures of the same size")
+        fresh_dense = trial.dense(images)
+        empty_losses = detector.losses(fresh_dense, detector.assign(fresh_dense, trial.truth((0, 0, 0))))
+        darker_dense = trial.dense((images * 0.9).clamp(0, 1))
+        darker_losses = detector.losses(darker_dense, assignment)
+    need(all(bool(loss.isfinite()) for loss in empty_losses.values()), "losses are finite without any object")
+    need(
+        all(bool(loss.isfinite()) for loss in darker_losses.values()),
+        "a frozen assignment serves other pictures of the same size",
+    )
 
 
 def _check_modes(trial: CheckCase) -> None:
-    """In a mixture of modes, as training with frozen parts has it, predict changes nothing."""
-    roots = modules_of(trial.detector)
-    before = [(part, part.training) for root in roots for part in root.modules()]
+    """Check that predict changes nothing in a mixture of modes, as in training with frozen parts."""
+    modules = modules_of(trial.detector)
+    modes = [(submodule, submodule.training) for module in modules for submodule in module.modules()]
     try:
-        for number, (part, _) in enumerate(before):
-            part.training = number % 3 != 1
+        for index, (submodule, _) in enumerate(modes):
+            submodule.training = index % 3 != 1
         with trial.guarded("predict in training mode"):
             trial.predict(trial.images())
     finally:
-        for part, mode in before:
-            part.training = mode
+        for submodule, mode in modes:
+            submodule.training = mode
 
 
 def _check_sizes(trial: CheckCase) -> None:
@@ -321,31 +368,33 @@ def _check_sizes(trial: CheckCase) -> None:
 
 def _check_refusals(trial: CheckCase) -> None:
     images, detector = trial.images(1), trial.detector
-    lens = trial.lens(1)
+    intrinsic = trial.lens(1)
     dense = trial.dense(images)
 
-    def refused(what: str, call: Callable[[], object]) -> None:
+    def expect_refusal(what: str, call: Callable[[], object]) -> None:
         try:
             call()
         except ConfigError as error:
             trial.need("\n" not in str(error), f"{what}: refused in one line")
-        except Exception as error:  # any other kind is the fault that is looked for
+        except Exception as error:  # any other exception is the fault in question
             trial.need(False, f"{what}: refused with ConfigError, not {type(error).__name__}")
         else:
             trial.need(False, f"{what}: refused with ConfigError")
 
-    for what, bad in (
+    for description, bad_images in (
         ("greyscale images", images[:, :1]),
         ("a single image without a batch", images[0]),
         ("uint8 images", (images * 255).to(torch.uint8)),
         ("integer images", images.to(torch.int16)),
     ):
-        refused(what, lambda bad=bad: detector.predict(bad, lens))  # type: ignore[misc]
-        refused(what, lambda bad=bad: detector.dense(bad, lens))  # type: ignore[misc]
-    if lens is not None:
-        refused("images without an intrinsic", lambda: detector.predict(images))
-        refused("intrinsics of another number", lambda: detector.predict(images, lens[:0]))
-    refused("truth of another number of images", lambda: detector.assign(dense, trial.truth((1, 1))))
-    (real,) = trial.truth((1,))
-    wrong = Truth(real.label + len(detector.classes), real.box, real.solid, real.intrinsic)
-    refused("labels that are none of the classes", lambda: detector.assign(dense, [wrong]))
+        expect_refusal(description, lambda bad_images=bad_images: detector.predict(bad_images, intrinsic))  # type: ignore[misc]
+        expect_refusal(description, lambda bad_images=bad_images: detector.dense(bad_images, intrinsic))  # type: ignore[misc]
+    if intrinsic is not None:
+        expect_refusal("images without an intrinsic", lambda: detector.predict(images))
+        expect_refusal("intrinsics of another number", lambda: detector.predict(images, intrinsic[:0]))
+    expect_refusal("truth of another number of images", lambda: detector.assign(dense, trial.truth((1, 1))))
+    (valid_truth,) = trial.truth((1,))
+    invalid_truth = Truth(
+        valid_truth.label + len(detector.classes), valid_truth.box, valid_truth.solid, valid_truth.intrinsic
+    )
+    expect_refusal("labels that are none of the classes", lambda: detector.assign(dense, [invalid_truth]))

@@ -1,4 +1,4 @@
-"""Part of `ssad.detectors.check`: places all over the picture, boxes in its pixels, solids in the documented frame."""
+"""Geometric part of `ssad.detectors.check`: places that cover the image, boxes in its pixels, documented 3D frame."""
 
 from __future__ import annotations
 
@@ -14,70 +14,79 @@ from ssad.core.detections import Dense, Detections, Solids, Truth
 from ssad.detectors.check_cases import CheckCase, usual_threshold
 from ssad.detectors.mono3d.decode import corners, hull, project
 
-BEST = 20  # detections of an image that are looked at
-FEW = 5  # of these, how many are taken for true
+BEST = 20  # detections compared in an image
+FEW = 5  # of these, the number used as truth
 NEAR = 1.5  # pixels between a detection and the place that it comes from: room for rounding
 SIDES = ("length", "height", "width")
 FITS = 0.9  # overlap of a box and the hull of a solid that belong together
 CLEARLY = {"yaw": 1.08, "size": 1.08, "centre": 1.25}  # ratio of losses; for another centre other places answer
-TRAINED = 0.4  # ratio of the losses of a detector's own detections to those of objects that are not there
+TRAINED = 0.4  # ratio of the losses of a detector's own detections to those of absent objects
 
 
 def check_places(trial: CheckCase) -> None:
-    """Nothing is left out: every level has places all over the picture, the same for every picture."""
+    """Check that every level has places all over the image, the same for every image."""
     images = trial.images(1)
     with torch.no_grad():
-        dense, other = trial.dense(images), trial.dense(1 - images)
-    same = dense.place.shape == other.place.shape and torch.equal(dense.place, other.place)
-    trial.need(same, "Dense.place depends on the size of the pictures alone, not on what they show")
-    holes = [level for level in sorted(set(dense.level.tolist())) if not _covers(dense, level)]
-    trial.need(not holes, f"Dense has places all over the picture, not only the best; level(s) {holes} have holes")
+        dense, inverted_dense = trial.dense(images), trial.dense(1 - images)
+    is_fixed = dense.place.shape == inverted_dense.place.shape and torch.equal(dense.place, inverted_dense.place)
+    trial.need(is_fixed, "Dense.place depends on the size of the pictures alone, not on what they show")
+    incomplete_levels = [level for level in sorted(set(dense.level.tolist())) if not _covers(dense, level)]
+    trial.need(
+        not incomplete_levels,
+        f"Dense has places all over the picture, not only the best; level(s) {incomplete_levels} have holes",
+    )
 
 
 def _covers(dense: Dense, level: int) -> bool:
-    """Whether each cell of a level within the picture has a place; it may lie in a corner of the cell."""
-    mine = dense.level == level
-    stride, place = float(dense.stride[mine][0]), dense.place[mine]
+    """Return whether each cell of a level within the image has a place, possibly in a corner of the cell."""
+    in_level = dense.level == level
+    stride, place = float(dense.stride[in_level][0]), dense.place[in_level]
     x, y = (stride * (torch.arange(int(length / stride), device=place.device) + 0.5) for length in dense.size[::-1])
-    for row in y.tolist():
-        near = place[(place[:, 1] - row).abs() <= 0.75 * stride, 0]
-        if not bool(((near[:, None] - x).abs() <= 0.75 * stride).any(0).all()):
+    for row_centre in y.tolist():
+        nearby_x = place[(place[:, 1] - row_centre).abs() <= 0.75 * stride, 0]
+        if not bool(((nearby_x[:, None] - x).abs() <= 0.75 * stride).any(0).all()):
             return False
     return True
 
 
 def check_boxes(trial: CheckCase) -> None:
-    """Boxes are in pixels of the picture, x before y, and detections are among those of the places."""
+    """Check that boxes are in pixels, x before y, and that detections are among the boxes of the places."""
     images = trial.images()
     with torch.no_grad():
         dense = trial.dense(images)
     box, place = dense.box.double(), dense.place.double()
-    middle = (box[..., :2] + box[..., 2:]) / 2
-    straight, crossed = _follows(middle, place), _follows(middle, place.flip(-1))
-    pixels = bool((middle.abs() > 2).any()) and straight < 2
-    trial.need(pixels, "Dense.box is in pixels of the picture, not in shares of it or in pixels of the network's input")
-    turned = crossed > 0.2 and crossed > 2 * abs(straight)
-    trial.need(not turned, "Dense.box is x1, y1, x2, y2: its x follows the x of Dense.place, not the y")
-    apart = []
-    for found, boxes in zip(trial.predict(images, threshold=usual_threshold(trial, images)), box, strict=True):
-        own, all_boxes = (_cut(b, trial.size) for b in (found.box[:BEST].double(), boxes))
-        if len(own) and len(all_boxes):
-            apart.append((own[:, None] - all_boxes).abs().amax(-1).amin(-1))
-    near = not apart or float(torch.cat(apart).median()) <= NEAR
-    trial.need(near, "the boxes of predict are among those of dense, in the same pixels")
+    centre = (box[..., :2] + box[..., 2:]) / 2
+    slope, crossed_slope = _follows(centre, place), _follows(centre, place.flip(-1))
+    in_pixels = bool((centre.abs() > 2).any()) and slope < 2
+    trial.need(
+        in_pixels, "Dense.box is in pixels of the picture, not in shares of it or in pixels of the network's input"
+    )
+    is_swapped = crossed_slope > 0.2 and crossed_slope > 2 * abs(slope)
+    trial.need(not is_swapped, "Dense.box is x1, y1, x2, y2: its x follows the x of Dense.place, not the y")
+    distances = []
+    for detections, image_boxes in zip(
+        trial.predict(images, threshold=usual_threshold(trial, images)), box, strict=True
+    ):
+        detected_boxes, place_boxes = (
+            _cut(candidate_boxes, trial.size) for candidate_boxes in (detections.box[:BEST].double(), image_boxes)
+        )
+        if len(detected_boxes) and len(place_boxes):
+            distances.append((detected_boxes[:, None] - place_boxes).abs().amax(-1).amin(-1))
+    agrees = not distances or float(torch.cat(distances).median()) <= NEAR
+    trial.need(agrees, "the boxes of predict are among those of dense, in the same pixels")
 
 
 def _follows(middle: Tensor, place: Tensor) -> float:
     """By how many pixels the middles [B, P, 2] of boxes move if the places [P, 2] move by one; 0 if these do not."""
-    across = place - place.mean(0)
-    spread = across.square().mean(0)
+    deviation = place - place.mean(0)
+    spread = deviation.square().mean(0)
     if not bool((spread > 0).all()):
         return 0.0
-    return float(((middle - middle.mean(1, keepdim=True)) * across).mean((0, 1)).div(spread).mean())
+    return float(((middle - middle.mean(1, keepdim=True)) * deviation).mean((0, 1)).div(spread).mean())
 
 
 def _cut(box: Tensor, size: tuple[int, int]) -> Tensor:
-    """Boxes [..., 4] cut to the picture."""
+    """Clip boxes [..., 4] to the image."""
     return box.clamp_min(0).minimum(box.new_tensor([size[1], size[0]] * 2))
 
 
@@ -100,19 +109,23 @@ class Reading:
 
     @property
     def changed(self) -> list[str]:
-        """What differs from the documented convention."""
-        parts = {"yaw": self.yaw != "", "size": self.size != (0, 1, 2), "centre": self.up != 0}
-        return [name for name, other in parts.items() if other]
+        """Names of the parts that differ from the documented convention."""
+        differences = {"yaw": self.yaw != "", "size": self.size != (0, 1, 2), "centre": self.up != 0}
+        return [name for name, differs in differences.items() if differs]
 
     def __str__(self) -> str:
-        order = ", ".join(SIDES[self.size.index(column)] for column in range(3))
-        said = {"yaw": f"yaw {self.yaw}", "size": f"size as {order}", "centre": "centre of the bottom face"}
+        size_order = ", ".join(SIDES[self.size.index(column)] for column in range(3))
+        descriptions = {
+            "yaw": f"yaw {self.yaw}",
+            "size": f"size as {size_order}",
+            "centre": "centre of the bottom face",
+        }
         if self.up > 0:
-            said["centre"] = "centre of the top face"
-        return " and ".join(said[name] for name in self.changed)
+            descriptions["centre"] = "centre of the top face"
+        return " and ".join(descriptions[name] for name in self.changed)
 
     def apply(self, solid: Solids) -> Solids:
-        """The solids in the documented convention."""
+        """Convert solids from this convention to the documented one."""
         size = solid.size_lhw[:, list(self.size)]
         centre = solid.centre.clone()
         centre[:, 1] += self.up * size[:, 1]
@@ -139,25 +152,32 @@ READINGS = sorted(
 
 
 def check_solids(trial: CheckCase) -> None:
-    """Solids are what their boxes show and what the losses take for true, in the documented convention."""
+    """Check 3D boxes against their 2D boxes and the losses, in the documented convention."""
     images = trial.images()
-    everything = trial.predict(images, threshold=usual_threshold(trial, images))
-    if not trial.three or any(one.solid is None for one in everything):
+    batch_detections = trial.predict(images, threshold=usual_threshold(trial, images))
+    if not trial.three or any(entry.solid is None for entry in batch_detections):
         return
-    fit = [_fit(trial, everything, reading) for reading in READINGS]
-    best = max(fit)
-    told = None
-    if best > FITS:
-        if 1 - fit[0] > 5 * (1 - best) + 0.005:
-            as_good = [reading for reading, one in zip(READINGS, fit, strict=True) if one > best - 0.002]
-            simple = [reading for reading in as_good if len(reading.changed) == len(as_good[0].changed)]
-            told = min(simple, key=_losses(trial, images, everything))
+    overlaps = [_fit(trial, batch_detections, convention) for convention in READINGS]
+    best_overlap = max(overlaps)
+    better_convention = None
+    if best_overlap > FITS:
+        if 1 - overlaps[0] > 5 * (1 - best_overlap) + 0.005:
+            ties = [
+                convention for convention, entry in zip(READINGS, overlaps, strict=True) if entry > best_overlap - 0.002
+            ]
+            # Several conventions may fit equally well; report the simplest, and let the losses decide among those.
+            simplest = [convention for convention in ties if len(convention.changed) == len(ties[0].changed)]
+            better_convention = min(simplest, key=_losses(trial, images, batch_detections))
     else:  # the boxes are not hulls, but predicted
-        told = _better_for_losses(trial, images, everything)
-        if told is not None and told.up != 0 and not _shown(fit[0], _fit(trial, everything, told)):
-            told = None
-    what = "solids have the centre of gravity, length, height, width and yaw of ssad.core.detections"
-    trial.need(told is None, f"{what}; these fit better if read otherwise: {told}")
+        better_convention = _better_for_losses(trial, images, batch_detections)
+        if (
+            better_convention is not None
+            and better_convention.up != 0
+            and not _shown(overlaps[0], _fit(trial, batch_detections, better_convention))
+        ):
+            better_convention = None
+    promise = "solids have the centre of gravity, length, height, width and yaw of ssad.core.detections"
+    trial.need(better_convention is None, f"{promise}; these fit better if read otherwise: {better_convention}")
 
 
 def _shown(documented: float, other: float) -> bool:
@@ -167,17 +187,17 @@ def _shown(documented: float, other: float) -> bool:
 
 def _fit(trial: CheckCase, everything: list[Detections], reading: Reading) -> float:
     """Mean overlap of the boxes with the hulls of the solids."""
-    lens = trial.lens(1)
-    found = []
-    for one in everything:
-        if one.solid is None or lens is None:
+    intrinsic = trial.lens(1)
+    image_overlaps = []
+    for detections in everything:
+        if detections.solid is None or intrinsic is None:
             continue
-        solid = reading.apply(one.solid)
-        shown = hull(project(corners(solid.centre, solid.size_lhw, solid.yaw), lens[0].to(solid.centre)))
-        box, shown = _cut(one.box[:BEST], trial.size), _cut(shown[:BEST], trial.size)
-        seen = _area(box) > 4
-        found.append(_overlap(box[seen], shown[seen]))
-    overlap = torch.cat(found) if found else torch.zeros(0)
+        solid = reading.apply(detections.solid)
+        hulls = hull(project(corners(solid.centre, solid.size_lhw, solid.yaw), intrinsic[0].to(solid.centre)))
+        box, hulls = _cut(detections.box[:BEST], trial.size), _cut(hulls[:BEST], trial.size)
+        is_visible = _area(box) > 4
+        image_overlaps.append(_overlap(box[is_visible], hulls[is_visible]))
+    overlap = torch.cat(image_overlaps) if image_overlaps else torch.zeros(0)
     return float(overlap.double().mean()) if len(overlap) else 0.0
 
 
@@ -187,8 +207,8 @@ def _area(box: Tensor) -> Tensor:
 
 def _overlap(a: Tensor, b: Tensor) -> Tensor:
     """IoU [N] of boxes [N, 4] in pairs."""
-    both = _area(torch.cat([torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])], 1))
-    return both / (_area(a) + _area(b) - both).clamp_min(1e-6)
+    intersection = _area(torch.cat([torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])], 1))
+    return intersection / (_area(a) + _area(b) - intersection).clamp_min(1e-6)
 
 
 def _better_for_losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> Reading | None:
@@ -197,14 +217,16 @@ def _better_for_losses(trial: CheckCase, images: Tensor, everything: list[Detect
     None as well if no reading is: the losses of weights that are not trained are as large for one truth as for another.
     """
     loss = _losses(trial, images, everything)
-    own, *others = (reading for reading in READINGS if len(reading.changed) <= 1)
-    best = min(others, key=loss)
-    clearly = math.isfinite(loss(own)) and loss(own) > CLEARLY[best.changed[0]] * loss(best)
+    documented, *others = (convention for convention in READINGS if len(convention.changed) <= 1)
+    best_convention = min(others, key=loss)
+    is_better = math.isfinite(loss(documented)) and loss(documented) > CLEARLY[best_convention.changed[0]] * loss(
+        best_convention
+    )
     with torch.no_grad():
         dense = trial.dense(images)
         losses = trial.detector.losses(dense, trial.detector.assign(dense, trial.truth((2, 1, 1))))
-    trained = loss(best) < TRAINED * float(sum(part.sum() for part in losses.values()))
-    return best if clearly and trained else None
+    is_trained = loss(best_convention) < TRAINED * float(sum(part.sum() for part in losses.values()))
+    return best_convention if is_better and is_trained else None
 
 
 def _losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> Callable[[Reading], float]:
@@ -213,7 +235,8 @@ def _losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> C
         dense = trial.dense(images)
 
     def loss(reading: Reading) -> float:
-        truth = [_truth(one, reading, trial) for one in everything]
+        # Detections serve as truth: the documented convention fits them best if the detector follows it.
+        truth = [_truth(detections, reading, trial) for detections in everything]
         assignment = trial.detector.assign(dense, truth)
         if not bool((assignment.label >= 0).any()):
             return math.inf
@@ -225,10 +248,10 @@ def _losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> C
 
 def _truth(found: Detections, reading: Reading, trial: CheckCase) -> Truth:
     """The best detections as truth."""
-    lens = trial.lens(1)
+    intrinsic = trial.lens(1)
     assert found.solid is not None
-    assert lens is not None
+    assert intrinsic is not None
     solid = reading.apply(found.solid)
-    columns = (solid.centre, solid.size_lhw, solid.yaw, solid.velocity, solid.attribute)
-    few = Solids(*(column[:FEW] for column in columns))
-    return Truth(found.label[:FEW], _cut(found.box[:FEW], trial.size), few, lens[0])
+    fields = (solid.centre, solid.size_lhw, solid.yaw, solid.velocity, solid.attribute)
+    solids = Solids(*(field_values[:FEW] for field_values in fields))
+    return Truth(found.label[:FEW], _cut(found.box[:FEW], trial.size), solids, intrinsic[0])

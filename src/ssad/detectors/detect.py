@@ -1,4 +1,4 @@
-"""What a detector finds in pictures of one's own, or in a data set: drawn, and as the official results file."""
+"""Detections in a user's images, drawn, or in a data set, as the official results file."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ MODALITIES = dict.fromkeys(("use_lidar", "use_radar", "use_map", "use_external")
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """A picture with what was found in it.
+    """Image with its detections.
 
     Attributes:
-        path: Where the drawn picture is.
+        path: Path of the drawn image.
         count: Number of boxes.
-        notes: What was assumed, each in a few words.
+        notes: Assumptions, each in a few words.
     """
 
     path: Path
@@ -58,14 +58,26 @@ def draw_found(picture: U8, found: Detections, classes: Sequence[str], intrinsic
         draw_flat(canvas, found.box, 1.0, colour=FOUND, width=width)
     else:
         draw_solids(canvas, found.solid, intrinsic, 1.0, colour=FOUND, width=width)
-    size = 0.4 * max(1.0, picture.shape[1] / 960)
+    font_scale = 0.4 * max(1.0, picture.shape[1] / 960)
     for box, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
-        x, y = (round(min(max(v, 0), limit - 1)) for v, limit in zip(box[:2], picture.shape[1::-1], strict=True))
-        words = f"{classes[label]} {score:.2f}"
-        (w, h), _ = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-        x, top = min(x, max(picture.shape[1] - w - 4, 0)), max(y - h - 6, 0)
-        cv2.rectangle(canvas, (x, top), (x + w + 4, top + h + 6), (0, 0, 0), -1)
-        cv2.putText(canvas, words, (x + 2, top + h + 2), cv2.FONT_HERSHEY_SIMPLEX, size, FOUND, 1, cv2.LINE_AA)
+        left, box_top = (
+            round(min(max(coordinate, 0), limit - 1))
+            for coordinate, limit in zip(box[:2], picture.shape[1::-1], strict=True)
+        )
+        caption = f"{classes[label]} {score:.2f}"
+        (text_width, text_height), _ = cv2.getTextSize(caption, cv2.FONT_HERSHEY_SIMPLEX, font_scale, 1)
+        left, top = min(left, max(picture.shape[1] - text_width - 4, 0)), max(box_top - text_height - 6, 0)
+        cv2.rectangle(canvas, (left, top), (left + text_width + 4, top + text_height + 6), (0, 0, 0), -1)
+        cv2.putText(
+            canvas,
+            caption,
+            (left + 2, top + text_height + 2),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            font_scale,
+            FOUND,
+            1,
+            cv2.LINE_AA,
+        )
     return canvas
 
 
@@ -78,60 +90,65 @@ def detect_pictures(
     focal: float | None = None,
     device: str = "cpu",
 ) -> list[Marked]:
-    """Draw what a detector finds in pictures, and write all boxes to OUT/detections.json.
+    """Draw the detections in images, and write all boxes to OUT/detections.json.
 
     Args:
-        detector: On the device.
-        files: The pictures, of any size.
-        out: Folder of the drawn pictures.
-        threshold: Least score.
+        detector: Detector on the device.
+        files: The images, of any size.
+        out: Folder of the drawn images.
+        threshold: Minimum score.
         focal: Focal length in pixels, for a 3D detector; None: that of a typical camera, which is noted.
-        device: Where the detector is.
+        device: Device of the detector.
 
     Returns:
-        One entry a picture.
+        One entry per image.
 
     Raises:
-        FormatError: A file is no picture.
-        ConfigError: Two pictures have one name.
+        FormatError: A file is not an image.
+        ConfigError: Two images have the same name.
         StoreError: A file cannot be written.
     """
     names = [file.stem for file in files]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise ConfigError(f"two pictures are called {twice}; give them to two commands with two OUT folders")
+    # Drawn images are named after the stem, so a.png and a.jpg would overwrite each other.
+    duplicate = next((name for name in names if names.count(name) > 1), None)
+    if duplicate is not None:
+        raise ConfigError(f"two pictures are called {duplicate}; give them to two commands with two OUT folders")
     make_folder(out)
-    marked, listed = [], {}
+    annotated_images, rows_by_file = [], {}
     for file in files:
-        read = as_images(file)
-        height, width = read.tensor.shape[-2:]
+        loaded = as_images(file)
+        height, width = loaded.tensor.shape[-2:]
         camera = Camera.typical(width, height)
         intrinsic = camera.intrinsic.copy()
-        assumed = (f"focal length {intrinsic[0, 0]:.0f} pixels assumed (--focal)",) if focal is None else ()
+        assumptions = (f"focal length {intrinsic[0, 0]:.0f} pixels assumed (--focal)",) if focal is None else ()
         intrinsic[[0, 1], [0, 1]] = focal or intrinsic[0, 0]
-        lens = torch.from_numpy(intrinsic.astype(np.float32))[None].to(device) if detector.task == "3d" else None
-        (found,) = to_host(detector.predict(read.tensor.to(device), lens, threshold=threshold))
-        picture = (read.tensor[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+        intrinsic_batch = (
+            torch.from_numpy(intrinsic.astype(np.float32))[None].to(device) if detector.task == "3d" else None
+        )
+        (detections,) = to_host(detector.predict(loaded.tensor.to(device), intrinsic_batch, threshold=threshold))
+        image = (loaded.tensor[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
         path = out / f"{file.stem}.jpg"
         if path.exists() and path.samefile(file):
             raise ConfigError(f"{path} would be written over the picture that is looked at; give another OUT")
-        save_picture(path, draw_found(picture, found, detector.classes, intrinsic))
-        listed[file.name] = _rows(found, detector.classes)
-        marked.append(Marked(path, len(found.score), (*read.notes, *(assumed if lens is not None else ()))))
-    write_atomic(out / "detections.json", dump_json(listed, indent=1) + "\n")
-    return marked
+        save_picture(path, draw_found(image, detections, detector.classes, intrinsic))
+        rows_by_file[file.name] = _rows(detections, detector.classes)
+        annotated_images.append(
+            Marked(path, len(detections.score), (*loaded.notes, *(assumptions if intrinsic_batch is not None else ())))
+        )
+    write_atomic(out / "detections.json", dump_json(rows_by_file, indent=1) + "\n")
+    return annotated_images
 
 
 def _rows(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
     """Boxes as plain data: x0, y0, x1, y1 in pixels; in space centre (m, camera frame), size l, h, w (m), yaw."""
     rows: list[dict[str, Any]] = []
-    for n, (box, label, score) in enumerate(
+    for index, (box, label, score) in enumerate(
         zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True)
     ):
-        row = {"class": classes[label], "score": round(score, 4), "box": [round(v, 2) for v in box]}
+        row = {"class": classes[label], "score": round(score, 4), "box": [round(coordinate, 2) for coordinate in box]}
         if found.solid is not None:
-            row |= {"centre": found.solid.centre[n].tolist(), "size_lhw": found.solid.size_lhw[n].tolist()}
-            row["yaw"] = float(found.solid.yaw[n])
+            row |= {"centre": found.solid.centre[index].tolist(), "size_lhw": found.solid.size_lhw[index].tolist()}
+            row["yaw"] = float(found.solid.yaw[index])
         rows.append(row)
     return rows
 
@@ -171,10 +188,10 @@ def detect_dataset(
         )
     names = scenes_of(data, split) if split else tuple(scene.name for scene in data.scenes())
     results: dict[str, list[dict[str, Any]]] = {}
-    for number, name in enumerate(names):
-        for one in detect_scene(detector, data.root, data.scene(name), device=device):
-            results[one.token] = results_rows(one)
-        progress(number + 1, len(names))
+    for scene_index, name in enumerate(names):
+        for sample_boxes in detect_scene(detector, data.root, data.scene(name), device=device):
+            results[sample_boxes.token] = results_rows(sample_boxes)
+        progress(scene_index + 1, len(names))
     make_folder(out)
     meta = MODALITIES | {"use_camera": True, "ssad_manifest": manifest, "ssad_detector": detector.name}
     path = out / "results.json"
@@ -188,23 +205,23 @@ def results_rows(found: SampleBoxes) -> list[dict[str, Any]]:
     return [
         {
             "sample_token": found.token,
-            "translation": boxes.centre[n].tolist(),
-            "size": boxes.size_wlh[n].tolist(),
-            "rotation": boxes.rotation[n].tolist(),
-            "velocity": np.nan_to_num(boxes.velocity[n, :2]).tolist(),
-            "detection_name": MMDET3D_CLASSES[int(boxes.label[n])],
-            "detection_score": float(boxes.score[n]),
-            "attribute_name": boxes.attribute[n],
+            "translation": boxes.centre[row_index].tolist(),
+            "size": boxes.size_wlh[row_index].tolist(),
+            "rotation": boxes.rotation[row_index].tolist(),
+            "velocity": np.nan_to_num(boxes.velocity[row_index, :2]).tolist(),
+            "detection_name": MMDET3D_CLASSES[int(boxes.label[row_index])],
+            "detection_score": float(boxes.score[row_index]),
+            "attribute_name": boxes.attribute[row_index],
         }
-        for n in range(len(boxes.score))
+        for row_index in range(len(boxes.score))
     ]
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a path is a folder in the nuScenes schema: one with a version in it.
+    """Return True for a folder in the nuScenes schema, which has a version in it.
 
     Raises:
-        SSADError: There is nothing there.
+        SSADError: The path does not exist.
     """
     if not path.exists():
         raise SSADError(f"{path}: no such file or folder")

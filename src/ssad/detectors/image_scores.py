@@ -29,7 +29,7 @@ CAMERAS = 64  # of a sample, at most: the number of an image is that of its samp
 
 @dataclass(frozen=True, slots=True)
 class PictureBoxes:
-    """What a 2D detector found in the images of one sample, a row a box.
+    """Detections of a 2D detector in the images of one sample, a row per box.
 
     Attributes:
         camera: Place of the image among the camera frames of the sample [N].
@@ -49,7 +49,7 @@ class PictureBoxes:
 
 @dataclass(frozen=True, slots=True)
 class SamplePictures:
-    """What was found in the images of one sample."""
+    """Detections in the images of one sample."""
 
     token: str
     boxes: PictureBoxes
@@ -70,19 +70,19 @@ class PictureTruth:
 
 @dataclass(frozen=True, slots=True)
 class PictureScores:
-    """AP50 of each of nuScenes's ten classes, in the order of `MMDET3D_CLASSES`; NaN where there is no object."""
+    """AP50 of each of nuScenes's ten classes, in the order of `MMDET3D_CLASSES`; NaN for absent classes."""
 
     ap: F64
 
     @property
     def mean_ap(self) -> float:
-        """Mean over the classes that are there; 0 if none is."""
+        """Mean over the classes that are present; 0 without any."""
         return float(np.nanmean(self.ap)) if np.isfinite(self.ap).any() else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class PictureMatches:
-    """Which boxes match; enough for the scores under any weights of the samples.
+    """Matches of boxes, sufficient for the scores under any weights of the samples.
 
     Attributes:
         matched: Detections from best to worst.
@@ -96,16 +96,19 @@ class PictureMatches:
 
     @property
     def samples(self) -> int:
-        """How many there are."""
+        """Number of samples."""
         return int(self.truth_counts.shape[1])
 
     def scores(self, weights: npt.NDArray[np.integer[Any]] | None = None) -> PictureScores:
-        """The scores, where each sample counts as often as its weight [S] says; None: once."""
-        times = np.ones(self.samples, np.int64) if weights is None else np.asarray(weights, np.int64)
-        rows = np.repeat(np.arange(len(self.sample)), times[self.sample])
-        own = self.matched
-        drawn = Matched2D(own.label[rows], own.hit[rows], own.ignored[rows], self.truth_counts @ times)
-        return PictureScores(drawn.average_precision())
+        """Return the scores, with each sample counted as often as its weight [S]; None: once."""
+        repetitions = np.ones(self.samples, np.int64) if weights is None else np.asarray(weights, np.int64)
+        # Repeating rows keeps their order, so the bootstrap needs no further matching.
+        rows = np.repeat(np.arange(len(self.sample)), repetitions[self.sample])
+        matches = self.matched
+        resampled = Matched2D(
+            matches.label[rows], matches.hit[rows], matches.ignored[rows], self.truth_counts @ repetitions
+        )
+        return PictureScores(resampled.average_precision())
 
 
 def gather_pictures(
@@ -122,53 +125,65 @@ def gather_pictures(
         found: Of all images, in order.
         classes: Names of the labels.
     """
-    table = np.array([MMDET3D_CLASSES.index(name) if name in MMDET3D_CLASSES else -1 for name in classes], np.int32)
-    result, start = [], 0
+    label_table = np.array(
+        [MMDET3D_CLASSES.index(name) if name in MMDET3D_CLASSES else -1 for name in classes], np.int32
+    )
+    sample_pictures, start = [], 0
     for sample in samples:
         count = len(by_sample.get(sample.token, []))
-        own = found[start : start + count]
+        sample_detections = found[start : start + count]
         start += count
-        camera = np.repeat(np.arange(count), [len(one.score) for one in own]).astype(np.int32)
-        label = table[_joined([one.label for one in own]).astype(np.int64)]
-        known = label >= 0
-        box, score = _joined([one.box for one in own], 4), _joined([one.score for one in own])
-        result.append(SamplePictures(sample.token, PictureBoxes(camera[known], box[known], score[known], label[known])))
-    return result
+        camera_indices = np.repeat(np.arange(count), [len(single.score) for single in sample_detections]).astype(
+            np.int32
+        )
+        labels = label_table[_joined([single.label for single in sample_detections]).astype(np.int64)]
+        is_known = labels >= 0
+        box, score = (
+            _joined([single.box for single in sample_detections], 4),
+            _joined([single.score for single in sample_detections]),
+        )
+        sample_pictures.append(
+            SamplePictures(
+                sample.token, PictureBoxes(camera_indices[is_known], box[is_known], score[is_known], labels[is_known])
+            )
+        )
+    return sample_pictures
 
 
 def _joined(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
     empty = np.zeros((0,) if width is None else (0, width))
-    return np.concatenate([empty, *(one.detach().cpu().double().numpy() for one in values)])
+    return np.concatenate([empty, *(tensor.detach().cpu().double().numpy() for tensor in values)])
 
 
 @lru_cache(maxsize=2)
 def read_picture_truth(root: Path, version: str, scenes: tuple[str, ...], samples: tuple[str, ...]) -> PictureTruth:
-    """The true boxes of all camera images.
+    """Read the true boxes of all camera images.
 
     Args:
-        root: Of the data set.
-        version: Of the data set.
+        root: Root of the data set.
+        version: Version of the data set.
         scenes: Names.
-        samples: Tokens of all samples of these scenes, in the order in which they are numbered.
+        samples: Tokens of all samples of these scenes, in the order of their numbers.
     """
-    place = {token: k for k, token in enumerate(samples)}
-    image: list[int] = []
-    label, box = [np.zeros(0, np.int64)], [np.zeros((0, 4))]
-    seen = dict.fromkeys(samples, 0)
-    with NuScenes(root, version) as data:
+    sample_index = {token: index for index, token in enumerate(samples)}
+    image_numbers: list[int] = []
+    labels, boxes = [np.zeros(0, np.int64)], [np.zeros((0, 4))]
+    frame_counts = dict.fromkeys(samples, 0)
+    with NuScenes(root, version) as dataset:
         for name in scenes:
-            scene = data.scene(name)
+            scene = dataset.scene(name)
             for frame in scene.frames:
                 if frame.modality != "camera" or not frame.key_frame:
                     continue
                 truth = camera_truth(frame, scene.annotations(frame.sample_token))
-                number = place[frame.sample_token] * CAMERAS + seen[frame.sample_token]
-                seen[frame.sample_token] += 1
-                image += [number] * len(truth.label)
-                label.append(truth.label.numpy())
-                box.append(truth.box.double().numpy())
+                image_number = sample_index[frame.sample_token] * CAMERAS + frame_counts[frame.sample_token]
+                frame_counts[frame.sample_token] += 1
+                image_numbers += [image_number] * len(truth.label)
+                labels.append(truth.label.numpy())
+                boxes.append(truth.box.double().numpy())
     return PictureTruth(
-        samples, Boxes2D(np.array(image, np.int32), np.concatenate(label).astype(np.int32), np.concatenate(box))
+        samples,
+        Boxes2D(np.array(image_numbers, np.int32), np.concatenate(labels).astype(np.int32), np.concatenate(boxes)),
     )
 
 
@@ -180,25 +195,37 @@ def match_pictures(found: Sequence[SamplePictures], truth: PictureTruth, classes
         truth: Of the same samples.
         classes: Names of those that the detector knows; objects of others are left out.
     """
-    real = truth.boxes
-    known = np.isin(real.label, [k for k, name in enumerate(MMDET3D_CLASSES) if name in classes])
-    real = Boxes2D(real.image[known], real.label[known], real.box[known])
-    place = {token: k for k, token in enumerate(truth.samples)}
-    own = sorted((one for one in found if one.token in place), key=lambda one: place[one.token])
-    parts = [one.boxes for one in own]
-    sample = np.repeat([place[one.token] for one in own], [len(part) for part in parts]).astype(np.int64)
-    camera = np.concatenate([np.zeros(0, np.int32), *(part.camera for part in parts)])
-    boxes = Boxes2D(
-        (sample * CAMERAS + camera).astype(np.int32),
-        np.concatenate([np.zeros(0, np.int32), *(part.label for part in parts)]).astype(np.int32),
-        np.concatenate([np.zeros((0, 4)), *(part.box for part in parts)]),
-        np.concatenate([np.zeros(0), *(part.score for part in parts)]),
+    truth_boxes = truth.boxes
+    is_known = np.isin(truth_boxes.label, [index for index, name in enumerate(MMDET3D_CLASSES) if name in classes])
+    truth_boxes = Boxes2D(truth_boxes.image[is_known], truth_boxes.label[is_known], truth_boxes.box[is_known])
+    sample_index = {token: index for index, token in enumerate(truth.samples)}
+    known_samples = sorted(
+        (sample_pictures for sample_pictures in found if sample_pictures.token in sample_index),
+        key=lambda sample_pictures: sample_index[sample_pictures.token],
     )
-    count, many = len(MMDET3D_CLASSES), len(truth.samples)
-    matched = match_2d(real, boxes, labels=count)
+    boxes_by_sample = [sample_pictures.boxes for sample_pictures in known_samples]
+    sample_numbers = np.repeat(
+        [sample_index[sample_pictures.token] for sample_pictures in known_samples],
+        [len(sample_boxes) for sample_boxes in boxes_by_sample],
+    ).astype(np.int64)
+    camera_indices = np.concatenate([np.zeros(0, np.int32), *(sample_boxes.camera for sample_boxes in boxes_by_sample)])
+    detected_boxes = Boxes2D(
+        (sample_numbers * CAMERAS + camera_indices).astype(np.int32),
+        # The empty array lets concatenate work without any sample.
+        np.concatenate([np.zeros(0, np.int32), *(sample_boxes.label for sample_boxes in boxes_by_sample)]).astype(
+            np.int32
+        ),
+        np.concatenate([np.zeros((0, 4)), *(sample_boxes.box for sample_boxes in boxes_by_sample)]),
+        np.concatenate([np.zeros(0), *(sample_boxes.score for sample_boxes in boxes_by_sample)]),
+    )
+    class_count, sample_count = len(MMDET3D_CLASSES), len(truth.samples)
+    matched = match_2d(truth_boxes, detected_boxes, labels=class_count)
     assert matched.row is not None
-    counts = np.bincount(real.label.astype(np.int64) * many + real.image // CAMERAS, minlength=count * many)
-    return PictureMatches(matched, sample[matched.row], counts.reshape(count, many))
+    truth_counts = np.bincount(
+        truth_boxes.label.astype(np.int64) * sample_count + truth_boxes.image // CAMERAS,
+        minlength=class_count * sample_count,
+    )
+    return PictureMatches(matched, sample_numbers[matched.row], truth_counts.reshape(class_count, sample_count))
 
 
 def picture_figures(scores: PictureScores, *, few: bool = False) -> dict[str, float]:
@@ -208,6 +235,6 @@ def picture_figures(scores: PictureScores, *, few: bool = False) -> dict[str, fl
         scores: The scores.
         few: Whether only mAP and the AP of cars are wanted.
     """
-    each = {f"AP_{name}": float(scores.ap[MMDET3D_CLASSES.index(name)]) for name in CLASSES}
-    found = {"mAP": scores.mean_ap, "AP_car": each["AP_car"]} | ({} if few else each)
-    return {name: round(value, 6) for name, value in found.items() if np.isfinite(value)}
+    class_ap = {f"AP_{name}": float(scores.ap[MMDET3D_CLASSES.index(name)]) for name in CLASSES}
+    figures = {"mAP": scores.mean_ap, "AP_car": class_ap["AP_car"]} | ({} if few else class_ap)
+    return {name: round(value, 6) for name, value in figures.items() if np.isfinite(value)}

@@ -1,4 +1,4 @@
-"""What people hand in as pictures, as detectors take them: [B, 3, H, W] float32 in [0, 1], RGB."""
+"""Conversion of user images to the format of detectors: [B, 3, H, W] float32 in [0, 1], RGB."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ HINTS = {
 
 @dataclass(frozen=True, slots=True)
 class Images:
-    """Pictures as detectors take them.
+    """Images in the format of detectors.
 
     Attributes:
-        tensor: [B, 3, H, W] float32 (float64 stays) in [0, 1], RGB.
-        notes: Conversions that a user may want to know about, each once: "greyscale repeated to three channels", "alpha
-            left out", "16 bit", ...
+        tensor: [B, 3, H, W] float32 (float64 is kept) in [0, 1], RGB.
+        notes: Conversions that a user may want to know about, each once: "greyscale repeated to three channels",
+            "alpha left out", "16 bit", ...
     """
 
     tensor: Tensor
@@ -44,32 +44,32 @@ class Images:
 
 
 def as_images(x: Any, *, where: str = "images") -> Images:
-    """One picture or a batch, from files, arrays or tensors; gradients of float tensors are kept.
+    """Convert one image or a batch from files, arrays or tensors; gradients of float tensors are kept.
 
-    Channels are RGB (OpenCV reads BGR: reverse its arrays first). uint8 is divided by 255, uint16 by 65535 (also when
-    only 12 of its bits are used, with a note); floats must be in [0, 1]. Greyscale is repeated to three channels and
-    alpha is left out, both with a note, since detectors are made for colour. Any size is accepted.
+    Channels are RGB (OpenCV reads BGR: reverse its arrays first). uint8 is divided by 255, uint16 by 65535 (also
+    when only 12 of its bits are used, with a note); floats must be in [0, 1]. Greyscale is repeated to three
+    channels and alpha is dropped, both with a note, since detectors expect colour. Any size is accepted.
 
     Args:
-        x: A file name (PNG, JPEG, TIFF, BMP, WebP; 8 bits, then turned upright as its EXIF says, or 16); a numpy array
-            [H, W], [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; or a list of any of
+        x: A file name (PNG, JPEG, TIFF, BMP, WebP; 8 bits, then turned upright by its EXIF, or 16); a numpy array
+            [H, W], [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; or a list of
             these, all of one size.
         where: Name of the argument, for messages.
 
     Raises:
-        ConfigError: Another shape, type or range, or pictures of different sizes.
-        FormatError: A file is not a picture.
+        ConfigError: The shape, type or range is invalid, or the images differ in size.
+        FormatError: A file is not an image.
     """
     if isinstance(x, Sequence) and not isinstance(x, str | bytes):
         if not x:
             raise ConfigError(f"{where}: no picture")
-        parts = [as_images(one, where=f"{where}[{k}]") for k, one in enumerate(x)]
-        sizes = sorted({tuple(part.tensor.shape[2:]) for part in parts})
+        converted_images = [as_images(image, where=f"{where}[{index}]") for index, image in enumerate(x)]
+        sizes = sorted({tuple(converted.tensor.shape[2:]) for converted in converted_images})
         if len(sizes) > 1:
-            shown = ", ".join(f"{height} x {width}" for height, width in sizes[:3])
-            raise ConfigError(f"{where}: pictures of different sizes ({shown}, height x width) make no batch")
-        notes = dict.fromkeys(note for part in parts for note in part.notes)
-        return Images(torch.cat([part.tensor for part in parts]), tuple(notes))
+            size_list = ", ".join(f"{height} x {width}" for height, width in sizes[:3])
+            raise ConfigError(f"{where}: pictures of different sizes ({size_list}, height x width) make no batch")
+        notes = dict.fromkeys(note for converted in converted_images for note in converted.notes)
+        return Images(torch.cat([converted.tensor for converted in converted_images]), tuple(notes))
     if isinstance(x, str | os.PathLike):
         return _scaled(*_read(Path(x).expanduser()), where=str(x))
     if isinstance(x, np.ndarray):
@@ -80,7 +80,7 @@ def as_images(x: Any, *, where: str = "images") -> Images:
 
 
 def _from_array(x: npt.NDArray[Any], where: str) -> Tensor:
-    """[H, W], [H, W, C] or [B, H, W, C] as [B, C, H, W]."""
+    """Convert [H, W], [H, W, C] or [B, H, W, C] to [B, C, H, W]."""
     if x.ndim == 2:
         x = x[..., None]
     if x.ndim == 3:
@@ -90,6 +90,7 @@ def _from_array(x: npt.NDArray[Any], where: str) -> Tensor:
         raise ConfigError(f"{where}: an array of shape {list(x.shape)}; pictures are [H, W, 3] or [B, H, W, 3]{turned}")
     if x.dtype.kind not in "uifb" or x.dtype.itemsize > 8:
         raise ConfigError(f"{where}: an array of {x.dtype}; pictures are uint8, uint16 or floats in [0, 1]")
+    # torch.from_numpy takes native byte order only, and warns of read-only arrays.
     native = np.ascontiguousarray(x.astype(x.dtype.newbyteorder("="), copy=False))
     return torch.from_numpy(native if native.flags.writeable else native.copy()).permute(0, 3, 1, 2)
 
@@ -105,28 +106,28 @@ def _from_tensor(x: Tensor, where: str) -> Tensor:
 
 
 def _read(path: Path) -> tuple[Tensor, tuple[str, ...]]:
-    """A file as [1, C, H, W], and what was done. FormatError."""
+    """Read a file as [1, C, H, W], with notes on conversions; raise FormatError if it is not an image."""
     from PIL import Image, ImageOps
 
-    data = read_bytes(path, limit=MAX_FILE)
+    content = read_bytes(path, limit=MAX_FILE)
     try:
-        # Pillow warns of broken EXIF, which decides nothing but the turn
+        # Pillow warns of broken EXIF, which matters for the orientation only
         with (
             warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(data), formats=FORMATS) as picture,
+            Image.open(io.BytesIO(content), formats=FORMATS) as image_file,
         ):
-            if picture.width * picture.height > MAX_PIXELS:
-                raise FormatError(f"{path}: {picture.width} x {picture.height} pixels are more than {MAX_PIXELS}")
-            picture.load()  # raises where the file is cut short
-            deep = _is_deep(picture, data)
-            upright = ImageOps.exif_transpose(picture)
+            if image_file.width * image_file.height > MAX_PIXELS:
+                raise FormatError(f"{path}: {image_file.width} x {image_file.height} pixels are more than {MAX_PIXELS}")
+            image_file.load()  # raises where the file is cut short
+            has_16_bits = _is_deep(image_file, content)
+            upright = ImageOps.exif_transpose(image_file)
     except FormatError:
         raise
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
-        why = "cut short" if "truncated" in str(error) else f"not a picture of {', '.join(FORMATS)}"
-        raise FormatError(f"{path}: {why}, or broken") from None
-    if deep:
-        return _read_deep(data, path)
+        reason = "cut short" if "truncated" in str(error) else f"not a picture of {', '.join(FORMATS)}"
+        raise FormatError(f"{path}: {reason}, or broken") from None
+    if has_16_bits:
+        return _read_deep(content, path)
     if upright.mode == "P":
         upright = upright.convert("RGBA" if "transparency" in upright.info else "RGB")
     elif upright.mode in ("1", "CMYK", "YCbCr", "LAB", "HSV"):
@@ -139,46 +140,51 @@ def _read(path: Path) -> tuple[Tensor, tuple[str, ...]]:
 def _is_deep(picture: Any, data: bytes) -> bool:
     """Whether a file has 16 bits a channel, which Pillow keeps for greyscale only."""
     if picture.format == "PNG":
+        # Byte 24 of a PNG file is the bit depth in its IHDR chunk.
         return data[24] == 16
+    # TIFF tag 258 is BitsPerSample.
     return picture.format == "TIFF" and bool(picture.tag_v2.get(258, (8,))[0] == 16)
 
 
 def _read_deep(data: bytes, path: Path) -> tuple[Tensor, tuple[str, ...]]:
     import cv2
 
-    raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if raw is None or raw.dtype != np.uint16:
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16:
         raise FormatError(f"{path}: 16 bits a channel in a way that is not known")
-    order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
-    return _channels(raw[..., order[raw.shape[2]]] if raw.ndim == 3 and raw.shape[2] in order else raw)
+    # OpenCV returns BGR or BGRA.
+    channel_order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
+    return _channels(
+        pixels[..., channel_order[pixels.shape[2]]] if pixels.ndim == 3 and pixels.shape[2] in channel_order else pixels
+    )
 
 
 def _channels(pixels: npt.NDArray[Any]) -> tuple[Tensor, tuple[str, ...]]:
-    """[H, W] or [H, W, C] as [1, 1 or 3, H, W]."""
+    """Convert [H, W] or [H, W, C] to [1, 1 or 3, H, W], without alpha."""
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
     notes = ("alpha left out",) if pixels.shape[2] in (2, 4) else ()
-    kept = np.ascontiguousarray(pixels[..., : 1 if pixels.shape[2] < 3 else 3])
-    return torch.from_numpy(kept).permute(2, 0, 1)[None], notes
+    colour = np.ascontiguousarray(pixels[..., : 1 if pixels.shape[2] < 3 else 3])
+    return torch.from_numpy(colour).permute(2, 0, 1)[None], notes
 
 
 def _scaled(x: Tensor, notes: tuple[str, ...], *, where: str) -> Images:
-    """[B, C, H, W] of any type as three channels of floats in [0, 1]."""
+    """Convert [B, C, H, W] of any type to three channels of floats in [0, 1]."""
     if 0 in x.shape:
         raise ConfigError(f"{where}: an empty picture, shape {list(x.shape)}")
-    kind = str(x.dtype).removeprefix("torch.")
+    dtype_name = str(x.dtype).removeprefix("torch.")
     if x.dtype == torch.uint8:
         image = x.float() / 255
     elif x.dtype == torch.uint16:
-        wide = x.to(torch.int32)
-        most = int(wide.max())
-        image = wide.float() / 65535
-        notes = (*notes, "16 bit" if most > 4095 else f"16 bit, none above {most}: dark, or of fewer bits")
+        widened = x.to(torch.int32)
+        max_value = int(widened.max())
+        image = widened.float() / 65535
+        notes = (*notes, "16 bit" if max_value > 4095 else f"16 bit, none above {max_value}: dark, or of fewer bits")
     elif x.is_floating_point():
         image = x if x.dtype in (torch.float32, torch.float64) else x.float()
         _check_range(image.detach(), where)
     else:
         raise ConfigError(
-            f"{where}: {kind} numbers; pictures are uint8, uint16 or floats in [0, 1]{HINTS.get(x.dtype, '')}"
+            f"{where}: {dtype_name} numbers; pictures are uint8, uint16 or floats in [0, 1]{HINTS.get(x.dtype, '')}"
         )
     if image.shape[1] == 4:
         image = image[:, :3]

@@ -1,4 +1,4 @@
-"""mmdetection3d's FCOS3D and PGD-Det from their weights, with what mmdetection3d returns: for conformance.
+"""mmdetection3d's FCOS3D and PGD-Det from official weights, with mmdetection3d's outputs, for conformance tests.
 
     detector = load("fcos3d", state_dict)
     maps, boxes = infer(detector, image, cam2img)
@@ -30,7 +30,7 @@ _NAMES = ("cls_scores", "bbox_preds", "dir_cls_preds", "depth_cls_preds", "attr_
 
 
 def load(name: str, state_dict: Mapping[str, Any] | str | Path) -> Mono3D:
-    """The full-size detector "fcos3d" or "pgd" with official weights, frozen, on the CPU.
+    """Return the full-size detector "fcos3d" or "pgd" with official weights, frozen, on the CPU.
 
     Args:
         name: "fcos3d" or "pgd".
@@ -48,8 +48,8 @@ def load(name: str, state_dict: Mapping[str, Any] | str | Path) -> Mono3D:
     if isinstance(state_dict, str | Path):
         fit_state(detector, load_weights(state_dict), state_dict)
         return detector
-    inner = state_dict.get("state_dict", state_dict)
-    fit_state(detector, {key: torch.as_tensor(value) for key, value in inner.items()}, "state_dict")
+    tensors = state_dict.get("state_dict", state_dict)
+    fit_state(detector, {key: torch.as_tensor(value) for key, value in tensors.items()}, "state_dict")
     return detector
 
 
@@ -76,24 +76,24 @@ def infer(
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ConfigError(f"infer: image must be [H, W, 3] of uint8 (BGR); got {list(image.shape)} of {image.dtype}")
-    lens = torch.as_tensor(cam2img).double().cpu()
-    if lens.shape not in {(3, 3), (4, 4)}:
-        raise ConfigError(f"infer: cam2img must be [4, 4] or [3, 3]; got {list(lens.shape)}")
-    where = next(detector.parameters())
-    rgb = torch.from_numpy(np.ascontiguousarray(image[..., ::-1])).to(where.device)
-    images = rgb.permute(2, 0, 1)[None].to(where.dtype) / 255  # times 255 gives back the same numbers
-    dense = detector.dense(images, lens[None, :3, :3].to(where))
-    found = detector.select(dense, detector.config.threshold)[0]
-    solid = found.solid
+    intrinsic = torch.as_tensor(cam2img).double().cpu()
+    if intrinsic.shape not in {(3, 3), (4, 4)}:
+        raise ConfigError(f"infer: cam2img must be [4, 4] or [3, 3]; got {list(intrinsic.shape)}")
+    parameter = next(detector.parameters())
+    rgb = torch.from_numpy(np.ascontiguousarray(image[..., ::-1])).to(parameter.device)
+    images = rgb.permute(2, 0, 1)[None].to(parameter.dtype) / 255  # times 255 gives back the same numbers
+    dense = detector.dense(images, intrinsic[None, :3, :3].to(parameter))
+    detections = detector.select(dense, detector.config.threshold)[0]
+    solid = detections.solid
     assert solid is not None
     centre = solid.centre
-    if lens.shape == (4, 4):  # a shift in the last column moves all boxes alike
-        centre = centre - torch.linalg.solve(lens[:3, :3], lens[:3, 3]).to(centre)
+    if intrinsic.shape == (4, 4):  # a shift in the last column moves all boxes by the same amount
+        centre = centre - torch.linalg.solve(intrinsic[:3, :3], intrinsic[:3, 3]).to(centre)
     bottom = bottom_centre(centre, solid.size_lhw)
     boxes = {
         "bboxes_3d": torch.cat([bottom, solid.size_lhw, solid.yaw[:, None], solid.velocity], 1),
-        "scores_3d": found.score,
-        "labels_3d": found.label,
+        "scores_3d": detections.score,
+        "labels_3d": detections.label,
         "attr_labels": solid.attribute,
     }
     return {name: dense.maps[name] for name in _NAMES if name in dense.maps}, boxes

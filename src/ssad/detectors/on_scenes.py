@@ -1,4 +1,4 @@
-"""Detectors on data sets: from pictures to boxes in the world and their scores; 2D boxes and their AP."""
+"""Detectors on data sets: from images to boxes in the world and their scores; 2D boxes and their AP."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ERRORS: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class SampleBoxes:
-    """What was found in one sample."""
+    """Detected boxes of one sample."""
 
     token: str
     boxes: DetectedBoxes
@@ -61,28 +61,32 @@ def to_host(found: Sequence[Detections]) -> list[Detections]:
     Raises:
         ConfigError: They are not tensors.
     """
-    flat = zip(*(_host([getattr(one, name) for one in found]) for name in ("score", "label", "box")), strict=True)
-    solids = [one.solid for one in found if one.solid is not None]
-    names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
-    moved = zip(*(_host([getattr(one, name) for one in solids]) for name in names), strict=True)
-    rows = [None if one.solid is None else Solids(*next(moved)) for one in found]
-    return [Detections(score, label, box, solid) for (score, label, box), solid in zip(flat, rows, strict=True)]
+    columns = zip(
+        *(_host([getattr(single, name) for single in found]) for name in ("score", "label", "box")), strict=True
+    )
+    solid_parts = [single.solid for single in found if single.solid is not None]
+    solid_fields = ("centre", "size_lhw", "yaw", "velocity", "attribute")
+    host_solids = zip(*(_host([getattr(single, name) for single in solid_parts]) for name in solid_fields), strict=True)
+    solid_rows = [None if single.solid is None else Solids(*next(host_solids)) for single in found]
+    return [
+        Detections(score, label, box, solid) for (score, label, box), solid in zip(columns, solid_rows, strict=True)
+    ]
 
 
 def _host(parts: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """Tensors on the CPU."""
-    if not all(isinstance(part, torch.Tensor) for part in parts):
+    if not all(isinstance(tensor, torch.Tensor) for tensor in parts):
         raise ConfigError("broken promise: Detections holds tensors")
-    if all(part.device.type == "cpu" for part in parts):
+    if all(tensor.device.type == "cpu" for tensor in parts):
         return list(parts)
     return joined(parts, torch.Tensor.cpu)
 
 
 def joined(parts: Sequence[torch.Tensor], change: Callable[[torch.Tensor], torch.Tensor]) -> list[torch.Tensor]:
     """`change`, which works on each row by itself, of all tensors [N, ...] at once where they are of a kind."""
-    if len({(part.dtype, part.shape[1:], part.device, part.ndim) for part in parts}) > 1 or not parts[0].ndim:
-        return [change(part) for part in parts]
-    return list(torch.split(change(torch.cat(list(parts))), [len(part) for part in parts]))
+    if len({(tensor.dtype, tensor.shape[1:], tensor.device, tensor.ndim) for tensor in parts}) > 1 or not parts[0].ndim:
+        return [change(tensor) for tensor in parts]
+    return list(torch.split(change(torch.cat(list(parts))), [len(tensor) for tensor in parts]))
 
 
 def detect_scene(
@@ -130,8 +134,8 @@ def detect_with(
     for frame in scene.frames:
         if frame.modality == "camera" and frame.key_frame:
             by_sample.setdefault(frame.sample_token, []).append(frame)
-    found: list[list[Any]] = [[] for _ in detectors]
-    step = at_once if device != "cpu" else 1
+    results: list[list[Any]] = [[] for _ in detectors]
+    samples_per_call = at_once if device != "cpu" else 1
     with ThreadPoolExecutor(4) as pool:
 
         def read(frames: Sequence[SensorFrame]) -> Sequence[U8]:
@@ -139,37 +143,49 @@ def detect_with(
                 return look(frames)
             return list(pool.map(lambda frame: read_image(root / frame.filename), frames))
 
-        with ThreadPoolExecutor(1) as maker:
-            blocks = [scene.samples[k : k + step] for k in range(0, len(scene.samples), step)]
-            flat = [[f for s in block for f in by_sample.get(s.token, [])] for block in blocks]
-            waiting = [maker.submit(read, frames) for frames in (flat[:2] if ahead else [])]
-            for number, block in enumerate(blocks):
-                pictures = waiting[number].result() if ahead else read(flat[number])
-                waiting += [maker.submit(read, frames) for frames in (flat[number + 2 : number + 3] if ahead else [])]
-                seen = _predict(detectors, flat[number], pictures, device)
-                for kept, detector, boxes in zip(found, detectors, seen, strict=True):
-                    two = detector.task == "2d"
-                    kept.extend(
-                        gather_pictures(block, by_sample, boxes, detector.classes)
-                        if two
-                        else _merged(block, by_sample, boxes)
+        with ThreadPoolExecutor(1) as producer:
+            sample_blocks = [
+                scene.samples[start : start + samples_per_call]
+                for start in range(0, len(scene.samples), samples_per_call)
+            ]
+            block_frames = [
+                [camera_frame for sample in samples for camera_frame in by_sample.get(sample.token, [])]
+                for samples in sample_blocks
+            ]
+            # Two blocks in flight: one is detected while the next is read.
+            pending = [producer.submit(read, frames) for frames in (block_frames[:2] if ahead else [])]
+            for block_index, samples in enumerate(sample_blocks):
+                images = pending[block_index].result() if ahead else read(block_frames[block_index])
+                pending += [
+                    producer.submit(read, frames)
+                    for frames in (block_frames[block_index + 2 : block_index + 3] if ahead else [])
+                ]
+                detections = _predict(detectors, block_frames[block_index], images, device)
+                for detector_results, detector, image_boxes in zip(results, detectors, detections, strict=True):
+                    is_2d = detector.task == "2d"
+                    detector_results.extend(
+                        gather_pictures(samples, by_sample, image_boxes, detector.classes)
+                        if is_2d
+                        else _merged(samples, by_sample, image_boxes)
                     )
-    return found
+    return results
 
 
 def _predict(
     detectors: Sequence[Detector], frames: Sequence[SensorFrame], pictures: Sequence[U8], device: str
 ) -> list[list[Detections]]:
     """Detections of each picture, in order, by detector; pictures of one size in one call."""
-    found: list[dict[int, Detections]] = [{} for _ in detectors]
-    for size in sorted({p.shape[:2] for p in pictures}):
-        rows = [k for k, p in enumerate(pictures) if p.shape[:2] == size]
-        lens = torch.from_numpy(np.stack([np.asarray(frames[k].intrinsic, np.float32) for k in rows])).to(device)
-        images = to_images([pictures[k] for k in rows], device)
-        for own, detector in zip(found, detectors, strict=True):
-            for k, one in zip(rows, to_host(_fitting(detector, images, lens)), strict=True):
-                own[k] = one
-    return [[own[k] for k in range(len(frames))] for own in found]
+    by_detector: list[dict[int, Detections]] = [{} for _ in detectors]
+    for image_size in sorted({image.shape[:2] for image in pictures}):
+        rows = [row for row, image in enumerate(pictures) if image.shape[:2] == image_size]
+        intrinsics = torch.from_numpy(np.stack([np.asarray(frames[row].intrinsic, np.float32) for row in rows])).to(
+            device
+        )
+        tensor = to_images([pictures[row] for row in rows], device)
+        for detector_results, detector in zip(by_detector, detectors, strict=True):
+            for row, detections in zip(rows, to_host(_fitting(detector, tensor, intrinsics)), strict=True):
+                detector_results[row] = detections
+    return [[detector_results[row] for row in range(len(frames))] for detector_results in by_detector]
 
 
 def _fitting(detector: Detector, images: torch.Tensor, lens: torch.Tensor) -> list[Detections]:
@@ -179,6 +195,7 @@ def _fitting(detector: Detector, images: torch.Tensor, lens: torch.Tensor) -> li
     except torch.OutOfMemoryError:
         if len(images) == 1:
             raise
+    # After the except block: the traceback would keep the tensors of the failed call alive.
     torch.cuda.empty_cache()
     half = len(images) // 2
     return [*_fitting(detector, images[:half], lens[:half]), *_fitting(detector, images[half:], lens[half:])]
@@ -187,38 +204,50 @@ def _fitting(detector: Detector, images: torch.Tensor, lens: torch.Tensor) -> li
 def _merged(
     samples: Sequence[Any], by_sample: Mapping[str, Sequence[SensorFrame]], boxes: Sequence[Detections]
 ) -> list[SampleBoxes]:
-    found, start = [], 0
+    sample_boxes, start = [], 0
     for sample in samples:
         frames = by_sample.get(sample.token, [])
-        own = boxes[start : start + len(frames)]
+        sample_detections = boxes[start : start + len(frames)]
         start += len(frames)
-        merged = merge_cameras(own, [f.sensor_to_ego for f in frames], [f.ego_to_world for f in frames])
-        found.append(SampleBoxes(sample.token, merged))
-    return found
+        merged = merge_cameras(
+            sample_detections, [frame.sensor_to_ego for frame in frames], [frame.ego_to_world for frame in frames]
+        )
+        sample_boxes.append(SampleBoxes(sample.token, merged))
+    return sample_boxes
 
 
 def detect(
     detector: Detector, root: Path, version: str, scenes: Sequence[str], *, device: str = "cpu"
 ) -> list[SampleBoxes]:
-    """Boxes for each sample of the scenes."""
-    with NuScenes(root, version) as data:
-        return [one for name in scenes for one in detect_scene(detector, root, data.scene(name), device=device)]
+    """Return boxes for each sample of the scenes."""
+    with NuScenes(root, version) as dataset:
+        return [
+            sample_boxes
+            for name in scenes
+            for sample_boxes in detect_scene(detector, root, dataset.scene(name), device=device)
+        ]
 
 
 def box_table(found: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable:
     """Found boxes as rows in the order of the truth's samples."""
-    place = {token: k for k, token in enumerate(truth.samples)}
-    chosen = sorted((one for one in found if one.token in place), key=lambda one: place[one.token])
-    parts = [one.boxes for one in chosen]
-    if not parts:
+    sample_index = {token: index for index, token in enumerate(truth.samples)}
+    known_samples = sorted(
+        (sample_boxes for sample_boxes in found if sample_boxes.token in sample_index),
+        key=lambda sample_boxes: sample_index[sample_boxes.token],
+    )
+    boxes_by_sample = [sample_boxes.boxes for sample_boxes in known_samples]
+    if not boxes_by_sample:
         return BoxTable.empty()
 
     def column(name: str) -> F64:
-        return np.concatenate([np.asarray(getattr(p, name), np.float64) for p in parts])
+        return np.concatenate([np.asarray(getattr(table_boxes, name), np.float64) for table_boxes in boxes_by_sample])
 
-    attributes = [_ATTRIBUTE[name] for p in parts for name in p.attribute]
+    attributes = [_ATTRIBUTE[name] for boxes in boxes_by_sample for name in boxes.attribute]
     table = BoxTable(
-        sample=np.repeat([place[one.token] for one in chosen], [len(p) for p in parts]).astype(np.int32),
+        sample=np.repeat(
+            [sample_index[sample_boxes.token] for sample_boxes in known_samples],
+            [len(boxes) for boxes in boxes_by_sample],
+        ).astype(np.int32),
         label=LABEL[column("label").astype(int)].astype(np.int8),
         centre=column("centre"),
         size_lwh=column("size_lwh"),
@@ -255,19 +284,19 @@ def numbers(scores: DetectionScores, *, few: bool = False) -> dict[str, float]:
         scores: The scores.
         few: Whether only mAP, NDS and the AP of cars are wanted.
     """
-    found = {"mAP": scores.mean_ap, "NDS": scores.nd_score, "AP_car": scores.mean_dist_aps["car"]}
+    figures = {"mAP": scores.mean_ap, "NDS": scores.nd_score, "AP_car": scores.mean_dist_aps["car"]}
     if not few:
-        found |= {f"AP_{name}": value for name, value in scores.mean_dist_aps.items()}
-        found |= {short: scores.tp_errors[name] for short, name in ERRORS.items()}
-    return {name: round(float(value), 6) for name, value in found.items() if np.isfinite(value)}
+        figures |= {f"AP_{name}": value for name, value in scores.mean_dist_aps.items()}
+        figures |= {short_name: scores.tp_errors[name] for short_name, name in ERRORS.items()}
+    return {name: round(float(value), 6) for name, value in figures.items() if np.isfinite(value)}
 
 
 class Annotated(Protocol):
-    """Pictures, uint8 [N, H, W, 3], by slices, and the truth of each."""
+    """Images, uint8 [N, H, W, 3], by slices, and the truth of each."""
 
     @property
     def pictures(self) -> Any:
-        """Pictures, uint8 [N, H, W, 3], by slices."""
+        """Images, uint8 [N, H, W, 3], by slices."""
 
     @property
     def truth(self) -> Sequence[Truth]:
@@ -275,64 +304,66 @@ class Annotated(Protocol):
 
 
 def detect_2d(detector: Detector, batches: Iterable[torch.Tensor], *, device: str = "cpu") -> Boxes2D:
-    """All detections of a detector in pictures, one row a detection.
+    """Return all detections of a detector in images, one row per detection.
 
     Args:
-        detector: What looks at them.
-        batches: Pictures, uint8 [N, H, W, 3], some at a time.
-        device: Where the detector is.
+        detector: The detector.
+        batches: Images, uint8 [N, H, W, 3], in batches.
+        device: Device of the detector.
 
     Returns:
-        The rows, in the order of the pictures; labels are the detector's own.
+        The rows, in the order of the images; labels are the detector's own.
     """
-    found: list[Detections] = []
-    for pictures in batches:
-        images = pictures.to(device).permute(0, 3, 1, 2).float() / 255
-        found += detector.predict(images, threshold=FLOOR)
+    detections: list[Detections] = []
+    for batch in batches:
+        tensor = batch.to(device).permute(0, 3, 1, 2).float() / 255
+        detections += detector.predict(tensor, threshold=FLOOR)
     return Boxes2D(
-        np.repeat(np.arange(len(found)), [len(one.score) for one in found]).astype(np.int32),
-        _rows([one.label for one in found]).astype(np.int32),
-        _rows([one.box for one in found], 4),
-        _rows([one.score for one in found]),
+        np.repeat(np.arange(len(detections)), [len(single.score) for single in detections]).astype(np.int32),
+        _rows([single.label for single in detections]).astype(np.int32),
+        _rows([single.box for single in detections], 4),
+        _rows([single.score for single in detections]),
     )
 
 
 def _rows(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
-    """Tensors [N] or [N, width] one after the other, on the CPU."""
+    """Concatenate tensors [N] or [N, width] on the CPU."""
     empty = np.zeros((0,) if width is None else (0, width))
-    return np.concatenate([empty, *(v.detach().cpu().double().numpy() for v in values)])
+    return np.concatenate([empty, *(tensor.detach().cpu().double().numpy() for tensor in values)])
 
 
 def score_2d(
     detector: Detector, data: Annotated, *, classes: Sequence[str] | None = None, device: str = "cpu", batch: int = 32
 ) -> dict[str, float]:
-    """AP50 of each class of the detector that there is in annotated pictures, and their mean.
+    """Return AP50 of each class of the detector that occurs in annotated images, and their mean.
 
     Args:
-        detector: What is scored. Objects of classes that it does not know are left out.
-        data: Pictures and their truth.
+        detector: Detector to score. Objects of classes that it does not know are left out.
+        data: Images and their truth.
         classes: Names of the labels of the truth; those of the detector if None.
-        device: Where the detector is.
-        batch: Pictures at once.
+        device: Device of the detector.
+        batch: Images at once.
 
     Returns:
         AP50 (the mean) and AP50_NAME.
     """
     names = detector.classes
-    index = {name: k for k, name in enumerate(names)}
-    own = np.array([index.get(name, -1) for name in (names if classes is None else classes)], np.int32)
+    label_of = {name: label_index for label_index, name in enumerate(names)}
+    detector_labels = np.array([label_of.get(name, -1) for name in (names if classes is None else classes)], np.int32)
     batches = (data.pictures[start : start + batch] for start in range(0, len(data.truth), batch))
-    predicted = detect_2d(detector, batches, device=device)
-    crowd = [torch.zeros(len(t.label), dtype=torch.bool) if t.crowd is None else t.crowd for t in data.truth]
-    image = np.repeat(np.arange(len(data.truth)), [len(t.label) for t in data.truth]).astype(np.int32)
-    label = own[_rows([t.label for t in data.truth]).astype(np.int32)]
-    known = label >= 0
-    real = Boxes2D(
-        image[known],
-        label[known],
-        _rows([t.box for t in data.truth], 4)[known],
-        ignore=_rows(crowd).astype(bool)[known],
+    detections = detect_2d(detector, batches, device=device)
+    crowd_flags = [
+        torch.zeros(len(truth.label), dtype=torch.bool) if truth.crowd is None else truth.crowd for truth in data.truth
+    ]
+    image = np.repeat(np.arange(len(data.truth)), [len(truth.label) for truth in data.truth]).astype(np.int32)
+    label = detector_labels[_rows([truth.label for truth in data.truth]).astype(np.int32)]
+    is_known = label >= 0
+    truth_boxes = Boxes2D(
+        image[is_known],
+        label[is_known],
+        _rows([truth.box for truth in data.truth], 4)[is_known],
+        ignore=_rows(crowd_flags).astype(bool)[is_known],
     )
-    ap = average_precision(real, predicted, labels=len(names))
-    each = {f"AP50_{name}": float(value) for name, value in zip(names, ap, strict=True) if np.isfinite(value)}
-    return {"AP50": float(np.mean(list(each.values()))) if each else 0.0} | each
+    ap = average_precision(truth_boxes, detections, labels=len(names))
+    class_ap = {f"AP50_{name}": float(value) for name, value in zip(names, ap, strict=True) if np.isfinite(value)}
+    return {"AP50": float(np.mean(list(class_ap.values()))) if class_ap else 0.0} | class_ap

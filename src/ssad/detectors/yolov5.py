@@ -56,12 +56,12 @@ _BLOCK_PARTS = {"cv1": "reduce", "cv2": "expand"}
 
 
 def yolov5n(classes: Sequence[str] = COCO, *, input_width: int | None = None, seed: int = 0) -> Yolo:
-    """YOLOv5n with fresh weights."""
+    """Build YOLOv5n with fresh weights."""
     return Yolo(YOLOV5N, classes, input_width=input_width, seed=seed)
 
 
 def yolov5s(classes: Sequence[str] = COCO, *, input_width: int | None = None, seed: int = 0) -> Yolo:
-    """YOLOv5s with fresh weights."""
+    """Build YOLOv5s with fresh weights."""
     return Yolo(YOLOV5S, classes, input_width=input_width, seed=seed)
 
 
@@ -81,24 +81,25 @@ def from_yolov5_keys(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Raises:
         FormatError: A name does not belong to YOLOv5 6.0 n or s.
     """
-    result: dict[str, Tensor] = {}
+    converted: dict[str, Tensor] = {}
     for key, value in state.items():
         match = re.fullmatch(r"(?:model\.){1,2}(\d+)\.(.+)", key)
         name = _rename(int(match[1]), match[2]) if match else None
         if name is None:
             raise FormatError(f"weights: '{key}' is no name of YOLOv5 6.0 n or s; convert a model of that version")
-        full = value.float() if value.is_floating_point() else value
+        tensor = value.float() if value.is_floating_point() else value
         if name == "anchors":
-            if full.shape != (3, 3, 2):
-                raise FormatError(f"weights: '{key}' has the shape {list(full.shape)}; it takes [3, 3, 2]")
-            full = full * torch.tensor(YOLOV5N.strides, dtype=full.dtype, device=full.device)[:, None, None]
+            if tensor.shape != (3, 3, 2):
+                raise FormatError(f"weights: '{key}' has the shape {list(tensor.shape)}; it takes [3, 3, 2]")
+            # The source stores anchors in strides of their level.
+            tensor = tensor * torch.tensor(YOLOV5N.strides, dtype=tensor.dtype, device=tensor.device)[:, None, None]
         if name:
-            result[name] = full
-    return result
+            converted[name] = tensor
+    return converted
 
 
 def _rename(layer: int, rest: str) -> str | None:
-    """The own name of a tensor, "" for one that is not needed, None for one that is not known."""
+    """Return the name of a tensor in `Yolo`; "" if it is not needed, None if it is unknown."""
     if layer == HEADS:
         if rest == "anchors":
             return "anchors"
@@ -108,16 +109,23 @@ def _rename(layer: int, rest: str) -> str | None:
         return f"network.heads.{head[1]}.{head[2]}" if head else None
     if layer not in LAYERS:
         return None
-    own = LAYERS[layer]
+    layer_name = LAYERS[layer]
     match = re.fullmatch(r"(?:m\.(\d+)\.)?(?:(cv[123])\.)?(conv\.weight|bn\.\w+)", rest)
     if match is None:
         return None
     block, part, tensor = match[1], match[2], match[3].replace("bn.", "norm.")
-    kinds = {} if own.startswith(("stem", "down", "up", "lateral")) else _POOL_PARTS if own == "pool" else _PARTS
+    # Plain convolutions have no parts; pooling and C3 blocks number theirs differently.
+    part_names = (
+        {}
+        if layer_name.startswith(("stem", "down", "up", "lateral"))
+        else _POOL_PARTS
+        if layer_name == "pool"
+        else _PARTS
+    )
     if block is not None:
-        if kinds is not _PARTS or part not in _BLOCK_PARTS:
+        if part_names is not _PARTS or part not in _BLOCK_PARTS:
             return None
-        return f"network.{own}.blocks.{block}.{_BLOCK_PARTS[part]}.{tensor}"
+        return f"network.{layer_name}.blocks.{block}.{_BLOCK_PARTS[part]}.{tensor}"
     if part is None:
-        return None if kinds else f"network.{own}.{tensor}"
-    return f"network.{own}.{kinds[part]}.{tensor}" if part in kinds else None
+        return None if part_names else f"network.{layer_name}.{tensor}"
+    return f"network.{layer_name}.{part_names[part]}.{tensor}" if part in part_names else None

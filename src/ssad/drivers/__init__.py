@@ -1,4 +1,4 @@
-"""Driving systems: what is put to the test."""
+"""Driving systems: the systems under test."""
 
 from __future__ import annotations
 
@@ -45,27 +45,27 @@ LEADERBOARD = "leaderboard"
 
 
 def find_system(name: str) -> Any:
-    """The class or object behind a system's name, entry point or "module:object"; arguments and label are left out.
+    """Return the class or object of a system name, entry point or "module:object", without arguments and label.
 
     Raises UnknownNameError; ConfigError if it does not import; FormatError for weights that cannot be used.
     """
-    text, name = name, Reference.of(name).name
-    kind, _, weights = name.partition(":")
-    if kind in LEARNED and weights:
-        return resolve("system", SYSTEMS, kind)(weights)
-    if kind == LEADERBOARD and weights:
+    full_name, name = name, Reference.of(name).name
+    base_name, _, weights = name.partition(":")
+    if base_name in LEARNED and weights:
+        return resolve("system", SYSTEMS, base_name)(weights)
+    if base_name == LEADERBOARD and weights:
         from ssad.drivers.leaderboard import Leaderboard
 
         return Leaderboard(weights)
-    found = resolve("system", SYSTEMS, name)
-    check_arguments("system", text, found, made=True)
-    return found
+    resolved = resolve("system", SYSTEMS, name)
+    check_arguments("system", full_name, resolved, made=True)
+    return resolved
 
 
 def weights_version(name: str) -> str:
-    """The hash of a learned system's weights, of a leaderboard agent's file, or of the files that arguments name.
+    """Return the hash of a learned system's weights, of a leaderboard agent's file, or of files in arguments.
 
-    "" for a system without any. Raises FormatError for weights that cannot be used.
+    "" for a system without files. Raises FormatError for weights that cannot be used.
     """
     reference = Reference.of(name)
     files = [Path(value) for value in reference.options.values() if isinstance(value, str) and Path(value).is_file()]
@@ -76,13 +76,13 @@ def weights_version(name: str) -> str:
 
 
 def make_system(name: str) -> Driver:
-    """A driving system by name, entry point or "module:object"; a class is called, with the arguments after a ?.
+    """Make a driving system by name, entry point or "module:object"; a class gets the arguments after "?".
 
     "mine:Mine?checkpoint=a.pt@first" is `Mine(checkpoint="a.pt")` of mine.py, and tables call it "first".
     Raises UnknownNameError, or ConfigError if the object is not a Driver.
     """
-    found, options = find_system(name), Reference.of(name).options
-    system = found(**options) if isinstance(found, type) or options else found
+    resolved, options = find_system(name), Reference.of(name).options
+    system = resolved(**options) if isinstance(resolved, type) or options else resolved
     controller = getattr(system, "controller", Controller.EXTERNAL)
     if not callable(getattr(system, "act", None)) or not callable(getattr(system, "reset", None)):
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(view); see README")
@@ -92,7 +92,7 @@ def make_system(name: str) -> Driver:
 
 
 class _Named:
-    """A driver under the name it was asked for; fills in what a short user class leaves out."""
+    """Driver under its requested name; fills in the optional attributes that a short user class omits."""
 
     def __init__(self, name: str, controller: Controller, system: Driver) -> None:
         self.name = name

@@ -1,4 +1,4 @@
-"""Autopilots that plan over less than the truth: what is in line of sight, and what a poor perceiver would find."""
+"""Autopilots that plan on less than the truth: objects in line of sight, or those of a poor perceiver."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ssad.drivers.builtin import Autopilot
 
 RANGE = 100.0  # m
 _HIDE = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS)
-_THING = 0.8  # m that a thing must be wide both ways to hide what is behind it
-_SLOTS = 64  # a scene has fewer agents: draws for all, so that none depends on how many there are
+_THING = 0.8  # m, minimum extent of a prop in both directions to occlude
+_SLOTS = 64  # more than the agents of any scene: with fixed draws per step none depends on the number of agents
 
 
 class LineOfSight(Autopilot):
@@ -34,16 +34,16 @@ class LineOfSight(Autopilot):
     sensors = ("truth",)
 
     def believe(self, view: Observation) -> Belief:
-        """The truth, less what is hidden."""
+        """Return the truth without hidden objects."""
         truth: Belief = view.readings["truth"]
         return truth.keep(in_sight(view.pose[:, :2], truth))
 
 
 class DegradedBelief(Autopilot):
-    """The Autopilot with a poor perceiver: misses objects in bursts, places them wrongly, and comes late.
+    """Autopilot with a poor perceiver: it misses objects in bursts, misplaces them, and is late.
 
-    Whether an object is missed is a Markov chain of two states, seen and missed, that each object has to itself. All
-    draws come from the episode's key and seed, so they depend neither on the batch nor on the other objects.
+    Each object has its own two-state Markov chain (detected, missed). All draws come from the episode's key and seed,
+    so they depend neither on the batch nor on the other objects.
     """
 
     name = "degraded"
@@ -58,14 +58,14 @@ class DegradedBelief(Autopilot):
         delay: int = 0,
         believer: Believer | None = None,
     ) -> None:
-        """Choose how poor it is.
+        """Set the degradation.
 
         Args:
             missed: Share of the steps in which an object is missed, 0 to 1.
-            burst: Steps that an object stays missed on average, at least 1; longer where the share asks for it.
-            noise: Standard deviation of an object's place along x and y, m, drawn anew in each step.
-            delay: Steps that what it believes is old.
-            believer: Whose belief is degraded; None: the truth.
+            burst: Mean number of steps that an object stays missed, at least 1; longer where the share requires it.
+            noise: Standard deviation of an object's position along x and y, m, independent in each step.
+            delay: Age of the belief in steps.
+            believer: Source of the belief to degrade; None: the truth.
 
         Raises:
             ConfigError: A value is out of its range.
@@ -76,6 +76,7 @@ class DegradedBelief(Autopilot):
                 f"not {missed}, {burst}, {noise} and {delay}"
             )
         self.missed, self.noise, self.delay, self.believer = missed, noise, delay, believer
+        # Rates of a two-state chain with stationary share `missed` and mean burst length `burst`.
         self.found = 1.0 / max(burst, missed / max(1.0 - missed, 1e-9)) if missed < 1.0 else 0.0
         self.lost = missed * self.found / (1.0 - missed) if missed < 1.0 else 1.0
         self.sensors: tuple[str, ...] = ("truth",) if believer is None else tuple(getattr(believer, "sensors", ()))
@@ -84,7 +85,7 @@ class DegradedBelief(Autopilot):
         self._past: list[Belief] = []
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """Forget the past; draws begin anew for these episodes."""
+        """Forget the past and restart the random draws for these episodes."""
         self._draws = [generator("belief", episode.key, episode.seed) for episode in episodes]
         self._missing = np.array([draws.random(_SLOTS) < self.missed for draws in self._draws]).reshape(-1, _SLOTS)
         self._past = []
@@ -93,19 +94,19 @@ class DegradedBelief(Autopilot):
             reset(episodes)
 
     def believe(self, view: Observation) -> Belief:
-        """What is left of the belief. ConfigError: it has 64 objects or more."""
+        """Return the degraded belief. ConfigError for 64 objects or more."""
         belief: Belief = view.readings["truth"] if self.believer is None else self.believer.believe(view)
         count = belief.kind.shape[1]
         if count >= _SLOTS:
             raise ConfigError(f"a degraded belief has room for {_SLOTS - 1} objects, not {count}")
         scenes = view.scene
-        chance = np.stack([self._draws[k].random(_SLOTS) for k in scenes.tolist()])
+        draws = np.stack([self._draws[scene].random(_SLOTS) for scene in scenes.tolist()])
         missing = self._missing[scenes]
-        missing = np.where(missing, chance >= self.found, chance < self.lost)
+        missing = np.where(missing, draws >= self.found, draws < self.lost)
         self._missing[scenes] = missing
         if self.noise > 0.0:
-            drawn = np.stack([self._draws[k].normal(size=(_SLOTS, 2)) for k in scenes.tolist()])
-            belief = moved(belief, (self.noise * drawn[:, :count]).astype(np.float32))
+            position_noise = np.stack([self._draws[scene].normal(size=(_SLOTS, 2)) for scene in scenes.tolist()])
+            belief = moved(belief, (self.noise * position_noise[:, :count]).astype(np.float32))
         self._past = [*self._past, belief.keep(~missing[:, :count])][-(self.delay + 1) :]
         return self._past[0]
 
@@ -121,42 +122,46 @@ def moved(belief: Belief, by: F32) -> Belief:
 
 
 def in_sight(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
-    """Which objects can be seen.
+    """Return which objects are visible.
 
     Args:
-        eye: [B, 2] where it is looked from, m.
+        eye: [B, 2] viewpoint, m.
         belief: The objects [B, K].
-        reach: How far one sees, m.
+        reach: Visual range, m.
 
     Returns:
-        [B, K]; False for rows that are not used.
+        [B, K]; False for unused rows.
     """
     half = 0.5 * belief.size
-    c, s = np.cos(belief.pose[..., 2]), np.sin(belief.pose[..., 2])
-    forward, aside = np.stack([c, s], -1), np.stack([-s, c], -1)
-    spots = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)], np.float32)
+    cosine, sine = np.cos(belief.pose[..., 2]), np.sin(belief.pose[..., 2])
+    forward, aside = np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)
+    unit_points = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)], np.float32)
     # [B, K, 5, 2]: the centre and the corners
     points = (
         belief.pose[..., None, :2]
-        + (spots[:, 0] * half[..., :1])[..., None] * forward[..., None, :]
-        + (spots[:, 1] * half[..., 1:])[..., None] * aside[..., None, :]
+        + (unit_points[:, 0] * half[..., :1])[..., None] * forward[..., None, :]
+        + (unit_points[:, 1] * half[..., 1:])[..., None] * aside[..., None, :]
     )
-    there = belief.kind != AgentKind.NONE
-    hides = there & (np.isin(belief.kind, _HIDE) | ((belief.kind == AgentKind.PROP) & (belief.size >= _THING).all(-1)))
-    free = np.hypot(*np.moveaxis(points - eye[:, None, None], -1, 0)) <= reach
-    for k in np.flatnonzero(hides.any(0)).tolist():
-        axes = np.stack([forward[:, k], aside[:, k]], 1)  # [B, 2, 2]
-        start = np.einsum("bij,bj->bi", axes, eye - belief.pose[:, k, :2])
-        way = np.einsum("bij,bknj->bkni", axes, points - belief.pose[:, None, None, k, :2]) - start[:, None, None]
+    present = belief.kind != AgentKind.NONE
+    occludes = present & (
+        np.isin(belief.kind, _HIDE) | ((belief.kind == AgentKind.PROP) & (belief.size >= _THING).all(-1))
+    )
+    unobstructed = np.hypot(*np.moveaxis(points - eye[:, None, None], -1, 0)) <= reach
+    for occluder in np.flatnonzero(occludes.any(0)).tolist():
+        axes = np.stack([forward[:, occluder], aside[:, occluder]], 1)  # [B, 2, 2]
+        start = np.einsum("bij,bj->bi", axes, eye - belief.pose[:, occluder, :2])
+        direction = (
+            np.einsum("bij,bknj->bkni", axes, points - belief.pose[:, None, None, occluder, :2]) - start[:, None, None]
+        )
         # the part of the line, from 0 to 1, that lies between each pair of opposite sides
-        step = np.where(np.abs(way) < 1e-9, 1e-9, way)
-        one = (-half[:, None, None, k] - start[:, None, None]) / step
-        other = (half[:, None, None, k] - start[:, None, None]) / step
-        enters = np.minimum(one, other).max(-1)
-        leaves = np.maximum(one, other).min(-1)
-        crosses = (enters < leaves) & (leaves > 0.0) & (enters < 1.0)
-        crosses[:, k] = False
-        within = (np.abs(start) <= half[:, k]).all(-1)  # who touches the eye hides nothing
-        free &= ~(crosses & (hides[:, k] & ~within)[:, None, None])
-    seen: Bool = there & free.any(-1)
-    return seen
+        step = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
+        first_hit = (-half[:, None, None, occluder] - start[:, None, None]) / step
+        second_hit = (half[:, None, None, occluder] - start[:, None, None]) / step
+        entry = np.minimum(first_hit, second_hit).max(-1)
+        departure = np.maximum(first_hit, second_hit).min(-1)
+        blocked = (entry < departure) & (departure > 0.0) & (entry < 1.0)
+        blocked[:, occluder] = False
+        inside = (np.abs(start) <= half[:, occluder]).all(-1)  # an object at the viewpoint itself occludes nothing
+        unobstructed &= ~(blocked & (occludes[:, occluder] & ~inside)[:, None, None])
+    visible: Bool = present & unobstructed.any(-1)
+    return visible

@@ -1,10 +1,10 @@
-"""A driving agent of the CARLA leaderboard as a driving system: `setup`, `sensors`, `run_step`, without CARLA.
+"""CARLA leaderboard agents as driving systems: `setup`, `sensors`, `run_step`, without CARLA.
 
-`--set systems=[leaderboard:FILE.py]` takes the class that FILE's `get_entry_point` names; after a second colon stands
-the path that `setup` gets. Where the packages `leaderboard`, `agents` and `carla` are not installed, the few names that
-agents need of them are put in their places.
+`--set systems=[leaderboard:FILE.py]` takes the class that FILE's `get_entry_point` names; a second colon
+introduces the path passed to `setup`. Where the packages `leaderboard`, `agents` and `carla` are not installed,
+minimal stand-ins provide the names that agents need.
 
-Each episode has an agent of its own. What agents are told, by id of the sensor: (number of the step, data). Frames are
+Each episode has its own agent. Agents receive (number of the step, data) by id of the sensor. Frames are
 CARLA's, left-handed: y to the right, yaw clockwise. Source of the interface: the leaderboard's
 autoagents/autonomous_agent.py and its pages on sensors.
 """
@@ -48,12 +48,12 @@ from ssad.world.roads import load_town, town_xodr
 
 GRAVITY: Final = 9.81  # m/s^2
 STEP: Final = 0.1  # s
-TURN: Final = math.radians(30.0)  # a way through a junction that turns less goes straight on
-APART: Final = 50.0  # m between points of the plan that the base class keeps
+TURN: Final = math.radians(30.0)  # a path through a junction that turns less counts as straight
+APART: Final = 50.0  # m between the plan points that the base class keeps
 
 
 class RoadOption(enum.IntEnum):
-    """What the plan says at a point, as in CARLA's agents.navigation.local_planner."""
+    """Command of the plan at a point, as in CARLA's agents.navigation.local_planner."""
 
     VOID = -1
     LEFT = 1
@@ -65,7 +65,7 @@ class RoadOption(enum.IntEnum):
 
 
 class Track(enum.Enum):
-    """What an agent may use, as in the leaderboard."""
+    """Permitted inputs of an agent, as in the leaderboard."""
 
     SENSORS = "SENSORS"
     MAP = "MAP"
@@ -74,7 +74,7 @@ class Track(enum.Enum):
 
 
 class AutonomousAgent:
-    """The base class of agents where the package `leaderboard` is not installed."""
+    """Base class of agents where the package `leaderboard` is not installed."""
 
     def __init__(self, carla_host: str = "", carla_port: int = 0, debug: bool = False) -> None:
         self.track = Track.SENSORS
@@ -84,34 +84,38 @@ class AutonomousAgent:
         self.wallclock_t0 = None
 
     def set_global_plan(self, global_plan_gps: Sequence[Any], global_plan_world_coord: Sequence[Any]) -> None:
-        """Keep a point of the plan every 50 m, and where what it says changes."""
-        kept, last = [0], 0
-        for k in range(1, len(global_plan_gps)):
-            if k == len(global_plan_gps) - 1 or k - last >= APART or global_plan_gps[k][1] != global_plan_gps[k - 1][1]:
-                kept.append(k)
-                last = k
-        self._global_plan = [global_plan_gps[k] for k in kept]
-        self._global_plan_world_coord = [global_plan_world_coord[k] for k in kept]
+        """Keep a point of the plan every 50 m, and where the command changes."""
+        indices, last_index = [0], 0
+        for index in range(1, len(global_plan_gps)):
+            if (
+                index == len(global_plan_gps) - 1
+                or index - last_index >= APART
+                or global_plan_gps[index][1] != global_plan_gps[index - 1][1]
+            ):
+                indices.append(index)
+                last_index = index
+        self._global_plan = [global_plan_gps[index] for index in indices]
+        self._global_plan_world_coord = [global_plan_world_coord[index] for index in indices]
 
     def setup(self, path_to_conf_file: str) -> None:
-        """Prepare; for agents to fill."""
+        """Prepare the agent; to be overridden."""
 
     def sensors(self) -> list[dict[str, Any]]:
-        """The sensors that it needs; for agents to fill."""
+        """Return the sensors of the agent; to be overridden."""
         return []
 
     def destroy(self) -> None:
-        """Clean up; for agents to fill."""
+        """Clean up; to be overridden."""
 
 
 class Leaderboard:
-    """A `Driver` over an agent of the leaderboard.
+    """`Driver` adapter of a leaderboard agent.
 
     Args:
-        path: File of the agent, and after a colon what its `setup` gets.
+        path: File of the agent, optionally followed by a colon and the argument of `setup`.
 
     Raises:
-        ConfigError: The file has no agent, it does not import, or it asks for a sensor that is not there.
+        ConfigError: The file has no agent, fails to import, or requests an unknown sensor.
     """
 
     name = "leaderboard"
@@ -127,9 +131,21 @@ class Leaderboard:
         self.version = hashlib.sha256(source + self._config.encode()).hexdigest()
         self._class = self._load(path)
         self._asked = self._sensors()
-        self.cameras: Mapping[str, Camera] = {i["id"]: camera_of(i) for i in self._asked if i["type"] == CAMERA}
-        self.lidars: Mapping[str, Lidar] = {i["id"]: lidar_of(i) for i in self._asked if i["type"] == LIDAR}
-        self.radars: Mapping[str, Lidar] = {i["id"]: radar_of(i) for i in self._asked if i["type"] == RADAR}
+        self.cameras: Mapping[str, Camera] = {
+            specification["id"]: camera_of(specification)
+            for specification in self._asked
+            if specification["type"] == CAMERA
+        }
+        self.lidars: Mapping[str, Lidar] = {
+            specification["id"]: lidar_of(specification)
+            for specification in self._asked
+            if specification["type"] == LIDAR
+        }
+        self.radars: Mapping[str, Lidar] = {
+            specification["id"]: radar_of(specification)
+            for specification in self._asked
+            if specification["type"] == RADAR
+        }
         self.sensors = (*self.cameras, *self.lidars, *self.radars)
         self._agents: list[Any] = []
         self._last: dict[int, tuple[float, float]] = {}
@@ -142,22 +158,23 @@ class Leaderboard:
             raise ConfigError(f"system 'leaderboard:{path}': expected the path of a Python file")
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module
-        before = list(sys.path)
+        previous_path = list(sys.path)
+        # Agents import their own modules relative to their folder.
         sys.path.insert(0, str(self.path.resolve().parent))
         try:
             spec.loader.exec_module(module)
         except Exception as error:
             raise ConfigError(f"system 'leaderboard:{path}': importing it failed: {describe(error)}") from error
         finally:
-            sys.path[:] = before
-        named = getattr(module, "get_entry_point", lambda: "")()
-        found = getattr(module, str(named), None)
-        if not isinstance(found, type) or not callable(getattr(found, "run_step", None)):
+            sys.path[:] = previous_path
+        class_name = getattr(module, "get_entry_point", lambda: "")()
+        agent_class = getattr(module, str(class_name), None)
+        if not isinstance(agent_class, type) or not callable(getattr(agent_class, "run_step", None)):
             raise ConfigError(f"system 'leaderboard:{path}': its get_entry_point() names no class with run_step")
-        return found
+        return agent_class
 
     def _agent(self) -> Any:
-        """A new agent, set up. Leaderboard 2.0 makes one of a host and a port, 1.0 of its configuration."""
+        """Make and set up an agent. Leaderboard 2.0 constructs from host and port, 1.0 from the configuration."""
         try:
             try:
                 agent = self._class("localhost", 2000)
@@ -169,100 +186,101 @@ class Leaderboard:
         return agent
 
     def _sensors(self) -> list[dict[str, Any]]:
-        """What an agent asks for."""
-        agent, where = self._agent(), f"system 'leaderboard:{self.path}'"
+        """Return the validated sensor specifications of an agent."""
+        agent, location = self._agent(), f"system 'leaderboard:{self.path}'"
         try:
-            told = agent.sensors()
+            specifications = agent.sensors()
         except Exception as error:
-            raise ConfigError(f"{where}: sensors() failed: {describe(error)}") from error
-        return checked(told, where)
+            raise ConfigError(f"{location}: sensors() failed: {describe(error)}") from error
+        return checked(specifications, location)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """A new agent for each episode, with the plan of its route."""
+        """Make a new agent for each episode, with the plan of its route."""
         for agent in self._agents:
             getattr(agent, "destroy", lambda: None)()
         self._agents, self._last = [], {}
-        wants_map = any(item["type"] == MAP for item in self._asked)
+        wants_map = any(specification["type"] == MAP for specification in self._asked)
         self._maps = [town_xodr(episode.town) if wants_map else "" for episode in episodes]
         for episode in episodes:
             agent = self._agent()
-            agent.sensors()  # some prepare themselves there
+            agent.sensors()  # some agents initialise themselves in sensors()
             route = episode.agents[0].route
             assert route is not None
-            gps, world = _plan(route, load_town(episode.town))
-            agent.set_global_plan(gps, world)
+            gps_plan, world_plan = _plan(route, load_town(episode.town))
+            agent.set_global_plan(gps_plan, world_plan)
             self._agents.append(agent)
 
     def act(self, view: Observation) -> F32:
-        """The controls of each row's agent."""
-        out = np.zeros((len(view.scene), 4), np.float32)
+        """Return the controls of each row's agent."""
+        controls = np.zeros((len(view.scene), 4), np.float32)
         for row, scene in enumerate(view.scene.tolist()):
             if view.done[row]:
                 continue
-            told = self._agents[scene].run_step(self._input(view, row), float(view.time[row]))
-            out[row] = told.throttle, told.brake, -told.steer, bool(getattr(told, "reverse", False))
-            if getattr(told, "hand_brake", False):
-                out[row, :2] = 0.0, 1.0
-        return out
+            control = self._agents[scene].run_step(self._input(view, row), float(view.time[row]))
+            controls[row] = control.throttle, control.brake, -control.steer, bool(getattr(control, "reverse", False))
+            if getattr(control, "hand_brake", False):
+                controls[row, :2] = 0.0, 1.0
+        return controls
 
     def _input(self, view: Observation, row: int) -> dict[str, tuple[int, Any]]:
         time, yaw = float(view.time[row]), float(view.pose[row, 2])
         step = round(time / STEP)
-        data: dict[str, tuple[int, Any]] = {}
-        for item in self._asked:
-            kind = item["type"]
+        readings: dict[str, tuple[int, Any]] = {}
+        for specification in self._asked:
+            sensor_type = specification["type"]
             value: Any
-            if kind == CAMERA:
-                picture = view.readings[item["id"]][row]
-                alpha = np.full((1, *picture.shape[1:]), 255, np.uint8)
-                value = np.concatenate([picture[::-1], alpha]).transpose(1, 2, 0).copy()
-            elif kind == LIDAR:
-                value = cloud(view.readings[item["id"]][row])
-            elif kind == RADAR:
-                seen = view.readings[item["id"]][row]
-                value = seen[seen[:, 0] > 0.0]
-            elif kind == "sensor.other.gnss":
+            if sensor_type == CAMERA:
+                image = view.readings[specification["id"]][row]
+                alpha = np.full((1, *image.shape[1:]), 255, np.uint8)
+                # CARLA delivers BGRA.
+                value = np.concatenate([image[::-1], alpha]).transpose(1, 2, 0).copy()
+            elif sensor_type == LIDAR:
+                value = cloud(view.readings[specification["id"]][row])
+            elif sensor_type == RADAR:
+                returns = view.readings[specification["id"]][row]
+                value = returns[returns[:, 0] > 0.0]
+            elif sensor_type == "sensor.other.gnss":
                 value = np.array(geolocation(float(view.pose[row, 0]), float(view.pose[row, 1])))
-            elif kind == "sensor.other.imu":
+            elif sensor_type == "sensor.other.imu":
                 value = self._imu(view, row, yaw)
-            elif kind == "sensor.speedometer":
+            elif sensor_type == "sensor.speedometer":
                 value = {"speed": float(view.speed[row])}
             else:
                 value = {"opendrive": self._maps[int(view.scene[row])]}
-            data[str(item["id"])] = (step, value)
+            readings[str(specification["id"])] = (step, value)
         self._last[int(view.scene[row])] = (time, yaw)
-        return data
+        return readings
 
     def _imu(self, view: Observation, row: int, yaw: float) -> F64:
-        """Accelerations and rates [6], and the compass: clockwise from north, rad."""
-        time, before = self._last.get(int(view.scene[row]), (float(view.time[row]), yaw))
-        passed = float(view.time[row]) - time
-        rate = float(wrap_angle(yaw - before)) / passed if passed > 0.0 else 0.0
+        """Return accelerations and rates [6], and the compass: clockwise from north, rad."""
+        last_time, last_yaw = self._last.get(int(view.scene[row]), (float(view.time[row]), yaw))
+        elapsed = float(view.time[row]) - last_time
+        yaw_rate = float(wrap_angle(yaw - last_yaw)) / elapsed if elapsed > 0.0 else 0.0
         compass = (0.5 * math.pi - yaw) % math.tau
-        across = -float(view.speed[row]) * rate
-        return np.array([float(view.accel[row]), across, GRAVITY, 0.0, 0.0, -rate, compass])
+        lateral = -float(view.speed[row]) * yaw_rate
+        return np.array([float(view.accel[row]), lateral, GRAVITY, 0.0, 0.0, -yaw_rate, compass])
 
 
 def _plan(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:
-    """The plan of a route, a point a metre: geographic places, and CARLA's transforms, each with its `RoadOption`."""
+    """Return the plan of a route, a point per metre: geographic and as CARLA's transforms, with `RoadOption`."""
     import carla
 
-    inside = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
+    in_junction = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
     options = np.full(len(route.xy), int(RoadOption.LANEFOLLOW))
-    begins = np.flatnonzero(inside & ~np.concatenate([[False], inside[:-1]]))
-    for first in begins.tolist():
-        rest = np.flatnonzero(~inside[first:])
-        last = first + int(rest[0]) if len(rest) else len(inside) - 1
-        turned = float(wrap_angle(float(route.yaw[last] - route.yaw[first])))
-        told = RoadOption.LEFT if turned > TURN else RoadOption.RIGHT if turned < -TURN else RoadOption.STRAIGHT
-        options[first : last + 1] = int(told)
-    gps, world = [], []
+    entries = np.flatnonzero(in_junction & ~np.concatenate([[False], in_junction[:-1]]))
+    for entry in entries.tolist():
+        exits = np.flatnonzero(~in_junction[entry:])
+        exit_index = entry + int(exits[0]) if len(exits) else len(in_junction) - 1
+        turn = float(wrap_angle(float(route.yaw[exit_index] - route.yaw[entry])))
+        command = RoadOption.LEFT if turn > TURN else RoadOption.RIGHT if turn < -TURN else RoadOption.STRAIGHT
+        options[entry : exit_index + 1] = int(command)
+    gps_plan, world_plan = [], []
     for (x, y), yaw, option in zip(route.xy.tolist(), route.yaw.tolist(), options.tolist(), strict=True):
         latitude, longitude, z = geolocation(x, y)
-        gps.append(({"lat": latitude, "lon": longitude, "z": z}, _option(option)))
-        place = carla.Transform(carla.Location(x=x, y=-y, z=z), carla.Rotation(yaw=-math.degrees(yaw)))
-        world.append((place, _option(option)))
-    return gps, world
+        gps_plan.append(({"lat": latitude, "lon": longitude, "z": z}, _option(option)))
+        transform = carla.Transform(carla.Location(x=x, y=-y, z=z), carla.Rotation(yaw=-math.degrees(yaw)))
+        world_plan.append((transform, _option(option)))
+    return gps_plan, world_plan
 
 
 def _option(value: int) -> Any:
@@ -289,7 +307,7 @@ def _stand_in() -> None:
 
 
 class VehicleControl:
-    """What an agent answers where `carla` is not installed."""
+    """Control command of an agent where `carla` is not installed."""
 
     def __init__(  # noqa: PLR0917
         self,
@@ -307,21 +325,21 @@ class VehicleControl:
 
 
 class Location:
-    """A place in CARLA's frame where `carla` is not installed."""
+    """Position in CARLA's frame where `carla` is not installed."""
 
     def __init__(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
         self.x, self.y, self.z = x, y, z
 
 
 class Rotation:
-    """A rotation in CARLA's frame, degrees, where `carla` is not installed."""
+    """Rotation in CARLA's frame, degrees, where `carla` is not installed."""
 
     def __init__(self, pitch: float = 0.0, yaw: float = 0.0, roll: float = 0.0) -> None:
         self.pitch, self.yaw, self.roll = pitch, yaw, roll
 
 
 class Transform:
-    """A place and a rotation where `carla` is not installed."""
+    """Position and rotation where `carla` is not installed."""
 
     def __init__(self, location: Location | None = None, rotation: Rotation | None = None) -> None:
         self.location, self.rotation = location or Location(), rotation or Rotation()

@@ -1,8 +1,8 @@
-"""The sensors that an agent of the leaderboards asks for: their places and fields, and readings in CARLA's frames.
+"""Sensors of CARLA leaderboard agents: mounting, fields of view, and readings in CARLA's frames.
 
-CARLA: x forward, y right, z up, yaw clockwise, degrees. Facts: the leaderboard's agent_wrapper.py and
+CARLA: x forward, y right, z up, yaw clockwise, degrees. Source: the leaderboard's agent_wrapper.py and
 sensor_interface.py (LiDAR of 64 channels from -30 to 10 degrees, 85 m, 600,000 points a second, of which 45 % are
-lost; radar of 1,500 points a second, 100 m); of gnss: CARLA's Mercator projection about latitude 0.
+lost; radar of 1,500 points a second, 100 m); for GNSS: CARLA's Mercator projection about latitude 0.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ _RIGHT: Final = np.array(
 
 
 def checked(sensors: Any, where: str) -> list[dict[str, Any]]:
-    """What an agent's `sensors` gives. ConfigError for what no leaderboard allows."""
+    """Validate the result of an agent's `sensors`. ConfigError for sensors that no leaderboard allows."""
     if not isinstance(sensors, Sequence):
         raise ConfigError(f"{where}: its sensors() must give a list, not {type(sensors).__name__}")
-    found: list[dict[str, Any]] = []
-    for item in sensors:
-        kind: Any = item.get("type") if isinstance(item, dict) else item
-        if not isinstance(item, dict) or "id" not in item or kind not in LIMITS:
+    accepted: list[dict[str, Any]] = []
+    for specification in sensors:
+        kind: Any = specification.get("type") if isinstance(specification, dict) else specification
+        if not isinstance(specification, dict) or "id" not in specification or kind not in LIMITS:
             raise ConfigError(f"{where}: it asks for the sensor {str(kind)[:60]}; there are: {', '.join(LIMITS)}")
-        if any(item["id"] == other["id"] for other in found):
-            raise ConfigError(f"{where}: two of its sensors have the id '{str(item['id'])[:60]}'")
-        found.append(item)
-        if sum(other["type"] == kind for other in found) > LIMITS[kind]:
+        if any(specification["id"] == earlier["id"] for earlier in accepted):
+            raise ConfigError(f"{where}: two of its sensors have the id '{str(specification['id'])[:60]}'")
+        accepted.append(specification)
+        if sum(earlier["type"] == kind for earlier in accepted) > LIMITS[kind]:
             raise ConfigError(f"{where}: it asks for more than {LIMITS[kind]} sensors {kind}")
-    return found
+    return accepted
 
 
 def geolocation(x: float, y: float) -> tuple[float, float, float]:
-    """Latitude and longitude, degrees, and altitude, m, of a place of ours: x m east and y m north of (0, 0)."""
+    """Return latitude and longitude, degrees, and altitude, m, of a point x m east and y m north of (0, 0)."""
     latitude = 360.0 * math.atan(math.exp(y / RADIUS)) / math.pi - 90.0
     return latitude, math.degrees(x / RADIUS), 0.0
 
@@ -78,19 +78,25 @@ def place_of(item: Mapping[str, Any], axes: F64) -> F64:
     """Sensor to car [4, 4], from the middle of the car's base, of a sensor whose own frame has these axes [3, 3]."""
     roll, pitch, yaw = (math.radians(number(item, key, 0.0, -720.0, 720.0)) for key in ("roll", "pitch", "yaw"))
 
-    def turn(axis: int, angle: float) -> F64:
-        c, s = math.cos(angle), math.sin(angle)
-        a, b = [k for k in range(3) if k != axis]
+    def rotation(axis: int, angle: float) -> F64:
+        cosine, sine = math.cos(angle), math.sin(angle)
+        first, second = [index for index in range(3) if index != axis]
         matrix = np.eye(3)
-        matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
+        matrix[first, first], matrix[first, second], matrix[second, first], matrix[second, second] = (
+            cosine,
+            -sine,
+            sine,
+            cosine,
+        )
         return matrix
 
     # CARLA: yaw clockwise seen from above, pitch upwards, roll clockwise seen from behind
-    place = np.eye(4)
-    place[:3, :3] = turn(2, -yaw) @ turn(1, pitch) @ turn(0, roll) @ axes
+    pose = np.eye(4)
+    pose[:3, :3] = rotation(2, -yaw) @ rotation(1, pitch) @ rotation(0, roll) @ axes
     x, y, z = (number(item, key, 0.0, -100.0, 100.0) for key in ("x", "y", "z"))
-    place[:3, 3] = x, 0.0 - y, z
-    return place
+    # CARLA's y axis points to the right.
+    pose[:3, 3] = x, 0.0 - y, z
+    return pose
 
 
 def camera_of(item: Mapping[str, Any]) -> Camera:
@@ -104,21 +110,23 @@ def camera_of(item: Mapping[str, Any]) -> Camera:
 
 def lidar_of(item: Mapping[str, Any]) -> Lidar:
     """The LiDAR that a leaderboard gives its agents: a whole turn a step."""
-    beams = np.deg2rad(np.linspace(-30.0, 10.0, 64))
-    place = place_of(item, _RIGHT)
-    return Lidar(beams, 937, place, _RANGE, noise=0.0, period=0.1, blind=0.1, lost=0.45, faint=0.0)
+    elevations = np.deg2rad(np.linspace(-30.0, 10.0, 64))
+    pose = place_of(item, _RIGHT)
+    return Lidar(elevations, 937, pose, _RANGE, noise=0.0, period=0.1, blind=0.1, lost=0.45, faint=0.0)
 
 
 def radar_of(item: Mapping[str, Any]) -> Lidar:
     """The rays of a radar: 12 times 12, evenly over its field."""
-    wide, high = (math.radians(number(item, f"{key}_fov", 30.0, 0.1, 170.0)) for key in ("horizontal", "vertical"))
-    beams: F64 = (np.arange(12, dtype=np.float64) + 0.5) * (high / 12) - 0.5 * high
-    place = place_of(item, _RIGHT)
-    return Lidar(beams, 12, place, _REACH, noise=0.0, period=0.1, blind=0.1, lost=0.0, faint=0.0, width=wide)
+    horizontal, vertical = (
+        math.radians(number(item, f"{key}_fov", 30.0, 0.1, 170.0)) for key in ("horizontal", "vertical")
+    )
+    elevations: F64 = (np.arange(12, dtype=np.float64) + 0.5) * (vertical / 12) - 0.5 * vertical
+    pose = place_of(item, _RIGHT)
+    return Lidar(elevations, 12, pose, _REACH, noise=0.0, period=0.1, blind=0.1, lost=0.0, faint=0.0, width=horizontal)
 
 
 def cloud(points: F32) -> F32:
-    """CARLA's points [P, 4]: x forward, y right, z up, m, and intensity; of points [., 5] of the world's LiDAR."""
-    kept = points[points[:, 4] >= 0.0]
-    away = np.linalg.norm(kept[:, :3], axis=1)
-    return np.column_stack([kept[:, 1], kept[:, 0], kept[:, 2], np.exp(-_FADE * away)]).astype(np.float32)
+    """Convert points [., 5] of the world's LiDAR to CARLA's [P, 4]: x forward, y right, z up, m, and intensity."""
+    returns = points[points[:, 4] >= 0.0]
+    distance = np.linalg.norm(returns[:, :3], axis=1)
+    return np.column_stack([returns[:, 1], returns[:, 0], returns[:, 2], np.exp(-_FADE * distance)]).astype(np.float32)

@@ -1,8 +1,8 @@
-"""Tasks on a Ray cluster: Ray's scheduler places them, a worker process of ours does each, as on one machine.
+"""Tasks on a Ray cluster: Ray schedules them, and a worker process runs each one as on a single machine.
 
-A Ray worker keeps one child process (`ssad.engine.local`) and hands it one task after the other, so that a task which
-raises, hangs, dies or eats the memory is told apart from a node that is lost: the former is an outcome, the latter is
-done again elsewhere. The cluster must see the same folders.
+A Ray worker keeps one child process (`ssad.jobs.local`) and hands it one task after another. A task that raises,
+hangs, dies or exhausts the memory is thereby distinct from a lost node: the former is an outcome, the latter is
+repeated on another node. All nodes must see the same folders.
 """
 
 from __future__ import annotations
@@ -18,45 +18,46 @@ from ssad.core.errors import ConfigError, SSADError, StoreError, install_extra
 from ssad.engine.local import LocalProcesses, Start
 from ssad.engine.task import Outcome, Task
 
-LOST_NODES = 5  # times that a task is done again because its node was lost
-AHEAD = 2  # tasks at hand for each place of the cluster, so that none waits for the next
+LOST_NODES = 5  # repeats of a task whose node was lost
+AHEAD = 2  # more than one, so that no CPU idles until the next task arrives
 
-_BACKENDS: dict[str, LocalProcesses] = {}  # of this Ray worker, by start
+_BACKENDS: dict[str, LocalProcesses] = {}  # backends of this Ray worker, by the representation of their start
 
 
 def _on_node(parts: tuple[Any, Any, float], start: Start | None) -> Any:
-    """What a Ray worker does with a task: has its child process do it, and says how that ended."""
+    """Run a task of a Ray worker in its child process and return the fields of the outcome."""
     function, argument, timeout_s = parts
-    name = repr(start)
-    if name not in _BACKENDS:
+    start_key = repr(start)
+    # A child process is bound to its start, so another start needs another process.
+    if start_key not in _BACKENDS:
         for other in _BACKENDS.values():
             other.close()
         _BACKENDS.clear()
-        _BACKENDS[name] = LocalProcesses(1, start=start)
-    backend = _BACKENDS[name]
+        _BACKENDS[start_key] = LocalProcesses(1, start=start)
+    backend = _BACKENDS[start_key]
     backend.submit(Task(function, argument, timeout_s))
     while True:
-        for found in backend.wait(1.0):
-            return found.status, found.value, found.reason, found.error, found.seconds
+        for outcome in backend.wait(1.0):
+            return outcome.status, outcome.value, outcome.reason, outcome.error, outcome.seconds
 
 
 def _check_address(address: str) -> None:
-    """Whether somebody listens at HOST:PORT; Ray itself would wait for minutes. OSError."""
+    """Raise OSError unless a process listens at HOST:PORT; Ray itself would wait for minutes."""
     host, colon, port = address.rpartition("://")[2].rpartition(":")
     if colon and port.isdigit():
         socket.create_connection((host, int(port)), timeout=5.0).close()
 
 
 class RayCluster:
-    """The backend of a Ray cluster; see `ssad.engine.task.Backend`.
+    """Backend of a Ray cluster; see `ssad.jobs.task.Backend`.
 
     Args:
-        address: of a running cluster, "auto", or "local" to start one for as long as this lives.
-        start: see `LocalProcesses`.
-        gpu_share: of a GPU for each task; 0: none is asked for.
+        address: Address of a running cluster, "auto", or "local" to start one for the lifetime of this object.
+        start: See `LocalProcesses`.
+        gpu_share: Share of a GPU for each task; 0 requests none.
 
     Raises:
-        ConfigError: Ray is not installed, or there is no such cluster.
+        ConfigError: Ray is not installed, or the cluster does not exist.
     """
 
     def __init__(self, address: str, *, start: Start | None = None, gpu_share: float = 0.0) -> None:
@@ -73,9 +74,11 @@ class RayCluster:
         except Exception as error:
             text = " ".join(str(error).split())
             raise ConfigError(f"no Ray cluster at '{address}': {text}") from None
-        path = [p or os.getcwd() for p in sys.path]
+        import_path = [entry or os.getcwd() for entry in sys.path]
         environment = {name: os.environ[name] for name in os.environ if name.startswith("SSAD_")}
-        environment["PYTHONPATH"] = os.pathsep.join(path)  # what is handed over is imported there before anything runs
+        environment["PYTHONPATH"] = os.pathsep.join(
+            import_path
+        )  # what is handed over is imported there before anything runs
         options: dict[str, Any] = {"num_cpus": 1, "max_retries": LOST_NODES, "runtime_env": {"env_vars": environment}}
         if gpu_share:
             options["num_gpus"] = gpu_share
@@ -85,20 +88,20 @@ class RayCluster:
 
     @property
     def capacity(self) -> int:
-        """How many tasks it wants at hand; follows the size of the cluster."""
+        """Number of tasks that the backend accepts at a time; follows the size of the cluster."""
         return AHEAD * max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     @property
     def busy(self) -> int:
-        """How many tasks it has now."""
+        """Number of submitted tasks without an outcome."""
         return len(self._tasks)
 
     def submit(self, task: Task) -> None:
-        """Take a task; only while `busy` is below `capacity`."""
+        """Submit a task; call only while `busy` is below `capacity`."""
         self._tasks[self._remote.remote((task.function, task.argument, task.timeout_s), self._start)] = task
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """See `Backend`.
+        """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:
             SSADError: No worker can start.
@@ -107,22 +110,23 @@ class RayCluster:
             time.sleep(seconds)
             return []
         ready, _ = self._ray.wait(list(self._tasks), timeout=seconds)
-        found = []
+        outcomes = []
         for reference in ready:
             task = self._tasks.pop(reference)
             try:
-                status, value, reason, error, spent = self._ray.get(reference)
-            except self._ray.exceptions.RayTaskError as problem:
-                cause = problem.cause
+                status, value, reason, error, elapsed_s = self._ray.get(reference)
+            # A task's own errors are part of its outcome: an error here comes from the start of the worker.
+            except self._ray.exceptions.RayTaskError as ray_error:
+                cause = ray_error.cause
                 raise (cause if isinstance(cause, SSADError) else StoreError(str(cause))) from None
-            except self._ray.exceptions.RayError as problem:
-                why = f"the cluster lost its node {LOST_NODES + 1} times: {' '.join(str(problem).split())[:200]}"
-                status, value, reason, error, spent = "crashed", None, why, None, 0.0
-            found.append(Outcome(task, status, value, reason, error, spent))
-        return found
+            except self._ray.exceptions.RayError as ray_error:
+                message = f"the cluster lost its node {LOST_NODES + 1} times: {' '.join(str(ray_error).split())[:200]}"
+                status, value, reason, error, elapsed_s = "crashed", None, message, None, 0.0
+            outcomes.append(Outcome(task, status, value, reason, error, elapsed_s))
+        return outcomes
 
     def close(self) -> None:
-        """End all that runs, and the cluster if it was started here."""
+        """Cancel all running tasks, and shut the cluster down if this object started it."""
         for reference in self._tasks:
             with contextlib.suppress(self._ray.exceptions.RayError):
                 self._ray.cancel(reference, force=True)

@@ -1,4 +1,4 @@
-"""Tasks in processes of this machine: a task that raises, hangs, dies or eats the memory costs only itself."""
+"""Tasks in processes of this machine: a task that raises, hangs, dies or exhausts the memory fails alone."""
 
 from __future__ import annotations
 
@@ -19,75 +19,80 @@ from ssad.core.registry import describe
 from ssad.engine.task import Outcome, Status, Task
 
 START_S = 600.0  # a worker may compile kernels when it starts
-SCARCE = 0.04  # share of the memory: with less left
-SCARCE_S = 2.0  # for so many seconds, the largest worker ends
+SCARCE = 0.04  # share of the memory; if less remains
+SCARCE_S = 2.0  # for this time, the largest worker is killed
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # environment variables
-WORKER_MEMORY = "SSAD_WORKER_MEMORY"  # environment variable: bytes that a worker may hold
-LOOK_S = 0.2  # from one look at the memory to the next
+WORKER_MEMORY = "SSAD_WORKER_MEMORY"  # environment variable: memory limit of a worker, bytes
+LOOK_S = 0.2  # interval between checks of the memory
 
 Start = tuple[Callable[[Any], None], Any]
 
 
 class Worker:
-    """One child process. It is started at once; what it does first may take long (`ready`)."""
+    """A child process. It is started at once; its own start-up may take long (see `ready`)."""
 
     def __init__(self, start: Start | None, environment: Mapping[str, str]) -> None:
-        theirs, orders = os.pipe()
-        answers, theirs_too = os.pipe()
+        child_input, request_pipe = os.pipe()
+        answer_pipe, child_output = os.pipe()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  closed by end
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "ssad.engine.worker", str(theirs), str(theirs_too)],
+            [sys.executable, "-m", "ssad.engine.worker", str(child_input), str(child_output)],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
-            pass_fds=(theirs, theirs_too),
+            pass_fds=(child_input, child_output),
             start_new_session=True,  # Ctrl-C reaches this process only
             env={**os.environ, **environment},
         )
-        os.close(theirs)
-        os.close(theirs_too)
-        self.answers = Connection(answers)
-        self._orders = Connection(orders)
+        # Only the child may hold its ends: the end of its answers then shows that it died.
+        os.close(child_input)
+        os.close(child_output)
+        self.answers = Connection(answer_pipe)
+        self._orders = Connection(request_pipe)
         self.ready = False
         self.task: Task | None = None
         self.began = time.monotonic()
-        self._send(([p or os.getcwd() for p in sys.path], start is not None))
+        # The child unpickles functions by import, so it needs the import path first.
+        self._send(([entry or os.getcwd() for entry in sys.path], start is not None))
         if start is not None:
             self._send(start)
 
     @property
     def deadline(self) -> float:
-        """When what it does now has taken too long."""
+        """Time (monotonic clock) at which the current start or task times out."""
         if not self.ready:
             return self.began + START_S
         return self.began + self.task.timeout_s if self.task is not None else float("inf")
 
     def _send(self, message: Any) -> None:
-        with contextlib.suppress(OSError):  # if it is dead, the end of its answers says so
+        with contextlib.suppress(OSError):  # a dead worker is noticed by the end of its answers
             self._orders.send(message)
 
     def give(self, task: Task) -> Outcome | None:
-        """Begin a task; an outcome when it cannot even be sent."""
+        """Start a task; return an outcome if the task cannot even be sent."""
         self.task, self.began = task, time.monotonic()
         try:
             self._send((task.function, task.argument))
-        except Exception as error:  # whatever pickling raises
+        except Exception as error:  # pickling can raise any exception
             return self.outcome("failed", f"the task cannot be handed over: {describe(error)}")
         return None
 
     def outcome(
         self, status: Status, reason: str = "", *, value: Any = None, error: Exception | None = None
     ) -> Outcome:
-        """How its task ended; it has none afterwards."""
+        """Return the outcome of the current task, and clear the task."""
         assert self.task is not None
         task, self.task = self.task, None
         return Outcome(task, status, value, reason, error, time.monotonic() - self.began)
 
     def hear(self) -> Outcome | None:
-        """An answer: that it has started, or the outcome of its task.
+        """Read an answer: the worker is ready, or its task has an outcome.
+
+        Returns:
+            The outcome; None if the worker has only started.
 
         Raises:
-            SSADError: It cannot start.
+            SSADError: The worker cannot start.
         """
         try:
             kind, value = self.answers.recv()
@@ -105,10 +110,10 @@ class Worker:
         return self.outcome("failed", str(value), error=value if isinstance(value, SSADError) else None)
 
     def overdue(self) -> Outcome:
-        """The outcome of a task that took too long.
+        """Return the outcome of a task that timed out.
 
         Raises:
-            SSADError: It was the start that took too long.
+            SSADError: The start of the worker timed out.
         """
         if not self.ready:
             raise SSADError(f"a worker process did not start within {START_S:.0f} s: {self._last_words()}")
@@ -116,36 +121,36 @@ class Worker:
         return self.outcome("timeout", f"took longer than {self.task.timeout_s:g} s")
 
     def memory(self) -> int:
-        """Bytes that it holds; 0 where that cannot be told."""
+        """Resident memory of the process, bytes; 0 where it is unknown."""
         try:
             return int(Path(f"/proc/{self.process.pid}/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         except (OSError, IndexError, ValueError):
             return 0
 
     def _last_words(self) -> str:
-        """The last line it wrote to standard error."""
-        size = self._log.seek(0, os.SEEK_END)
-        self._log.seek(max(0, size - 4096))
+        """Return the last line of the process's output."""
+        log_size = self._log.seek(0, os.SEEK_END)
+        self._log.seek(max(0, log_size - 4096))
         lines = [line.strip() for line in self._log.read().decode(errors="replace").splitlines()]
         return next((line for line in reversed(lines) if line), "")[:300]
 
     def how_it_ended(self) -> str:
-        """Wait for the process, and say how it ended.
+        """Wait for the process to end and describe its exit.
 
         Returns:
-            Text such as "the process ended (killed by SIGSEGV)" or "the process ended (exit code 3)", with its last
-            words.
+            Text such as "the process ended (killed by SIGSEGV)" or "the process ended (exit code 3)", followed by
+            the last line of its output.
         """
-        code = self.process.wait()
+        exit_code = self.process.wait()
         try:
-            text = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+            cause = f"killed by {signal.Signals(-exit_code).name}" if exit_code < 0 else f"exit code {exit_code}"
         except ValueError:
-            text = f"killed by signal {-code}"
-        words = self._last_words()
-        return f"the process ended ({text}){f': {words}' if words else ''}"
+            cause = f"killed by signal {-exit_code}"
+        last_line = self._last_words()
+        return f"the process ended ({cause}){f': {last_line}' if last_line else ''}"
 
     def end(self) -> None:
-        """End the process and forget it."""
+        """Kill the process and release its resources."""
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
@@ -156,15 +161,16 @@ class Worker:
 
 
 class LocalProcesses:
-    """The backend of worker processes on this machine.
+    """Backend of worker processes on this machine.
 
     Args:
-        workers: how many.
-        start: a function and its argument, called once in each worker before its first task; its time does not count
-            as a task's. With one the first worker starts alone, since it may compile kernels for all.
-        gpus: the workers see one of these each, in turn, as `CUDA_VISIBLE_DEVICES` names them; none: left as it is.
-        threads: of linear algebra in each worker, unless the user's environment says otherwise; what it says of
-            OpenMP alone holds for all.
+        workers: Number of workers.
+        start: A function and its argument, called once in each worker before its first task; its time does not
+            count as a task's. With a start the first worker starts alone, since it may compile kernels for all.
+        gpus: Each worker sees one of these, in turn, as `CUDA_VISIBLE_DEVICES` names them; none: the variable
+            is left as it is.
+        threads: Threads of linear algebra in each worker, unless the user's environment sets another number; a
+            value for OpenMP alone applies to all libraries.
     """
 
     def __init__(self, workers: int, *, start: Start | None = None, gpus: Sequence[str] = (), threads: int = 1) -> None:
@@ -175,45 +181,47 @@ class LocalProcesses:
         self._unsent: list[Outcome] = []
         self._started = 0
         self._looked = time.monotonic()
-        self._plenty = (0, time.monotonic())  # memory of the machine, and when there was enough of it
+        self._plenty = (0, time.monotonic())  # total memory, and the last time at which enough was free
 
     @property
     def busy(self) -> int:
-        """How many tasks it has now."""
+        """Number of submitted tasks without an outcome."""
         return len(self._waiting) + len(self._unsent) + sum(worker.task is not None for worker in self._workers)
 
     def submit(self, task: Task) -> None:
-        """Take a task; only while `busy` is below `capacity`."""
+        """Submit a task; call only while `busy` is below `capacity`."""
         self._waiting.append(task)
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """See `Backend`.
+        """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:
             SSADError: No worker can start.
         """
         self._hand_out()
-        found, self._unsent = self._unsent, []
-        pause = min([seconds, LOOK_S, *(max(0.0, w.deadline - time.monotonic()) for w in self._workers)])
-        for answers in wait([w.answers for w in self._workers], 0.0 if found else pause):
-            worker = next(w for w in self._workers if w.answers is answers)
+        outcomes, self._unsent = self._unsent, []
+        pause = min(
+            [seconds, LOOK_S, *(max(0.0, candidate.deadline - time.monotonic()) for candidate in self._workers)]
+        )
+        for answers in wait([candidate.answers for candidate in self._workers], 0.0 if outcomes else pause):
+            worker = next(candidate for candidate in self._workers if candidate.answers is answers)
             outcome = worker.hear()
             if outcome is not None:
-                found.append(outcome)
+                outcomes.append(outcome)
             if worker.process.poll() is not None or (outcome is not None and outcome.status == "crashed"):
                 self._remove(worker)
         now = time.monotonic()
-        for worker in [w for w in self._workers if now > w.deadline]:
-            found.append(worker.overdue())
+        for worker in [candidate for candidate in self._workers if now > candidate.deadline]:
+            outcomes.append(worker.overdue())
             self._remove(worker)
         if now - self._looked > LOOK_S:
             self._looked = now
-            found += self._guard_memory()
+            outcomes += self._guard_memory()
         self._hand_out()
-        return found
+        return outcomes
 
     def _hand_out(self) -> None:
-        """Tasks to workers that are ready; starts workers where there are more tasks than those."""
+        """Assign tasks to idle workers, and start workers while tasks outnumber them."""
         for worker in self._workers:
             if worker.ready and worker.task is None and self._waiting:
                 unsent = worker.give(self._waiting.pop(0))
@@ -222,9 +230,9 @@ class LocalProcesses:
         idle = sum(worker.task is None for worker in self._workers)
         while len(self._workers) < self.capacity and idle < len(self._waiting):
             if self._start is not None and self._workers and not any(worker.ready for worker in self._workers):
-                return  # the first one starts alone
-            wanted = os.environ.get("OMP_NUM_THREADS", str(self._threads))  # PyTorch asks MKL before OpenMP
-            environment = {name: os.environ.get(name, wanted) for name in THREADS}
+                return  # the first worker starts alone: it may compile kernels for all
+            thread_count = os.environ.get("OMP_NUM_THREADS", str(self._threads))  # PyTorch asks MKL before OpenMP
+            environment = {name: os.environ.get(name, thread_count) for name in THREADS}
             if self._gpus:
                 environment["CUDA_VISIBLE_DEVICES"] = self._gpus[self._started % len(self._gpus)]
             self._workers.append(Worker(self._start, environment))
@@ -232,57 +240,65 @@ class LocalProcesses:
             idle += 1
 
     def _guard_memory(self) -> list[Outcome]:
-        """Ends a worker that holds more than it may, and the largest one before the machine runs out of memory."""
+        """Kill workers above the memory limit, and the largest worker before the machine runs out of memory."""
         working = [(worker.memory(), worker) for worker in self._workers if worker.task is not None]
-        limit = int(os.environ.get(WORKER_MEMORY) or 0)
-        too_large = [(held, w) for held, w in working if limit and held > limit]
-        total, left = memory_left()
+        memory_limit = int(os.environ.get(WORKER_MEMORY) or 0)
+        too_large = [(memory, candidate) for memory, candidate in working if memory_limit and memory > memory_limit]
+        total_memory, free_memory = memory_left()
         now = time.monotonic()
-        if left >= SCARCE * total or total != self._plenty[0]:  # a virtual machine may grow with its use
-            self._plenty = total, now
+        if (
+            free_memory >= SCARCE * total_memory or total_memory != self._plenty[0]
+        ):  # a virtual machine may grow with its use
+            self._plenty = total_memory, now
+        # A short dip does not kill: the shortage must last. One worker is killed at a time.
         elif working and not too_large and now - self._plenty[1] > SCARCE_S:
-            too_large = [max(working, key=lambda pair: pair[0])]
-            self._plenty = total, now
-        found = []
-        for held, worker in too_large:
-            why = f"its limit is {limit / 2**30:.1f}" if limit and held > limit else "the machine has none left"
-            found.append(worker.outcome("crashed", f"out of memory: it held {held / 2**30:.1f} GiB, {why}"))
+            too_large = [max(working, key=lambda entry: entry[0])]
+            self._plenty = total_memory, now
+        outcomes = []
+        for memory, worker in too_large:
+            cause = (
+                f"its limit is {memory_limit / 2**30:.1f}"
+                if memory_limit and memory > memory_limit
+                else "the machine has none left"
+            )
+            outcomes.append(worker.outcome("crashed", f"out of memory: it held {memory / 2**30:.1f} GiB, {cause}"))
             self._remove(worker)
-        return found
+        return outcomes
 
     def _remove(self, worker: Worker) -> None:
         self._workers.remove(worker)
         worker.end()
 
     def close(self) -> None:
-        """End all that runs."""
+        """Kill all workers."""
         for worker in self._workers:
             worker.end()
         self._workers, self._waiting = [], []
 
 
 def memory_left() -> tuple[int, int]:
-    """Memory of this machine, or of the container that this process runs in.
+    """Return the memory of this machine, or of the container that this process runs in.
 
     Returns:
-        Total memory and the part that is free to use, bytes; (0, 0) where that is unknown.
+        Total and available memory, bytes; (0, 0) where that is unknown.
     """
     try:
-        rows = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        total, free = (int(rows[name].split()[0]) * 1024 for name in ("MemTotal", "MemAvailable"))
+        fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        total_memory, available = (int(fields[name].split()[0]) * 1024 for name in ("MemTotal", "MemAvailable"))
     except (OSError, KeyError, ValueError):
         return 0, 0
-    group = Path("/sys/fs/cgroup")
+    cgroup = Path("/sys/fs/cgroup")
     with contextlib.suppress(OSError, ValueError):
-        limit = int((group / "memory.max").read_text())
-        rows = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        used = int((group / "memory.current").read_text()) - int(rows.get("inactive_file", 0))
-        return min(total, limit), min(free, limit - used)
-    return total, free
+        memory_limit = int((cgroup / "memory.max").read_text())
+        fields = dict(line.split() for line in (cgroup / "memory.stat").read_text().splitlines())
+        # The kernel can reclaim inactive file pages at any time, so they count as free.
+        used_memory = int((cgroup / "memory.current").read_text()) - int(fields.get("inactive_file", 0))
+        return min(total_memory, memory_limit), min(available, memory_limit - used_memory)
+    return total_memory, available
 
 
 class ThisProcess:
-    """The backend that does each task here and now, without isolation or time-outs: for debugging and tests."""
+    """Backend that runs tasks in the calling process, without isolation or time-outs: for debugging and tests."""
 
     capacity = 1
 
@@ -292,29 +308,29 @@ class ThisProcess:
 
     @property
     def busy(self) -> int:
-        """How many tasks it has now."""
+        """Number of submitted tasks without an outcome."""
         return len(self._waiting)
 
     def submit(self, task: Task) -> None:
-        """Take a task."""
+        """Submit a task."""
         self._waiting.append(task)
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """Do what there is."""
+        """Run all submitted tasks."""
         if self._start is not None:
             self._start[0](self._start[1])
             self._start = None
-        found = []
+        outcomes = []
         while self._waiting:
-            task, began = self._waiting.pop(0), time.monotonic()
+            task, started_at = self._waiting.pop(0), time.monotonic()
             try:
                 value = task.function(task.argument)
             except SSADError as error:
-                found.append(Outcome(task, "failed", None, str(error), error, time.monotonic() - began))
+                outcomes.append(Outcome(task, "failed", None, str(error), error, time.monotonic() - started_at))
                 continue
-            found.append(Outcome(task, "ok", value, seconds=time.monotonic() - began))
-        return found
+            outcomes.append(Outcome(task, "ok", value, seconds=time.monotonic() - started_at))
+        return outcomes
 
     def close(self) -> None:
-        """Forget what was not done."""
+        """Drop the tasks that have not run."""
         self._waiting = []

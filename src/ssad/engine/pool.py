@@ -1,4 +1,4 @@
-"""Work shared out: one pool for suites, recordings and the toolbox, over processes of this machine or a Ray cluster."""
+"""One pool for suites, recordings and the toolbox, on processes of this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Pool:
 
         Args:
             task: The task.
-            first: Whether it goes before all tasks that have not begun and were not added first themselves.
+            first: Whether the task precedes all waiting tasks that were not added first themselves.
         """
         (self._urgent if first else self._queue).append(task)
 
     def drop(self, unwanted: Callable[[Task], bool]) -> list[Task]:
-        """Takes back the tasks that have not begun and are not wanted any more; they are returned."""
+        """Remove the waiting tasks that `unwanted` selects, and return them."""
         dropped = [task for task in (*self._urgent, *self._queue) if unwanted(task)]
         self._urgent = deque(task for task in self._urgent if not unwanted(task))
         self._queue = deque(task for task in self._queue if not unwanted(task))
@@ -53,6 +53,7 @@ class Pool:
             SSADError: no worker can start.
         """
         while self._urgent or self._queue or self.backend.busy:
+            # Tasks stay in our queues as long as possible: only waiting tasks can be dropped or overtaken.
             while (self._urgent or self._queue) and self.backend.busy < self.backend.capacity:
                 self.backend.submit((self._urgent or self._queue).popleft())
             yield from self.backend.wait(TICK_S)
@@ -75,23 +76,23 @@ def open_pool(
     device: str = "cpu",
     start: Start | None = None,
 ) -> Pool:
-    """A pool for about so many tasks.
+    """Open a pool for a number of tasks.
 
     Args:
-        tasks: how many there will be at the most at a time; no more workers are started.
-        workers: processes of this machine (None: one a core, on GPUs what their memory takes); 0: this very process,
-            without isolation, for debugging.
-        ray: address of a Ray cluster instead; see `RayCluster`.
+        tasks: Largest number of simultaneous tasks; no more workers are started.
+        workers: Processes of this machine (None: one per core, on GPUs as many as their memory allows); 0: the
+            calling process, without isolation, for debugging.
+        ray: Address of a Ray cluster to use instead; see `RayCluster`.
         device: cpu or cuda; on cuda each worker sees one of the visible GPUs.
-        start: see `LocalProcesses`.
+        start: See `LocalProcesses`.
 
     Raises:
-        ConfigError: there is no such cluster.
+        ConfigError: The cluster does not exist.
     """
     gpus = visible_gpus() if device != "cpu" else []
     if ray is not None:
-        share = 1.0 / max(1, gpu_workers(len(gpus)) // max(len(gpus), 1)) if device != "cpu" else 0.0
-        return Pool(RayCluster(ray, start=start, gpu_share=share))
+        gpu_share = 1.0 / max(1, gpu_workers(len(gpus)) // max(len(gpus), 1)) if device != "cpu" else 0.0
+        return Pool(RayCluster(ray, start=start, gpu_share=gpu_share))
     if workers == 0:
         return Pool(ThisProcess(start))
     count = workers or min(gpu_workers(len(gpus)) or default_workers(), default_workers())
@@ -107,12 +108,12 @@ def run_all(
     timeout_s: float = float("inf"),
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Any]:
-    """Call a function on each argument, for work that is of use only as a whole; finished results are on disk.
+    """Call a function on each argument, for work whose parts are useful only together.
 
     Args:
-        pool: Where the calls run; the pool is used up.
+        pool: Runs the calls; the pool is used up.
         function: See `Task`.
-        arguments: What the function is called with, one task each; see `Task`.
+        arguments: Arguments of the calls, one task each; see `Task`.
         timeout_s: Time limit of a task, s; see `Task`.
         progress: Called with the number of finished tasks and the number of all tasks.
 
@@ -121,10 +122,10 @@ def run_all(
 
     Raises:
         SSADError: The first error that the function raised; no further task is started then.
-        StoreError: Some tasks crashed or took too long; raised once all others are done.
+        StoreError: Some tasks crashed or timed out; raised once all others have ended.
     """
     results: list[Any] = [None] * len(arguments)
-    lost: list[str] = []
+    failures: list[str] = []
     with pool:
         for number, argument in enumerate(arguments):
             pool.add(Task(function, argument, timeout_s, label=number))
@@ -134,8 +135,10 @@ def run_all(
             if outcome.error is not None:
                 raise outcome.error
             if outcome.status != "ok":
-                lost.append(outcome.reason)
-    if lost:
-        more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
-        raise StoreError(f"{len(lost)} of {len(arguments)} parts failed: {lost[0]}{more}; run the same command again")
+                failures.append(outcome.reason)
+    if failures:
+        remainder = f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""
+        raise StoreError(
+            f"{len(failures)} of {len(arguments)} parts failed: {failures[0]}{remainder}; run the same command again"
+        )
     return results

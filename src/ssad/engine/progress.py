@@ -1,4 +1,4 @@
-"""Live progress with the time that is left; plain lines where there is no terminal."""
+"""Live progress with the remaining time; plain lines where there is no terminal."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-EVERY_S = 10.0  # from one plain line to the next
+EVERY_S = 10.0  # between plain lines
 
 
 class Live:
-    """A context: a Rich bar on a terminal, else a line every ten seconds."""
+    """Context manager: a Rich progress bar on a terminal, else a line every ten seconds."""
 
     def __init__(self, title: str, total: int, done: int, *, console: Console, unit: str = "cells") -> None:
         self.total, self.done, self.failed, self.first = total, done, 0, done
@@ -27,20 +27,21 @@ class Live:
             self.task = self.bar.add_task(title, total=total, completed=done, note="")
 
     def left(self) -> str:
-        """Time left, from the cells done so far in this process."""
-        count = self.done - self.first
-        if not count or self.done >= self.total:
+        """Return the remaining time, from the cells finished by this process."""
+        # Cells of an earlier, resumed run took no time in this process.
+        finished = self.done - self.first
+        if not finished or self.done >= self.total:
             return "eta --:--"
-        seconds = round((time.monotonic() - self.began) / count * (self.total - self.done))
+        seconds = round((time.monotonic() - self.began) / finished * (self.total - self.done))
         return f"eta {seconds // 60:02d}:{seconds % 60:02d}"
 
     def note(self) -> str:
-        """Failures so far and the time left."""
+        """Return the number of failures and the remaining time."""
         failed = f"{self.failed} failed  " if self.failed else ""
         return failed + self.left()
 
     def advance(self, ok: bool) -> None:
-        """One more cell is done."""
+        """Count one more finished cell."""
         self.done += 1
         self.failed += not ok
 
@@ -50,7 +51,7 @@ class Live:
         self.tick()
 
     def tick(self) -> None:
-        """Show where things are."""
+        """Update the display."""
         if self.bar:
             self.bar.update(self.task, completed=self.done, total=self.total, note=self.note())
         elif time.monotonic() - self.said >= EVERY_S:
@@ -58,7 +59,7 @@ class Live:
             self.line()
 
     def line(self) -> None:
-        """One plain line."""
+        """Print one plain line."""
         self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}")
 
     def __enter__(self) -> Self:
@@ -71,5 +72,5 @@ class Live:
     ) -> None:
         if self.bar:
             self.bar.stop()
-        elif kind is None or self.done > self.first:  # an error before anything was done is alone
+        elif kind is None or self.done > self.first:  # an error before the first finished cell stands alone
             self.line()

@@ -1,8 +1,8 @@
-"""The results folder: append-only, safe against kill -9, never a line lost or doubled.
+"""The results folder: append-only, safe against kill -9, without lost or duplicate lines.
 
-DIR/run.json says what runs; DIR/episodes.jsonl and DIR/results.jsonl get one line a cell, the latter last: a cell is
-finished when its line in results.jsonl is whole. What was cut off in the middle is dropped on the next start; what
-failed goes when it is to be tried again.
+DIR/run.json describes the run; DIR/episodes.jsonl and DIR/results.jsonl get one line per cell, the latter last: a
+cell is finished when its line in results.jsonl is complete. A truncated line is dropped on the next start; failed
+cells are removed when they are retried.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from ssad.core.jsonl import scan_lines
 
 RUN, RESULTS, EPISODES, LOCK = "run.json", "results.jsonl", "episodes.jsonl", ".lock"
 
-Retry = bool | Collection[str]  # whether all that failed is tried again, or which keys
+Retry = bool | Collection[str]  # whether all failed cells are retried, or the keys of those that are
 
 
 def read_run(folder: str | Path) -> dict[str, Any]:
-    """run.json of a results folder. StoreError when the folder holds no run."""
+    """Return run.json of a results folder. StoreError if the folder holds no run."""
     path = Path(folder) / RUN
     if not path.is_file():
         raise StoreError(f"{folder}: not a results folder (it has no {RUN}); make one with: ssad run SUITE --out DIR")
-    data = safeio.read_json(path)
-    if not isinstance(data, dict) or "identity" not in data:
+    content = safeio.read_json(path)
+    if not isinstance(content, dict) or "identity" not in content:
         raise StoreError(f"{path}: not written by ssad run")
-    return data
+    return content
 
 
 class Store:
-    """One results folder, held by one process (`with Store.open(...) as store`)."""
+    """A results folder, held by one process (`with Store.open(...) as store`)."""
 
     def __init__(self, folder: Path, lock: int) -> None:
         self.folder = folder
@@ -74,6 +74,7 @@ class Store:
         if not (self.folder / RUN).exists():
             safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
         results, ends = scan_lines(self.folder / RESULTS)
+        # A kill may leave half a line, and the next line would be appended to it.
         _cut(self.folder / RESULTS, ends[-1] if ends else 0)
         for record in results:
             if record["key"] in self.results:
@@ -94,36 +95,37 @@ class Store:
             self._files[name] = _open_append(self.folder / name)
 
     def append(self, result: Mapping[str, Any], episode: Mapping[str, Any] | None) -> None:
-        """Add one finished cell; it is durable when this returns.
+        """Add a finished cell; the record is durable when this returns.
 
         Args:
             result: The record.
             episode: Line for episodes.jsonl, if there is one.
 
         Raises:
-            ValueError: There is already a record of this key.
+            ValueError: The store already has a record with this key.
         """
         key = str(result["key"])
         if key in self.results:
             raise ValueError(f"cell {key} is already in the store")
+        # The result goes last: it marks the cell as finished, so its episode must already be there.
         if episode is not None:
             self._write(EPISODES, episode)
         self._write(RESULTS, result)
         self.results[key] = dict(result)
 
     def _write(self, name: str, record: Mapping[str, Any]) -> None:
-        data = (safeio.dump_json(dict(record)) + "\n").encode()
+        encoded = (safeio.dump_json(dict(record)) + "\n").encode()
         try:
-            written = os.write(self._files[name], data)
-            while written < len(data):  # a full disk or a signal can cut a write short
-                written += os.write(self._files[name], data[written:])
+            written = os.write(self._files[name], encoded)
+            while written < len(encoded):  # a full disk or a signal can cut a write short
+                written += os.write(self._files[name], encoded[written:])
             os.fsync(self._files[name])
         except OSError as error:
             path = self.folder / name
             raise StoreError(f"{path}: cannot be written: {error.strerror}; make room and run again") from None
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Close the files and release the lock."""
         for descriptor in (*self._files.values(), self._lock):
             os.close(descriptor)
         self._files, self._lock = {}, -1
@@ -149,13 +151,15 @@ def _check_content(folder: Path, run: Mapping[str, Any], what: str) -> None:
         if (folder / RESULTS).exists():
             raise StoreError(f"{folder}: has {RESULTS} but no {RUN}; choose another folder with --out")
         return
-    before = read_run(folder)
-    if before["identity"] == run["identity"]:
+    existing = read_run(folder)
+    if existing["identity"] == run["identity"]:
         return
-    old, new = before.get("suite", {}), run.get("suite", {})
-    changed = sorted(k for k in {*old, *new} if old.get(k) != new.get(k)) or ["the code, a system or a town"]
+    old_suite, new_suite = existing.get("suite", {}), run.get("suite", {})
+    changed = sorted(key for key in {*old_suite, *new_suite} if old_suite.get(key) != new_suite.get(key)) or [
+        "the code, a system or a town"
+    ]
     raise StoreError(
-        f"{folder}: holds another run (suite {old.get('name')}; differs in {', '.join(changed)}); "
+        f"{folder}: holds another run (suite {old_suite.get('name')}; differs in {', '.join(changed)}); "
         f"choose another folder{' with --out' if what == 'ssad run' else ''} or remove this one"
     )
 

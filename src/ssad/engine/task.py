@@ -1,4 +1,4 @@
-"""Pieces of work and what becomes of them: what a pool is given and what it gives back."""
+"""Tasks and their outcomes: the input and output of a pool."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ class Task:
     """One call in a worker process: `function(argument)`.
 
     Args:
-        function: a function of a module (not a lambda), so that another process can import it.
-        argument: what it is called with; it and the result are pickled on their way.
-        timeout_s: seconds after which the worker is ended; the time to start a worker does not count.
-        label: what the caller knows the task by; it stays in this process.
+        function: A function of a module (not a lambda), so that another process can import it.
+        argument: Argument of the call; it and the result are pickled for the transfer.
+        timeout_s: Time after which the worker is killed, s; the start of the worker does not count.
+        label: Identifies the task for the caller; it stays in this process.
     """
 
     function: Callable[[Any], Any]
@@ -28,15 +28,16 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a task ended.
+    """Outcome of a task.
 
     Attributes:
-        task: the task.
-        status: ok; failed: it raised; timeout; crashed: its process ended, by itself, by a signal, or for memory.
-        value: what the function returned.
-        reason: why it did not end well, one line.
-        error: the `SSADError` that it raised, if it was one.
-        seconds: wall time in the worker.
+        task: The task.
+        status: ok; failed: it raised; timeout; crashed: its process ended, by itself, by a signal, or for lack
+            of memory.
+        value: Return value of the function.
+        reason: Cause of a failure, one line.
+        error: The `SSADError` that the function raised, if any.
+        seconds: Wall time in the worker.
     """
 
     task: Task
@@ -48,25 +49,25 @@ class Outcome:
 
 
 class Backend(Protocol):
-    """Where tasks run: processes of this machine, a cluster, or this very process. A context manager's `close`."""
+    """Execution of tasks: processes of this machine, a cluster, or the calling process. `close` ends it."""
 
     @property
     def capacity(self) -> int:
-        """How many tasks it wants at hand at a time."""
+        """Number of tasks that the backend accepts at a time."""
 
     @property
     def busy(self) -> int:
-        """How many it has now."""
+        """Number of submitted tasks without an outcome."""
 
     def submit(self, task: Task) -> None:
-        """Take a task; only while `busy` is below `capacity`."""
+        """Submit a task; call only while `busy` is below `capacity`."""
 
     def wait(self, seconds: float) -> Sequence[Outcome]:
-        """What has ended, after so many seconds at the latest.
+        """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:
             SSADError: No worker can start.
         """
 
     def close(self) -> None:
-        """End all that runs."""
+        """End all running tasks."""

@@ -1,8 +1,8 @@
-"""The child process that does the work: `python -m ssad.engine.worker IN OUT`, two file descriptors of pipes.
+"""Child process that runs tasks: `python -m ssad.jobs.worker IN OUT`, two file descriptors of pipes.
 
-In come (import path, whether there is a start) once, then (function, argument) pairs, the start first. Out go (kind,
-value) pairs: "ready"; "value"; "error", the exception of a user's mistake or a line of text; "fatal", it cannot start.
-What the work prints goes to the process's own standard error, so it cannot disturb the answers.
+Input: (import path, whether a start follows) once, then (function, argument) pairs, the start first. Output: (kind,
+value) pairs: "ready"; "value"; "error" with the exception of a user's mistake or a line of text; "fatal" if the start
+fails. Tasks print to the standard error of the process, so that they cannot disturb the answers.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from ssad.core.registry import describe
 
 
 def _die_with_parent() -> None:
-    """Ask the kernel to end this process when its parent is killed (Linux; elsewhere end of input does it)."""
+    """Ask the kernel to kill this process when its parent dies (Linux; elsewhere the end of the input does)."""
     with contextlib.suppress(Exception):
+        # 1 is PR_SET_PDEATHSIG of <sys/prctl.h>.
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
@@ -34,7 +35,7 @@ def _read(orders: Connection, received: queue.SimpleQueue[Any]) -> None:
             received.put(orders.recv())
         except (EOFError, OSError):
             os._exit(0)
-        except Exception as error:  # what came cannot be imported here
+        except Exception as error:  # the message cannot be unpickled here, such as for a missing module
             received.put((_raise, describe(error)))
 
 
@@ -46,19 +47,20 @@ def main(orders: int, answers: int) -> None:
     """Serve until the input ends."""
     _die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    reader, out = Connection(orders), Connection(answers)
-    path, starts = reader.recv()
-    sys.path[:] = list(dict.fromkeys([*path, *sys.path]))
+    reader, writer = Connection(orders), Connection(answers)
+    import_path, has_start = reader.recv()
+    sys.path[:] = list(dict.fromkeys([*import_path, *sys.path]))
     received: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    # A thread of its own notices the end of the input while a task runs.
     threading.Thread(target=_read, args=(reader, received), daemon=True).start()
-    if starts:
+    if has_start:
         try:
             function, argument = received.get()
             function(argument)
         except Exception as error:
-            out.send(("fatal", str(error) if isinstance(error, SSADError) else describe(error)))
+            writer.send(("fatal", str(error) if isinstance(error, SSADError) else describe(error)))
             return
-    out.send(("ready", None))
+    writer.send(("ready", None))
     while True:
         function, argument = received.get()
         try:
@@ -68,9 +70,9 @@ def main(orders: int, answers: int) -> None:
         except (Exception, SystemExit) as error:
             message = ("error", describe(error))
         try:
-            out.send(message)
-        except Exception as error:  # whatever pickling raises
-            out.send(("error", f"the result cannot be handed over: {describe(error)}"))
+            writer.send(message)
+        except Exception as error:  # pickling can raise any exception
+            writer.send(("error", f"the result cannot be handed over: {describe(error)}"))
 
 
 if __name__ == "__main__":

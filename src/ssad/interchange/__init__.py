@@ -1,1 +1,1 @@
-"""Other simulators and formats, behind the protocols of SSAD."""
+"""Other simulators and scenario formats, behind the protocols of SSAD."""

@@ -1,6 +1,6 @@
-"""CommonRoad's lanelets, signs, lights and intersections as a lane graph: of what `commonroad_lanes` writes, the same.
+"""CommonRoad's lanelets, signs, lights and intersections as a lane graph; the inverse of `commonroad_lanes`.
 
-The middle of its bounds is the centre line of a lane, and what lies side by side is a road.
+The middle of its bounds is the centre line of a lane, and lanes side by side form a road.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from ssad.interchange.commonroad_xml import Texts
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-SPEED: Final = 50.0 / 3.6  # m/s where no sign tells another limit
+SPEED: Final = 50.0 / 3.6  # m/s without a sign
 MAX_LANELETS: Final = 20_000
 _TURNS = ("Right", "Straight", "Left")
 _ASKEW = math.radians(15.0)
-_MIN_STEP = 1e-3  # m between points of a lane that are kept
+_MIN_STEP = 1e-3  # m between points of a lane; closer ones are dropped
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class ReadLanes:
     Attributes:
         graph: Their lane graph.
         lane_of: Id of a lanelet -> its lane.
-        states: Number of a signal -> the one state that its light always shows.
-        cycles: How many lights change.
+        states: Number of a signal -> the state that its light shows permanently.
+        cycles: Number of lights that change.
     """
 
     graph: LaneGraph
@@ -47,35 +47,40 @@ class ReadLanes:
 
 
 def read_lanes(root: Element, texts: Texts, name: str, lost: Counter[str]) -> ReadLanes:
-    """The lane graph of a file's lanelets.
+    """Build the lane graph of a file's lanelets.
 
     Args:
         root: The document.
         texts: Reads its texts.
-        name: What the town is called.
-        lost: Takes what is not carried over.
+        name: Name of the town.
+        lost: Counter of the features that are not carried over.
 
     Raises:
-        FormatError: Lanelets are broken, or refer to what there is not.
-        MapError: They make no town.
+        FormatError: Lanelets are broken, or have dangling references.
+        MapError: They form no valid town.
     """
     elements = root.findall("lanelet")
     if not elements:
         raise texts.fail("commonRoad", "it has no lanelet")
     if len(elements) > MAX_LANELETS:
         raise texts.fail("commonRoad", f"{len(elements)} lanelets, at most {MAX_LANELETS}")
-    kinds = {id(e): [t.text or "" for t in e.iterfind("laneletType")] for e in elements}
-    walks = [e for e in elements if "crosswalk" in kinds[id(e)]]
-    lanes = [e for e in elements if "crosswalk" not in kinds[id(e)]]
-    if not lanes:
+    types_by_element = {
+        id(lanelet): [type_element.text or "" for type_element in lanelet.iterfind("laneletType")]
+        for lanelet in elements
+    }
+    crosswalks = [lanelet for lanelet in elements if "crosswalk" in types_by_element[id(lanelet)]]
+    lanelets = [lanelet for lanelet in elements if "crosswalk" not in types_by_element[id(lanelet)]]
+    if not lanelets:
         raise texts.fail("commonRoad", "it has no lanelet but crosswalks")
     lane_of: dict[int, int] = {}
-    for k, element in enumerate(lanes):
-        number = texts.whole(element.get("id"), element, "id")
-        if number in lane_of:
+    for lane_index, element in enumerate(lanelets):
+        lanelet_id = texts.whole(element.get("id"), element, "id")
+        if lanelet_id in lane_of:
             raise texts.fail(element, "there are two of this id")
-        lane_of[number] = k
-    return _Lanes(texts, lost, lanes, lane_of, [kinds[id(e)] for e in lanes]).read(root, name, walks)
+        lane_of[lanelet_id] = lane_index
+    return _Lanes(texts, lost, lanelets, lane_of, [types_by_element[id(lanelet)] for lanelet in lanelets]).read(
+        root, name, crosswalks
+    )
 
 
 class _Lanes:
@@ -87,23 +92,24 @@ class _Lanes:
     def read(self, root: Element, name: str, walks: list[Element]) -> ReadLanes:
         shapes = self.shapes = [self._shape(element) for element in self.lanes]
         count = len(shapes)
-        left, right, road, hand = self._beside()
-        follow = [self._lane_refs(element, "successor") for element in self.lanes]
-        for k, element in enumerate(self.lanes):
-            for before in self._lane_refs(element, "predecessor"):
-                if k not in follow[before]:
-                    follow[before].append(k)
-        junction = self._junctions(root, follow)
-        marks = [self._marks(element) for element in self.lanes]
-        limits = self._limits(root)
-        places = [
+        left, right, road, direction = self._beside()
+        successors = [self._lane_refs(element, "successor") for element in self.lanes]
+        for lane_index, element in enumerate(self.lanes):
+            for predecessor in self._lane_refs(element, "predecessor"):
+                # A file may give a link at one of its ends only.
+                if lane_index not in successors[predecessor]:
+                    successors[predecessor].append(lane_index)
+        junction = self._junctions(root, successors)
+        markings = [self._marks(element) for element in self.lanes]
+        speed_limits = self._limits(root)
+        outlines = [
             np.concatenate(
                 [
-                    self.texts.points(w.find("leftBound"), w, "leftBound"),
-                    self.texts.points(w.find("rightBound"), w, "rightBound")[::-1],
+                    self.texts.points(crosswalk.find("leftBound"), crosswalk, "leftBound"),
+                    self.texts.points(crosswalk.find("rightBound"), crosswalk, "rightBound")[::-1],
                 ]
             )[:, :2]
-            for w in walks
+            for crosswalk in walks
         ]
         self.graph = LaneGraph(
             name=name,
@@ -113,27 +119,27 @@ class _Lanes:
             width=np.concatenate([shape[:, 4] for shape in shapes]).astype(np.float32),
             s=np.concatenate([shape[:, 5] for shape in shapes]).astype(np.float32),
             offset=np.cumsum([0, *(len(shape) for shape in shapes)]).astype(np.int32),
-            kind=np.array([_kind(names) for names in self.kinds], np.uint8),
+            kind=np.array([_kind(type_names) for type_names in self.kinds], np.uint8),
             road=road,
             section=np.zeros(count, np.int32),
-            lane_id=(hand * (np.arange(count) + 1)).astype(np.int32),
+            lane_id=(direction * (np.arange(count) + 1)).astype(np.int32),
             junction=junction,
-            speed_limit=limits,
+            speed_limit=speed_limits,
             left=left,
             right=right,
-            left_marking=np.array([mark[0] for mark in marks], np.uint8),
-            right_marking=np.array([mark[1] for mark in marks], np.uint8),
-            succ_offset=np.cumsum([0, *(len(after) for after in follow)]).astype(np.int32),
-            succ=np.array([k for after in follow for k in after], np.int32),
-            crosswalk_offset=np.cumsum([0, *(len(place) for place in places)]).astype(np.int32),
-            crosswalk_xy=np.concatenate([np.zeros((0, 2)), *places]).astype(np.float32),
+            left_marking=np.array([marking[0] for marking in markings], np.uint8),
+            right_marking=np.array([marking[1] for marking in markings], np.uint8),
+            succ_offset=np.cumsum([0, *(len(lane_successors) for lane_successors in successors)]).astype(np.int32),
+            succ=np.array([lane_index for lane_successors in successors for lane_index in lane_successors], np.int32),
+            crosswalk_offset=np.cumsum([0, *(len(outline) for outline in outlines)]).astype(np.int32),
+            crosswalk_xy=np.concatenate([np.zeros((0, 2)), *outlines]).astype(np.float32),
             **self._signs(root, shapes, "trafficSign"),
-            **self._signals(root, shapes, junction, follow),
+            **self._signals(root, shapes, junction, successors),
         )
         return ReadLanes(self.graph, self.lane_of, self.states, self.cycles)
 
     def _shape(self, element: Element) -> F64:
-        """[N, 6] x, y, z, yaw, width, s of a lanelet."""
+        """Return [N, 6] x, y, z, yaw, width, s of a lanelet."""
         sides = [self.texts.points(element.find(tag), element, tag) for tag in ("leftBound", "rightBound")]
         if min(len(side) for side in sides) < 2:
             raise self.texts.fail(element, "a bound has fewer than two points")
@@ -141,107 +147,119 @@ class _Lanes:
             self.lost["lanelets whose bounds have different numbers of points are resampled"] += 1
             sides = [_resampled(side, max(map(len, sides))) for side in sides]
         middle = 0.5 * (sides[0] + sides[1])
-        apart = np.hypot(*np.diff(middle[:, :2], axis=0).T)
-        kept = np.concatenate([[True], apart > _MIN_STEP])
-        sides, middle = [side[kept] for side in sides], middle[kept]
+        spacing = np.hypot(*np.diff(middle[:, :2], axis=0).T)
+        is_distinct = np.concatenate([[True], spacing > _MIN_STEP])
+        sides, middle = [side[is_distinct] for side in sides], middle[is_distinct]
         if len(middle) < 2:
             raise self.texts.fail(element, "its points all lie in one place")
-        run = np.gradient(middle[:, :2], axis=0)
-        along = np.unwrap(np.arctan2(run[:, 1], run[:, 0]))
+        tangent = np.gradient(middle[:, :2], axis=0)
+        path_heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
         across = (sides[0] - sides[1])[:, :2]
         width = np.hypot(*across.T)
-        # bounds that lie just across each other tell the heading itself
-        square = np.arctan2(across[:, 1], across[:, 0]) - 0.5 * np.pi
-        off = np.asarray(wrap_angle(square - along))
-        yaw = np.where((np.abs(off) < _ASKEW) & (width > 0.01), along + off, along)
-        half = np.maximum(0.5 * np.abs(np.diff(yaw)), 1e-6)
-        step = np.hypot(*np.diff(middle[:, :2], axis=0).T) * np.where(half < 1.0, half / np.sin(half), 1.0)
-        s = np.concatenate([[0.0], np.cumsum(step)])
+        # where the bounds lie straight across from each other, the line between them gives the heading exactly
+        bound_heading = np.arctan2(across[:, 1], across[:, 0]) - 0.5 * np.pi
+        heading_error = np.asarray(wrap_angle(bound_heading - path_heading))
+        yaw = np.where((np.abs(heading_error) < _ASKEW) & (width > 0.01), path_heading + heading_error, path_heading)
+        # Arc length of the circle through both points: the chord times half the turn over its sine.
+        half_turn = np.maximum(0.5 * np.abs(np.diff(yaw)), 1e-6)
+        arc_steps = np.hypot(*np.diff(middle[:, :2], axis=0).T) * np.where(
+            half_turn < 1.0, half_turn / np.sin(half_turn), 1.0
+        )
+        s = np.concatenate([[0.0], np.cumsum(arc_steps)])
         return np.column_stack([middle, yaw, width, s])
 
     def _lane_refs(self, element: Element, tag: str) -> list[int]:
-        found = []
-        for ref in self.texts.ids(element, tag):
-            if ref not in self.lane_of:
-                raise self.texts.fail(element, f"{tag} {ref}: there is no such lanelet")
-            found.append(self.lane_of[ref])
-        return found
+        lanes = []
+        for lanelet_id in self.texts.ids(element, tag):
+            if lanelet_id not in self.lane_of:
+                raise self.texts.fail(element, f"{tag} {lanelet_id}: there is no such lanelet")
+            lanes.append(self.lane_of[lanelet_id])
+        return lanes
 
     def _beside(self) -> tuple[Any, Any, Any, Any]:
-        """Lanes to the left and right, and the road (lanes side by side) and hand (direction in it) of each lane."""
+        """Return the lanes to the left and right, and the road (lanes side by side) and direction of each lane."""
         count = len(self.lanes)
         sides = np.full((2, count), -1, np.int32)
-        joined: list[list[tuple[int, int]]] = [[] for _ in range(count)]
-        for k, element in enumerate(self.lanes):
-            for side, tag in enumerate(("adjacentLeft", "adjacentRight")):
-                for other, item in zip(self._lane_refs(element, tag), element.iterfind(tag), strict=True):
-                    sign = -1 if item.get("drivingDir") == "opposite" else 1
-                    sides[side, k] = other
-                    joined[k].append((other, sign))
-                    joined[other].append((k, sign))
-        road, hand = np.full(count, -1, np.int32), np.ones(count, np.int32)
-        for first in range(count):
-            if road[first] >= 0:
+        neighbours: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+        for lane_index, element in enumerate(self.lanes):
+            for side_index, tag in enumerate(("adjacentLeft", "adjacentRight")):
+                for neighbour, reference in zip(self._lane_refs(element, tag), element.iterfind(tag), strict=True):
+                    sign = -1 if reference.get("drivingDir") == "opposite" else 1
+                    sides[side_index, lane_index] = neighbour
+                    neighbours[lane_index].append((neighbour, sign))
+                    neighbours[neighbour].append((lane_index, sign))
+        road, direction = np.full(count, -1, np.int32), np.ones(count, np.int32)
+        # Lanes that are connected by adjacency form one road: flood fill from each lane without a road.
+        for root_lane in range(count):
+            if road[root_lane] >= 0:
                 continue
-            road[first], waiting = first, [first]
-            while waiting:
-                k = waiting.pop()
-                for other, sign in joined[k]:
-                    if road[other] < 0:
-                        road[other], hand[other] = first, hand[k] * sign
-                        waiting.append(other)
-        return sides[0], sides[1], road, -hand
+            road[root_lane], pending = root_lane, [root_lane]
+            while pending:
+                lane_index = pending.pop()
+                for neighbour, sign in neighbours[lane_index]:
+                    if road[neighbour] < 0:
+                        road[neighbour], direction[neighbour] = root_lane, direction[lane_index] * sign
+                        pending.append(neighbour)
+        return sides[0], sides[1], road, -direction
 
     def _marks(self, element: Element) -> tuple[Marking, Marking]:
-        found = []
+        markings = []
         for tag in ("leftBound", "rightBound"):
-            told = element.findtext(f"{tag}/lineMarking") or "no_marking"
-            found.append(xml.MARKING_OF.get(told.strip(), Marking.OTHER))
-        return found[0], found[1]
+            marking_name = element.findtext(f"{tag}/lineMarking") or "no_marking"
+            markings.append(xml.MARKING_OF.get(marking_name.strip(), Marking.OTHER))
+        return markings[0], markings[1]
 
     def _junctions(self, root: Element, follow: list[list[int]]) -> Any:
         junction = np.full(len(self.lanes), -1, np.int32)
-        for k, element in enumerate(root.iterfind("intersection")):
+        for junction_index, element in enumerate(root.iterfind("intersection")):
             for incoming in element.iterfind("incoming"):
-                waiting = [
-                    n for t in ("Right", "Straight", "Left") for n in self._lane_refs(incoming, f"successors{t}")
+                pending = [
+                    successor
+                    for direction in ("Right", "Straight", "Left")
+                    for successor in self._lane_refs(incoming, f"successors{direction}")
                 ]
-                while waiting:
-                    lane = waiting.pop()
+                while pending:
+                    lane = pending.pop()
                     if junction[lane] < 0:
-                        junction[lane] = k
-                        waiting += [n for n in follow[lane] if "intersection" in self.kinds[n]]
+                        junction[lane] = junction_index
+                        pending += [successor for successor in follow[lane] if "intersection" in self.kinds[successor]]
         return junction
 
     def _limits(self, root: Element) -> Any:
-        told: dict[int, float] = {}
+        limit_by_sign: dict[int, float] = {}
         for sign in root.iterfind("trafficSign"):
-            for part in sign.iterfind("trafficSignElement"):
-                if part.findtext("trafficSignID") in (xml.TOP_SPEED, "R2-1"):
-                    told[self.texts.whole(sign.get("id"), sign, "id")] = self.texts.number(
-                        part.findtext("additionalValue"), sign, "additionalValue"
+            for sign_element in sign.iterfind("trafficSignElement"):
+                if sign_element.findtext("trafficSignID") in (xml.TOP_SPEED, "R2-1"):
+                    limit_by_sign[self.texts.whole(sign.get("id"), sign, "id")] = self.texts.number(
+                        sign_element.findtext("additionalValue"), sign, "additionalValue"
                     )
-        limits = np.full(len(self.lanes), SPEED, np.float32)
-        for k, element in enumerate(self.lanes):
-            speeds = [told[ref] for ref in self.texts.ids(element, "trafficSignRef") if ref in told]
+        speed_limits = np.full(len(self.lanes), SPEED, np.float32)
+        for lane_index, element in enumerate(self.lanes):
+            speeds = [
+                limit_by_sign[sign_id]
+                for sign_id in self.texts.ids(element, "trafficSignRef")
+                if sign_id in limit_by_sign
+            ]
             if speeds and not min(speeds) > 0.0:
                 raise self.texts.fail(element, f"its speed limit is {min(speeds):g} m/s")
-            limits[k] = min(speeds, default=SPEED)
-        return limits
+            speed_limits[lane_index] = min(speeds, default=SPEED)
+        return speed_limits
 
     def _ruled(self, tag: str) -> dict[int, list[tuple[int, float | None]]]:
-        """Id of a sign or light -> lanes that refer to it, and the arc length of their stop line if they have one."""
-        found: dict[int, list[tuple[int, float | None]]] = defaultdict(list)
+        """Return id of a sign or light -> lanes that refer to it, and the arc length of their stop line or None."""
+        lanes_by_id: dict[int, list[tuple[int, float | None]]] = defaultdict(list)
         for lane, element in enumerate(self.lanes):
-            line = element.find("stopLine")
-            xy = None
-            if line is not None:
-                corners = self.texts.points(line, element, "stopLine")[:, :2]
-                xy = corners.mean(0) if len(corners) else None
-            refs = {*self.texts.ids(element, tag), *(self.texts.ids(line, tag) if line is not None else ())}
-            for ref in sorted(refs):
-                found[ref].append((lane, None if xy is None else _project(self.shapes[lane], xy)))
-        return found
+            stop_line = element.find("stopLine")
+            stop_position = None
+            if stop_line is not None:
+                corners = self.texts.points(stop_line, element, "stopLine")[:, :2]
+                stop_position = corners.mean(0) if len(corners) else None
+            refs = {*self.texts.ids(element, tag), *(self.texts.ids(stop_line, tag) if stop_line is not None else ())}
+            for reference in sorted(refs):
+                lanes_by_id[reference].append(
+                    (lane, None if stop_position is None else _project(self.shapes[lane], stop_position))
+                )
+        return lanes_by_id
 
     def _place(self, element: Element, fallback: F64) -> F64:
         position = element.find("position")
@@ -249,35 +267,37 @@ class _Lanes:
         return xy[0] if len(xy) else fallback
 
     def _signs(self, root: Element, shapes: list[F64], tag: str) -> dict[str, Any]:
-        ruled = self._ruled(f"{tag}Ref")
-        kinds: list[SignKind] = []
-        places, yaws, rules = [], [], []
+        lanes_by_sign = self._ruled(f"{tag}Ref")
+        sign_kinds: list[SignKind] = []
+        positions, yaws, rule_rows = [], [], []
         for sign in root.iterfind(tag):
-            names = [part.findtext("trafficSignID") or "" for part in sign.iterfind("trafficSignElement")]
-            lanes = ruled.get(self.texts.whole(sign.get("id"), sign, "id"), [])
+            sign_names = [
+                sign_element.findtext("trafficSignID") or "" for sign_element in sign.iterfind("trafficSignElement")
+            ]
+            lanes = lanes_by_sign.get(self.texts.whole(sign.get("id"), sign, "id"), [])
             kind = next(
                 (
-                    SignKind.STOP if n in (xml.STOP, "R1-1") else SignKind.YIELD
-                    for n in names
-                    if n in (xml.STOP, xml.YIELD, "R1-1", "R1-2")
+                    SignKind.STOP if sign_name in (xml.STOP, "R1-1") else SignKind.YIELD
+                    for sign_name in sign_names
+                    if sign_name in (xml.STOP, xml.YIELD, "R1-1", "R1-2")
                 ),
                 None,
             )
-            other = sorted(set(names) - {xml.STOP, xml.YIELD, xml.TOP_SPEED, "R1-1", "R1-2", "R2-1"})
-            for name in other:
+            unsupported = sorted(set(sign_names) - {xml.STOP, xml.YIELD, xml.TOP_SPEED, "R1-1", "R1-2", "R2-1"})
+            for name in unsupported:
                 self.lost[f"traffic sign {name[:20]}"] += 1
             if kind is None or not lanes:
                 continue
             end = shapes[lanes[0][0]][-1]
             for lane, s in lanes:
-                rules.append((len(kinds), lane, shapes[lane][-1, 5] if s is None else s))
-            kinds.append(kind)
-            places.append(self._place(sign, end[:2]))
+                rule_rows.append((len(sign_kinds), lane, shapes[lane][-1, 5] if s is None else s))
+            sign_kinds.append(kind)
+            positions.append(self._place(sign, end[:2]))
             yaws.append(float(wrap_angle(end[3])))
-        table = np.array(rules, np.float64).reshape(-1, 3)
+        table = np.array(rule_rows, np.float64).reshape(-1, 3)
         return {
-            "sign_kind": np.array(kinds, np.uint8),
-            "sign_xy": np.array(places).reshape(-1, 2),
+            "sign_kind": np.array(sign_kinds, np.uint8),
+            "sign_xy": np.array(positions).reshape(-1, 2),
             "sign_yaw": np.array(yaws),
             "rule_sign": table[:, 0],
             "rule_lane": table[:, 1],
@@ -285,42 +305,47 @@ class _Lanes:
         }
 
     def _signals(self, root: Element, shapes: list[F64], junction: Any, follow: list[list[int]]) -> dict[str, Any]:
-        ruled = self._ruled("trafficLightRef")
+        lanes_by_light = self._ruled("trafficLightRef")
         self.states: dict[int, SignalState] = {}
         self.cycles = 0
-        rows: list[tuple[float, ...]] = []
-        stops: list[tuple[int, int, float]] = []
+        signal_rows: list[tuple[float, ...]] = []
+        stop_rows: list[tuple[int, int, float]] = []
         phases: dict[tuple[tuple[int, str], ...], int] = {}
         for light in root.iterfind("trafficLight"):
-            lanes = ruled.get(self.texts.whole(light.get("id"), light, "id"), [])
+            lanes = lanes_by_light.get(self.texts.whole(light.get("id"), light, "id"), [])
             cycle = self._cycle(light)
             if not lanes:
                 self.lost["traffic lights that no lanelet refers to"] += 1
                 continue
-            number = len(rows)
+            signal_number = len(signal_rows)
             if len({state for _, state in cycle[:-1]}) == 1:
-                self.states[number] = xml.STATE_OF[cycle[0][1]]
+                self.states[signal_number] = xml.STATE_OF[cycle[0][1]]
             else:
                 self.cycles += 1
             end = shapes[lanes[0][0]][-1]
-            inside = next((int(junction[n]) for n in follow[lanes[0][0]] if junction[n] >= 0), -1)
+            junction_index = next(
+                (int(junction[successor]) for successor in follow[lanes[0][0]] if junction[successor] >= 0), -1
+            )
             phase = phases.setdefault(cycle, len(phases))
-            rows.append((*self._place(light, end[:2]), float(wrap_angle(end[3])), inside, phase))
-            stops += [(number, lane, shapes[lane][-1, 5] if s is None else s) for lane, s in lanes]
-        table, line = np.array(rows, np.float64).reshape(-1, 5), np.array(stops, np.float64).reshape(-1, 3)
+            signal_rows.append((*self._place(light, end[:2]), float(wrap_angle(end[3])), junction_index, phase))
+            stop_rows += [(signal_number, lane, shapes[lane][-1, 5] if s is None else s) for lane, s in lanes]
+        table, stop_table = (
+            np.array(signal_rows, np.float64).reshape(-1, 5),
+            np.array(stop_rows, np.float64).reshape(-1, 3),
+        )
         return {
             "signal_xy": table[:, :2],
             "signal_yaw": table[:, 2],
             "signal_junction": table[:, 3],
             "signal_phase": table[:, 4],
             "signal_virtual": np.zeros(len(table), bool),
-            "stop_signal": line[:, 0],
-            "stop_lane": line[:, 1],
-            "stop_s": line[:, 2],
+            "stop_signal": stop_table[:, 0],
+            "stop_lane": stop_table[:, 1],
+            "stop_s": stop_table[:, 2],
         }
 
     def _cycle(self, light: Element) -> tuple[tuple[int, str], ...]:
-        """Duration in steps and colour of the parts of a cycle, and its offset."""
+        """Return duration in steps and colour of each part of a cycle, followed by its offset."""
         parts = []
         for part in light.iterfind("cycle/cycleElement"):
             colour = (part.findtext("color") or "").strip()
@@ -333,18 +358,22 @@ class _Lanes:
 
 
 def _kind(names: list[str]) -> LaneType:
-    told = [xml.LANE_TYPE_OF.get(name.strip(), LaneType.DRIVING) for name in names if name.strip() != "intersection"]
-    return told[0] if told else LaneType.DRIVING
+    lane_types = [
+        xml.LANE_TYPE_OF.get(name.strip(), LaneType.DRIVING) for name in names if name.strip() != "intersection"
+    ]
+    return lane_types[0] if lane_types else LaneType.DRIVING
 
 
 def _resampled(side: F64, count: int) -> F64:
-    u = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(side[:, :2], axis=0).T))])
-    at = np.linspace(0.0, u[-1], count)
-    return np.stack([np.interp(at, u, side[:, k]) for k in range(3)], 1)
+    distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(side[:, :2], axis=0).T))])
+    sample_distances = np.linspace(0.0, distances[-1], count)
+    return np.stack([np.interp(sample_distances, distances, side[:, axis]) for axis in range(3)], 1)
 
 
 def _project(shape: F64, xy: F64) -> float:
-    a, d = shape[:-1, :2], np.diff(shape[:, :2], axis=0)
-    t = np.clip(((xy - a) * d).sum(1) / np.maximum((d**2).sum(1), 1e-12), 0.0, 1.0)
-    i = int(np.argmin(((a + t[:, None] * d - xy) ** 2).sum(1)))
-    return float(shape[i, 5] + t[i] * (shape[i + 1, 5] - shape[i, 5]))
+    segment_starts, segment_vectors = shape[:-1, :2], np.diff(shape[:, :2], axis=0)
+    fraction = np.clip(
+        ((xy - segment_starts) * segment_vectors).sum(1) / np.maximum((segment_vectors**2).sum(1), 1e-12), 0.0, 1.0
+    )
+    nearest = int(np.argmin(((segment_starts + fraction[:, None] * segment_vectors - xy) ** 2).sum(1)))
+    return float(shape[nearest, 5] + fraction[nearest] * (shape[nearest + 1, 5] - shape[nearest, 5]))

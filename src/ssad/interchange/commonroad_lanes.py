@@ -1,7 +1,7 @@
 """A lane graph as CommonRoad's lanelets, signs, lights and intersections.
 
-A lanelet is one lane of the graph, also sidewalks, shoulders and crosswalks; its bounds are its centre line, half its
-width to either side.
+A lanelet is one lane of the graph, also sidewalks, shoulders and crosswalks; its bounds are its centre line moved by
+half its width to either side.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ssad.world.episode_arrays import signal_programs
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-FLAT: Final = 0.5  # m between the lowest and the highest point of a town whose heights are not written
+FLAT: Final = 0.5  # m between the lowest and highest point of a town that is written without heights
 _TURN = math.radians(25.0)
 
 
@@ -42,34 +42,49 @@ def write_lanes(
     Returns:
         The next free id, and what is not carried over.
     """
-    numbers = _Numbers(number)
-    speeds = {speed: numbers.new() for speed in sorted({float(v) for v in graph.speed_limit})}
-    lit = [k for k in range(len(graph.signal_phase)) if not graph.signal_virtual[k] or k in forced]
-    lights = {k: numbers.new() for k in lit}
-    signs = {k: numbers.new() for k in range(len(graph.sign_kind))}
+    ids = _Numbers(number)
+    speed_sign_ids = {speed: ids.new() for speed in sorted({float(limit) for limit in graph.speed_limit})}
+    signal_indices = [
+        index for index in range(len(graph.signal_phase)) if not graph.signal_virtual[index] or index in forced
+    ]
+    light_ids = {index: ids.new() for index in signal_indices}
+    sign_ids = {index: ids.new() for index in range(len(graph.sign_kind))}
     lane_lights: dict[int, list[tuple[float, int]]] = defaultdict(list)
     lane_signs: dict[int, list[tuple[float, int]]] = defaultdict(list)
     for signal, lane, s in zip(graph.stop_signal.tolist(), graph.stop_lane.tolist(), graph.stop_s, strict=True):
-        if signal in lights:
-            lane_lights[lane].append((float(s), lights[signal]))
-    for sign, lane, s in zip(graph.rule_sign.tolist(), graph.rule_lane.tolist(), graph.rule_s, strict=True):
-        lane_signs[lane].append((float(s), signs[sign]))
-    high = float(np.ptp(graph.z)) > FLAT
+        if signal in light_ids:
+            lane_lights[lane].append((float(s), light_ids[signal]))
+    for sign_index, lane, s in zip(graph.rule_sign.tolist(), graph.rule_lane.tolist(), graph.rule_s, strict=True):
+        lane_signs[lane].append((float(s), sign_ids[sign_index]))
+    with_heights = float(np.ptp(graph.z)) > FLAT
     for lane in range(graph.lanes):
-        _lanelet(root, graph, lane, speeds[float(graph.speed_limit[lane])], lane_lights[lane], lane_signs[lane], high)
-    for k in range(len(graph.crosswalk_offset) - 1):
-        _crosswalk(root, graph, k, numbers.new())
-    for speed, sign in speeds.items():
-        _sign(root, sign, xml.TOP_SPEED, graph.xy[0].tolist(), speed)
-    for k, sign in signs.items():
-        _sign(root, sign, xml.STOP if graph.sign_kind[k] == SignKind.STOP else xml.YIELD, graph.sign_xy[k].tolist())
+        _lanelet(
+            root,
+            graph,
+            lane,
+            speed_sign_ids[float(graph.speed_limit[lane])],
+            lane_lights[lane],
+            lane_signs[lane],
+            with_heights,
+        )
+    for index in range(len(graph.crosswalk_offset) - 1):
+        _crosswalk(root, graph, index, ids.new())
+    for speed, sign_index in speed_sign_ids.items():
+        _sign(root, sign_index, xml.TOP_SPEED, graph.xy[0].tolist(), speed)
+    for index, sign_index in sign_ids.items():
+        _sign(
+            root,
+            sign_index,
+            xml.STOP if graph.sign_kind[index] == SignKind.STOP else xml.YIELD,
+            graph.sign_xy[index].tolist(),
+        )
     programs = signal_programs(graph)
-    for k, light in lights.items():
-        _light(root, light, graph.signal_xy[k], forced.get(k), programs[k].tolist(), dt)
-    _intersections(root, graph, numbers)
-    hidden = len(graph.signal_phase) - len(lit)
-    lost = [f"{hidden} places of signals that the map does not have"] if hidden else []
-    return numbers.next, lost
+    for index, light_id in light_ids.items():
+        _light(root, light_id, graph.signal_xy[index], forced.get(index), programs[index].tolist(), dt)
+    _intersections(root, graph, ids)
+    hidden_count = len(graph.signal_phase) - len(signal_indices)
+    omissions = [f"{hidden_count} places of signals that the map does not have"] if hidden_count else []
+    return ids.next, omissions
 
 
 class _Numbers:
@@ -82,11 +97,11 @@ class _Numbers:
 
 
 def _bounds(graph: LaneGraph, lane: int, high: bool) -> list[F64]:
-    part = graph.points(lane)
-    yaw, half = graph.yaw[part].astype(np.float64), 0.5 * graph.width[part].astype(np.float64)
-    normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1) * half[:, None]
-    sides = [graph.xy[part] + sign * normal for sign in (1.0, -1.0)]
-    return [np.column_stack([side, graph.z[part]]) if high else side for side in sides]
+    points_slice = graph.points(lane)
+    yaw, half_width = graph.yaw[points_slice].astype(np.float64), 0.5 * graph.width[points_slice].astype(np.float64)
+    normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1) * half_width[:, None]
+    sides = [graph.xy[points_slice] + sign * normal for sign in (1.0, -1.0)]
+    return [np.column_stack([side, graph.z[points_slice]]) if high else side for side in sides]
 
 
 def _lanelet(  # noqa: PLR0917
@@ -99,52 +114,55 @@ def _lanelet(  # noqa: PLR0917
     high: bool,
 ) -> None:
     element = node(root, "lanelet", id=lane + 1)
-    marks = graph.left_marking[lane], graph.right_marking[lane]
-    for tag, side, mark in zip(("leftBound", "rightBound"), _bounds(graph, lane, high), marks, strict=True):
+    markings = graph.left_marking[lane], graph.right_marking[lane]
+    for tag, bound_points, marking in zip(
+        ("leftBound", "rightBound"), _bounds(graph, lane, high), markings, strict=True
+    ):
         bound = node(element, tag)
-        xml.points(bound, side)
-        node(bound, "lineMarking", xml.MARKINGS[Marking(int(mark))])
-    for tag, others in (("predecessor", graph.predecessors(lane)), ("successor", graph.successors(lane))):
-        for other in others.tolist():
-            node(element, tag, ref=other + 1)
-    for tag, other in (("adjacentLeft", int(graph.left[lane])), ("adjacentRight", int(graph.right[lane]))):
-        if other >= 0:
-            same = graph.same_direction(lane, other)
-            node(element, tag, ref=other + 1, drivingDir="same" if same else "opposite")
+        xml.points(bound, bound_points)
+        node(bound, "lineMarking", xml.MARKINGS[Marking(int(marking))])
+    for tag, neighbours in (("predecessor", graph.predecessors(lane)), ("successor", graph.successors(lane))):
+        for neighbour in neighbours.tolist():
+            node(element, tag, ref=neighbour + 1)
+    for tag, neighbour in (("adjacentLeft", int(graph.left[lane])), ("adjacentRight", int(graph.right[lane]))):
+        if neighbour >= 0:
+            same_direction = graph.same_direction(lane, neighbour)
+            node(element, tag, ref=neighbour + 1, drivingDir="same" if same_direction else "opposite")
     if stops := lights or signs:
         x, y, yaw, width = graph.at(lane, stops[0][0])
-        across = 0.5 * width * np.array([-math.sin(yaw), math.cos(yaw)])
+        half_line = 0.5 * width * np.array([-math.sin(yaw), math.cos(yaw)])
         line = node(element, "stopLine")
-        xml.points(line, [np.array([x, y]) + across, np.array([x, y]) - across])
+        xml.points(line, [np.array([x, y]) + half_line, np.array([x, y]) - half_line])
         node(line, "lineMarking", "solid")
-        for tag, refs in (("trafficSignRef", signs), ("trafficLightRef", lights)):
-            for _, ref in refs:
-                node(line, tag, ref=ref)
+        for tag, references in (("trafficSignRef", signs), ("trafficLightRef", lights)):
+            for _, reference in references:
+                node(line, tag, ref=reference)
     node(element, "laneletType", xml.LANE_TYPES[LaneType(int(graph.kind[lane]))])
     if graph.junction[lane] >= 0:
         node(element, "laneletType", "intersection")
     node(element, "trafficSignRef", ref=speed)
-    for tag, refs in (("trafficSignRef", signs), ("trafficLightRef", lights)):
-        for _, ref in refs:
-            node(element, tag, ref=ref)
+    for tag, references in (("trafficSignRef", signs), ("trafficLightRef", lights)):
+        for _, reference in references:
+            node(element, tag, ref=reference)
 
 
 def _crosswalk(root: Element, graph: LaneGraph, k: int, number: int) -> None:
     corners = graph.crosswalk(k)
     half = len(corners) // 2
     element = node(root, "lanelet", id=number)
-    for tag, side in (("leftBound", corners[:half]), ("rightBound", corners[half:][::-1])):
-        xml.points(node(element, tag), side)
+    # The outline runs around the crosswalk; both bounds must run in one direction.
+    for tag, bound_points in (("leftBound", corners[:half]), ("rightBound", corners[half:][::-1])):
+        xml.points(node(element, tag), bound_points)
     node(element, "laneletType", "crosswalk")
     node(element, "userBidirectional", "pedestrian")
 
 
 def _sign(root: Element, number: int, kind: str, place: list[float], value: float | None = None) -> None:
     sign = node(root, "trafficSign", id=number)
-    part = node(sign, "trafficSignElement")
-    node(part, "trafficSignID", kind)
+    sign_element = node(sign, "trafficSignElement")
+    node(sign_element, "trafficSignID", kind)
     if value is not None:
-        node(part, "additionalValue", value)
+        node(sign_element, "additionalValue", value)
     xml.points(node(sign, "position"), [place])
     node(sign, "virtual", value is not None)
 
@@ -152,39 +170,39 @@ def _sign(root: Element, number: int, kind: str, place: list[float], value: floa
 def _light(  # noqa: PLR0917
     root: Element, number: int, place: Any, state: SignalState | None, program: list[float], dt: float
 ) -> None:
-    cycle, begin, green, yellow = (round(value / dt) for value in program)
-    parts = [(1, state)] if state is not None else []
+    cycle, offset, green, yellow = (round(value / dt) for value in program)
+    cycle_parts = [(1, state)] if state is not None else []
     if state is None:
-        rest = cycle - green - yellow
-        parts = [(green, SignalState.GREEN), (yellow, SignalState.YELLOW), (rest, SignalState.RED)]
+        red_duration = cycle - green - yellow
+        cycle_parts = [(green, SignalState.GREEN), (yellow, SignalState.YELLOW), (red_duration, SignalState.RED)]
     light = node(root, "trafficLight", id=number)
-    told = node(light, "cycle")
-    for duration, shown in parts:
-        element = node(told, "cycleElement")
-        node(element, "duration", duration)
-        node(element, "color", xml.COLOURS[SignalState(int(shown))])
-    if state is None and begin > 0:
-        node(told, "timeOffset", begin)
+    cycle_element = node(light, "cycle")
+    for duration, colour in cycle_parts:
+        cycle_part = node(cycle_element, "cycleElement")
+        node(cycle_part, "duration", duration)
+        node(cycle_part, "color", xml.COLOURS[SignalState(int(colour))])
+    if state is None and offset > 0:
+        node(cycle_element, "timeOffset", offset)
     xml.points(node(light, "position"), [place])
     node(light, "direction", "all")
     node(light, "active", True)
 
 
 def _intersections(root: Element, graph: LaneGraph, numbers: _Numbers) -> None:
-    for junction in sorted({int(n) for n in graph.junction} - {-1}):
-        inner = np.flatnonzero((graph.junction == junction) & (graph.kind == LaneType.DRIVING)).tolist()
-        ways: dict[int, list[int]] = defaultdict(list)
-        for lane in inner:
-            for before in graph.predecessors(lane).tolist():
-                if graph.junction[before] != junction:
-                    ways[before].append(lane)
-        if not ways:
+    for junction in sorted({int(lane_junction) for lane_junction in graph.junction} - {-1}):
+        inner_lanes = np.flatnonzero((graph.junction == junction) & (graph.kind == LaneType.DRIVING)).tolist()
+        lanes_by_entry: dict[int, list[int]] = defaultdict(list)
+        for lane in inner_lanes:
+            for entry_lane in graph.predecessors(lane).tolist():
+                if graph.junction[entry_lane] != junction:
+                    lanes_by_entry[entry_lane].append(lane)
+        if not lanes_by_entry:
             continue
         element = node(root, "intersection", id=numbers.new())
-        for before, lanes in sorted(ways.items()):
+        for entry_lane, following in sorted(lanes_by_entry.items()):
             incoming = node(element, "incoming", id=numbers.new())
-            node(incoming, "incomingLanelet", ref=before + 1)
-            turns = {lane: turn_of(graph, lane) for lane in lanes}
+            node(incoming, "incomingLanelet", ref=entry_lane + 1)
+            turns = {lane: turn_of(graph, lane) for lane in following}
             for tag, low, high in (
                 ("Right", -math.inf, -_TURN),
                 ("Straight", -_TURN, _TURN),

@@ -1,4 +1,4 @@
-"""Obstacles of CommonRoad as actors: who has a trajectory repeats it, whatever happens around it."""
+"""Obstacles of CommonRoad as actors: a trajectory is replayed, whatever happens around it."""
 
 from __future__ import annotations
 
@@ -18,142 +18,144 @@ from ssad.world.models import MODELS
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-OWN: Final = 1.5  # m from the ego's start at which an obstacle is the ego itself
+OWN: Final = 1.5  # m from the ego's start within which an obstacle is the ego's own recording
 _VEHICLES = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE, AgentKind.BICYCLE)
 
 
 class Obstacles:
-    """The obstacles of a document, whose steps last `dt` s; what is only nearly right is counted in `lost`."""
+    """The obstacles of a document whose steps last `dt` s; inexact conversions are counted in `lost`."""
 
     def __init__(self, texts: Texts, lost: Counter[str], dt: float) -> None:
         self.texts, self.lost, self.dt = texts, lost, dt
 
     def read(self, root: Element, start: Pose, limits: Limits) -> tuple[Actor, ...]:
-        """Actors in the order of their ids.
+        """Return the actors in the order of their ids.
 
         Args:
             root: The document.
-            start: Where the ego starts; an obstacle that starts there too is the ego's own recording.
-            limits: When the episode ends.
+            start: Start of the ego; an obstacle that starts there too is the ego's own recording.
+            limits: Limits of the episode.
 
         Raises:
             FormatError: An obstacle is broken.
         """
-        until = min(limits.max_steps * STEP, limits.max_time)
-        found: dict[int, tuple[float, Actor]] = {}
-        seen: set[int] = set()
-        for tag, make in (("staticObstacle", self._static), ("dynamicObstacle", self._dynamic)):
+        end_time = min(limits.max_steps * STEP, limits.max_time)
+        actors: dict[int, tuple[float, Actor]] = {}
+        known_ids: set[int] = set()
+        for tag, convert in (("staticObstacle", self._static), ("dynamicObstacle", self._dynamic)):
             for element in root.iterfind(tag):
-                number = self.texts.whole(element.get("id"), element, "id")
-                if number in seen:
+                obstacle_id = self.texts.whole(element.get("id"), element, "id")
+                if obstacle_id in known_ids:
                     raise self.texts.fail(element, "there are two of this id")
-                seen.add(number)
-                actor = make(element, until)
+                known_ids.add(obstacle_id)
+                actor = convert(element, end_time)
                 if actor is not None and self._is_ego(actor, start):
                     self.lost["an obstacle that is the ego's own recording: it starts where the ego does"] += 1
                 elif actor is not None:
                     rows = np.array(actor.trajectory or [(0.0, actor.pose.x, actor.pose.y, 0.0)])
-                    away = float(np.hypot(rows[:, 1] - start.x, rows[:, 2] - start.y).min())
-                    found[number] = away, actor
-        near = sorted(found, key=lambda number: found[number][0])[: MAX_AGENTS - 1]
-        if left := len(found) - len(near):
-            self.lost[f"{left} obstacles: a scene has room for {MAX_AGENTS - 1}, the nearest to the ego's start"] += 1
-        return tuple(found[number][1] for number in sorted(near))
+                    distance = float(np.hypot(rows[:, 1] - start.x, rows[:, 2] - start.y).min())
+                    actors[obstacle_id] = distance, actor
+        nearest_ids = sorted(actors, key=lambda obstacle_id: actors[obstacle_id][0])[: MAX_AGENTS - 1]
+        if excess := len(actors) - len(nearest_ids):
+            self.lost[f"{excess} obstacles: a scene has room for {MAX_AGENTS - 1}, the nearest to the ego's start"] += 1
+        return tuple(actors[obstacle_id][1] for obstacle_id in sorted(nearest_ids))
 
     @staticmethod
     def _is_ego(actor: Actor, start: Pose) -> bool:
-        """Whether an actor that moves starts just where the ego does."""
+        """Return whether a moving actor starts exactly where the ego does."""
         if not actor.trajectory or actor.trajectory[0][0] > 0.0:
             return False
         _, x, y, yaw = actor.trajectory[0]
         return math.hypot(x - start.x, y - start.y) < OWN and abs(float(wrap_angle(yaw - start.yaw))) < 0.2
 
     def _body(self, element: Element) -> tuple[str, str]:
-        """Type of an obstacle, and the model that plays it."""
-        told = (element.findtext("type") or "").strip()
-        static = element.tag == "staticObstacle"
-        kinds: Sequence[AgentKind] = KINDS_OF.get(told, ())
-        if static:
-            kinds = _VEHICLES if told == "parkedVehicle" else (AgentKind.PROP,)
+        """Return the type of an obstacle, and the model that represents it."""
+        type_name = (element.findtext("type") or "").strip()
+        is_static = element.tag == "staticObstacle"
+        kinds: Sequence[AgentKind] = KINDS_OF.get(type_name, ())
+        if is_static:
+            kinds = _VEHICLES if type_name == "parkedVehicle" else (AgentKind.PROP,)
         if not kinds:
-            raise self.texts.fail(element, f"'{told[:40]}' is no type of obstacle; known: {', '.join(KINDS_OF)}")
+            raise self.texts.fail(element, f"'{type_name[:40]}' is no type of obstacle; known: {', '.join(KINDS_OF)}")
         size = self._size(element)
-        models = [m for m in MODELS.values() if m.kind in kinds]
-        best = min(models, key=lambda m: abs(m.length - size[0]) + abs(m.width - size[1]))
-        if max(abs(best.length - size[0]), abs(best.width - size[1])) > 0.01:
-            self.lost[f"the body of a {told} ({size[0]:.3g} x {size[1]:.3g} m) becomes '{best.name}'"] += 1
-        return told, best.name
+        candidates = [candidate for candidate in MODELS.values() if candidate.kind in kinds]
+        model = min(candidates, key=lambda candidate: abs(candidate.length - size[0]) + abs(candidate.width - size[1]))
+        if max(abs(model.length - size[0]), abs(model.width - size[1])) > 0.01:
+            self.lost[f"the body of a {type_name} ({size[0]:.3g} x {size[1]:.3g} m) becomes '{model.name}'"] += 1
+        return type_name, model.name
 
     def _size(self, element: Element) -> tuple[float, float]:
-        """Length and width, m."""
+        """Return length and width, m."""
         shape = element.find("shape")
         if shape is None or not len(shape):
             raise self.texts.fail(element, "shape is missing")
-        part = shape[0]
-        if part.tag == "rectangle":
-            length, width = (self.texts.number(part.findtext(k), element, k) for k in ("length", "width"))
-        elif part.tag == "circle":
-            length = width = 2.0 * self.texts.number(part.findtext("radius"), element, "radius")
-        elif part.tag == "polygon":
-            corners = self.texts.points(part, element, "polygon")
+        outline = shape[0]
+        if outline.tag == "rectangle":
+            length, width = (
+                self.texts.number(outline.findtext(extent), element, extent) for extent in ("length", "width")
+            )
+        elif outline.tag == "circle":
+            length = width = 2.0 * self.texts.number(outline.findtext("radius"), element, "radius")
+        elif outline.tag == "polygon":
+            corners = self.texts.points(outline, element, "polygon")
             if len(corners) < 3:
                 raise self.texts.fail(element, "its shape is a polygon of fewer than 3 points")
             length, width = np.ptp(corners[:, :2], axis=0).tolist()
         else:
-            raise self.texts.fail(element, f"its shape is a {part.tag[:40]}, which is not read")
+            raise self.texts.fail(element, f"its shape is a {outline.tag[:40]}, which is not read")
         if not (0.0 < length < 1e4 and 0.0 < width < 1e4):
             raise self.texts.fail(element, f"its body is {length:g} x {width:g} m")
-        if part.tag != "rectangle" or part.find("center") is not None or len(shape) > 1:
+        if outline.tag != "rectangle" or outline.find("center") is not None or len(shape) > 1:
             self.lost["bodies that are no rectangle about their middle"] += 1
         return length, width
 
     def _static(self, element: Element, until: float) -> Actor | None:
-        told, body = self._body(element)
+        type_name, model = self._body(element)
         state = element.find("initialState")
         if state is None:
             raise self.texts.fail(element, "initialState is missing")
-        return Actor(f"{told}-{element.get('id')}", body, self.pose(state, element))
+        return Actor(f"{type_name}-{element.get('id')}", model, self.pose(state, element))
 
     def _dynamic(self, element: Element, until: float) -> Actor | None:
-        told, body = self._body(element)
+        type_name, model = self._body(element)
         start = element.find("initialState")
         if start is None:
             raise self.texts.fail(element, "initialState is missing")
-        name = f"{told}-{element.get('id')}"
+        name = f"{type_name}-{element.get('id')}"
         regions = element.findall("occupancySet/occupancy")
         if regions:
             self.lost["occupancy sets: their middles are taken as a trajectory"] += 1
-        rows: dict[float, tuple[float, float, float]] = {}
+        pose_by_time: dict[float, tuple[float, float, float]] = {}
         pose = self.pose(start, element)
         for state in (start, *element.findall("trajectory/state"), *regions):
             time = self.middle(state, "time", element, None) * self.dt
-            last = max(rows, default=-1.0)
-            if time < last:
+            last_time = max(pose_by_time, default=-1.0)
+            if time < last_time:
                 raise self.texts.fail(element, f"time {time / self.dt:g} does not come after the one before it")
-            if time == last:
+            if time == last_time:
                 self.lost["states of a step that has one already"] += 1
                 continue
             pose = self._middle_of(state, element, pose) if state.tag == "occupancy" else self.pose(state, element)
-            rows[time] = pose.x, pose.y, pose.yaw
-        if len(rows) < 2:
-            return Actor(name, body, pose)
-        table = [(round(time, 6), *row) for time, row in rows.items()]
-        if until - 1e-6 <= table[-1][0] <= until + 1e-6:  # it is still there in the last step
+            pose_by_time[time] = pose.x, pose.y, pose.yaw
+        if len(pose_by_time) < 2:
+            return Actor(name, model, pose)
+        table = [(round(time, 6), *row) for time, row in pose_by_time.items()]
+        if until - 1e-6 <= table[-1][0] <= until + 1e-6:  # it exists in the last step, so it must not disappear there
             table.append((until + 1.0, *table[-1][1:]))
-        return Actor(name, body, Pose(*table[0][1:]), trajectory=tuple(table))
+        return Actor(name, model, Pose(*table[0][1:]), trajectory=tuple(table))
 
     def pose(self, state: Element, within: Element) -> Pose:
-        """Where a state is; of a region the middle."""
+        """Return the pose of a state; of a region the middle."""
         position = state.find("position")
         if position is None or not len(position):
             raise self.texts.fail(within, "position is missing")
         if position[0].tag == "point":
             x, y = self.texts.points(position, within, "position")[0, :2].tolist()
         else:
-            told = position[0].find("center")
-            if told is None:
+            centre = position[0].find("center")
+            if centre is None:
                 raise self.texts.fail(within, f"a position that is a {position[0].tag[:40]} is not read")
-            x, y = (self.texts.number(told.findtext(axis), within, f"position: {axis}") for axis in "xy")
+            x, y = (self.texts.number(centre.findtext(axis), within, f"position: {axis}") for axis in "xy")
             self.lost["positions that are regions: their middle is taken"] += 1
         return Pose(x, y, float(wrap_angle(self.middle(state, "orientation", within, None))))
 
@@ -167,13 +169,13 @@ class Obstacles:
             if len(corners) < 3:
                 raise self.texts.fail(within, "an occupancy is a polygon of fewer than 3 points")
             return Pose(float(corners[:, 0].mean()), float(corners[:, 1].mean()), before.yaw)
-        told = [shape[0].findtext(f"center/{axis}", "0") for axis in "xy"]
-        x, y = (self.texts.number(text, within, "occupancy: center") for text in told)
+        coordinates = [shape[0].findtext(f"center/{axis}", "0") for axis in "xy"]
+        x, y = (self.texts.number(text, within, "occupancy: center") for text in coordinates)
         yaw = self.texts.number(shape[0].findtext("orientation", repr(before.yaw)), within, "occupancy: orientation")
         return Pose(x, y, float(wrap_angle(yaw)))
 
     def middle(self, state: Element, tag: str, within: Element, default: float | None) -> float:
-        """A value of a state; of an interval the middle."""
+        """Return a value of a state; of an interval the middle."""
         element = state.find(tag)
         if element is None and default is not None:
             return default

@@ -1,7 +1,7 @@
-"""CommonRoad XML 2020a as a scenario: obstacles repeat their trajectories, the planning problem is driven by the ego.
+"""CommonRoad XML 2020a as a scenario: obstacles replay their trajectories, and the ego gets the planning problem.
 
-Where the lanelets are those of a town here, the scenario takes place in that town; else they become one. Whatever has
-no counterpart is named in `ReadCommonRoad.lost`.
+If the lanelets are those of an existing town, the scenario takes place in that town; else they become a town.
+Features without a counterpart are listed in `ReadCommonRoad.lost`.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 MAX_BYTES: Final = 128 * MIB
-WAY: Final = 200.0  # m along its lane that an ego without a place to reach gets
-ALIKE: Final = 0.01  # m between the lanes of a file and those of a town that count as the same
+WAY: Final = 200.0  # m, length of the route along its lane of an ego without a goal
+ALIKE: Final = 0.01  # m, largest distance between lanes of a file and of a town that count as the same
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ReadCommonRoad:
         scenario: The scenario.
         graph: Its town.
         known: Whether the town can be loaded by its name; else the graph must be stored.
-        lost: What of the file it does not carry, a line each.
+        lost: Features of the file that are not carried over, one line each.
     """
 
     scenario: Scenario
@@ -58,18 +58,18 @@ class ReadCommonRoad:
 
 
 def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None = None) -> ReadCommonRoad:
-    """The scenario of a file.
+    """Read the scenario of a file.
 
     Args:
         path: The file.
-        town: What a town of its lanelets is called; None: as the file.
-        map_name: Town that it takes place in, or a file of it, instead of its lanelets.
+        town: Name for a town made of its lanelets; None: the name of the file.
+        map_name: Its town, or a file of that town, instead of its lanelets.
 
     Raises:
-        FormatError: The file is broken, or is no CommonRoad XML 2020a.
-        MapError, UnknownNameError: Its lanelets make no town, or there is no town of that name.
-        RouteError: The ego's way does not lie on the town's roads.
-        ConfigError: It makes no scenario that can be driven.
+        FormatError: The file is broken, or is not CommonRoad XML 2020a.
+        MapError, UnknownNameError: Its lanelets form no valid town, or the named town does not exist.
+        RouteError: The ego's route does not lie on the town's roads.
+        ConfigError: The scenario cannot be driven.
     """
     root = read_xml(path, limit=MAX_BYTES)
     where = str(path)
@@ -82,8 +82,8 @@ def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None
     try:
         return reader.read(Path(path).stem, town or Path(path).stem, map_name)
     except (MapError, RouteError, ConfigError) as error:
-        text = " ".join(str(error).split())
-        raise type(error)(text if where in text else f"{where}: {text}") from None
+        message = " ".join(str(error).split())
+        raise type(error)(message if where in message else f"{where}: {message}") from None
 
 
 class _Reader:
@@ -97,42 +97,45 @@ class _Reader:
         self.obstacles = Obstacles(self.texts, self.lost, self.dt)
 
     def read(self, stem: str, town: str, map_name: str | None) -> ReadCommonRoad:
-        """The scenario, checked, and what was lost."""
-        lanes, graph, known, name = self._town(town, map_name)
+        """Return the scenario, checked, and the features that are not carried over."""
+        lanes, graph, is_known, town_name = self._town(town, map_name)
         problem = self._problem()
         start, speed = self._start(problem)
-        limits, goal, target = self._goal(problem, lanes, speed)
-        route, line = self._route(graph, start, goal)
-        told = scenario_name(self.own.get("name", "")) or scenario_name(self.root.get("benchmarkID", ""))
+        limits, goal, target_speed = self._goal(problem, lanes, speed)
+        route, ego_route = self._route(graph, start, goal)
+        stored_name = scenario_name(self.own.get("name", "")) or scenario_name(self.root.get("benchmarkID", ""))
         scenario = Scenario(
-            name=told or scenario_name(stem) or "imported",
+            name=stored_name or scenario_name(stem) or "imported",
             type="Custom",
-            town=name,
+            town=town_name,
             route=route,
-            parameters=start_parameters(line, start, speed, digits=6),
+            parameters=start_parameters(ego_route, start, speed, digits=6),
             limits=limits,
-            target_speed=target,
+            target_speed=target_speed,
             group=self.own.get("group", ""),
             actors=self.obstacles.read(self.root, start, limits),
-            signals=self._signals(lanes, graph, line, limits),
+            signals=self._signals(lanes, graph, ego_route, limits),
             source=f"CommonRoad {Path(self.texts.where).name}",
         )
         for tag in ("phantomObstacle", "environmentObstacle", "location/environment"):
             if count := len(self.root.findall(tag)):
                 self.lost[tag] += count
-        build_episode(scenario, graph, seed=0)  # whatever is still wrong with it is said now
-        lost = tuple(f"{text}{f' ({n} times)' if n > 1 else ''}" for text, n in self.lost.items())
-        return ReadCommonRoad(scenario, graph, known, lost)
+        build_episode(scenario, graph, seed=0)  # reports any remaining error of the scenario
+        lost = tuple(
+            f"{message}{f' ({occurrences} times)' if occurrences > 1 else ''}"
+            for message, occurrences in self.lost.items()
+        )
+        return ReadCommonRoad(scenario, graph, is_known, lost)
 
-    # ------------------------------------------------------------ where
+    # ------------------------------------------------------------ the town
 
     def _town(self, town: str, map_name: str | None) -> tuple[ReadLanes, LaneGraph, bool, str]:
-        """The file's lanes, the town that it takes place in, whether that is known, and its name."""
+        """Return the file's lanes, the town, whether the town can be loaded by name, and its name."""
         lanes = read_lanes(self.root, self.texts, town, self.lost)
         if map_name is not None:
-            known = is_town(map_name)
+            is_known = is_town(map_name)
             graph = load_town(map_name)
-            return lanes, (graph if known else replace(graph, name=town)), known, (map_name if known else town)
+            return lanes, (graph if is_known else replace(graph, name=town)), is_known, (map_name if is_known else town)
         if is_town(self.own.get("town", "")):
             graph = load_town(self.own["town"])
             if _alike(graph, lanes.graph):
@@ -149,13 +152,18 @@ class _Reader:
         """The plan that forces just the lights that always show the same."""
         if not lanes.states:
             return SignalPlan()
-        ruled = _ruled(lanes.graph)
-        number = {stops: k for k, stops in _ruled(graph).items()}
-        wanted = {number[ruled[k]]: state for k, state in lanes.states.items() if ruled.get(k) in number}
-        until = max(60.0, limits.max_time)
+        lanes_by_signal = _ruled(lanes.graph)
+        # Signals have no common ids: they are matched by the lanes that they stop.
+        signal_by_lanes = {stops: signal for signal, stops in _ruled(graph).items()}
+        forced_states = {
+            signal_by_lanes[lanes_by_signal[signal]]: state
+            for signal, state in lanes.states.items()
+            if lanes_by_signal.get(signal) in signal_by_lanes
+        }
+        end_time = max(60.0, limits.max_time)
         if "signals_until" in self.own:
-            until = self.texts.number(self.own["signals_until"], self.root, "source: signals_until")
-        plan = plan_of(graph, line, wanted, until) if len(wanted) == len(lanes.states) else None
+            end_time = self.texts.number(self.own["signals_until"], self.root, "source: signals_until")
+        plan = plan_of(graph, line, forced_states, end_time) if len(forced_states) == len(lanes.states) else None
         if plan is None:
             self.lost[f"the states of {len(lanes.states)} signals, which no signal plan here gives"] += 1
         return plan or SignalPlan()
@@ -183,18 +191,18 @@ class _Reader:
         return pose, min(speed, MAX_SPEED)
 
     def _goal(self, problem: Element, lanes: ReadLanes, speed: float) -> tuple[Limits, Pose | None, float]:
-        """Limits, the place to reach, and the target speed."""
+        """Return the limits, the goal pose, and the target speed."""
         goals = problem.findall("goalState")
         if not goals:
             raise self.texts.fail(problem, "goalState is missing")
         if len(goals) > 1:
             self.lost[f"{len(goals) - 1} more goal states: the first is the goal"] += 1
         goal = goals[0]
-        begin, end = self.texts.value(goal.find("time"), problem, "goalState: time")
-        steps = round(end * self.dt / STEP)
+        begin_step, end_step = self.texts.value(goal.find("time"), problem, "goalState: time")
+        steps = round(end_step * self.dt / STEP)
         if steps < 1:
-            raise self.texts.fail(problem, f"its goal is to be reached at step {end:g}")
-        if begin > 0.0:
+            raise self.texts.fail(problem, f"its goal is to be reached at step {end_step:g}")
+        if begin_step > 0.0:
             self.lost["the earliest time of the goal"] += 1
         if goal.find("orientation") is not None:
             self.lost["the orientation of the goal"] += 1
@@ -202,32 +210,32 @@ class _Reader:
         if self.own.get("contact") in ("end", "count", "remove"):
             limits = replace(limits, contact=self.own["contact"])  # type: ignore[arg-type]
         if "max_distance" in self.own:
-            way = self.texts.number(self.own["max_distance"], self.root, "source: max_distance")
-            limits = replace(limits, max_distance=max(way, 1.0))
-        target = Scenario.target_speed
+            max_distance = self.texts.number(self.own["max_distance"], self.root, "source: max_distance")
+            limits = replace(limits, max_distance=max(max_distance, 1.0))
+        target_speed = Scenario.target_speed
         if (velocity := goal.find("velocity")) is not None:
-            low, target = self.texts.value(velocity, problem, "goalState: velocity")
-            if low > 0.0:
+            min_speed, target_speed = self.texts.value(velocity, problem, "goalState: velocity")
+            if min_speed > 0.0:
                 self.lost["the least speed at the goal"] += 1
         elif speed > 1.0:
-            target = speed
-        if not 0.1 <= target <= MAX_SPEED:
-            target = min(max(target, Scenario.target_speed), MAX_SPEED)
-            self.lost[f"the speed at the goal: the ego drives at {target:g} m/s"] += 1
-        return limits, self._region(goal.find("position"), problem, lanes), target
+            target_speed = speed
+        if not 0.1 <= target_speed <= MAX_SPEED:
+            target_speed = min(max(target_speed, Scenario.target_speed), MAX_SPEED)
+            self.lost[f"the speed at the goal: the ego drives at {target_speed:g} m/s"] += 1
+        return limits, self._region(goal.find("position"), problem, lanes), target_speed
 
     def _region(self, position: Element | None, problem: Element, lanes: ReadLanes) -> Pose | None:
-        """The middle of a goal region; None: there is none."""
+        """Return the middle of a goal region; None if there is none."""
         if position is None or not len(position):
             return None
         if len(position) > 1:
             self.lost["more than one goal region: the first is the goal"] += 1
         region = position[0]
         if region.tag == "lanelet":
-            ref = self.texts.whole(region.get("ref"), problem, "goalState: lanelet")
-            if ref not in lanes.lane_of:
-                raise self.texts.fail(problem, f"its goal is lanelet {ref}, which is not there")
-            lane = lanes.lane_of[ref]
+            lanelet_id = self.texts.whole(region.get("ref"), problem, "goalState: lanelet")
+            if lanelet_id not in lanes.lane_of:
+                raise self.texts.fail(problem, f"its goal is lanelet {lanelet_id}, which is not there")
+            lane = lanes.lane_of[lanelet_id]
             x, y, yaw, _ = lanes.graph.at(lane, max(float(lanes.graph.length[lane]) - 1.0, 0.0))
             return Pose(x, y, yaw)
         if region.tag == "polygon":
@@ -243,13 +251,13 @@ class _Reader:
         return Pose(x, y)
 
     def _route(self, graph: LaneGraph, start: Pose, goal: Pose | None) -> tuple[tuple[Pose, ...], Route]:
-        """Key points of the ego's way, and the way."""
+        """Return the key points of the ego's route, and the route."""
         if goal is None:
             self.lost[f"the ego has no place to reach: {WAY:g} m along its lane"] += 1
             return self._ahead(graph, start)
         try:
-            line = route_along(graph, (start, (goal.x, goal.y)))
-            route = start, Pose(goal.x, goal.y, float(wrap_angle(line.yaw[-1])))
+            ego_route = route_along(graph, (start, (goal.x, goal.y)))
+            route = start, Pose(goal.x, goal.y, float(wrap_angle(ego_route.yaw[-1])))
             return route, route_along(graph, route)
         except RouteError as error:
             if _lane_under(graph, start) is None or "no way" not in str(error):
@@ -258,39 +266,45 @@ class _Reader:
         return self._ahead(graph, start)
 
     def _ahead(self, graph: LaneGraph, start: Pose) -> tuple[tuple[Pose, ...], Route]:
-        """The way along the lane under the ego, straight on where lanes part."""
+        """Return the route along the lane under the ego, straight on where lanes diverge."""
         place = _lane_under(graph, start)
         if place is None:
             raise RouteError(f"{self.texts.where}: the ego does not stand on a road of '{graph.name}'")
         path = lane_path(graph, place, WAY)
         if len(path) < 3:
             raise RouteError(f"{self.texts.where}: the road ends before the ego")
-        kept = np.unique(np.linspace(0, len(path) - 2, 9).astype(int))[1:]
-        step = path[kept + 1] - path[kept]
-        rows = np.column_stack([path[kept], np.arctan2(step[:, 1], step[:, 0])])
+        point_indices = np.unique(np.linspace(0, len(path) - 2, 9).astype(int))[1:]
+        directions = path[point_indices + 1] - path[point_indices]
+        rows = np.column_stack([path[point_indices], np.arctan2(directions[:, 1], directions[:, 0])])
         route = (start, *(Pose(x, y, yaw) for x, y, yaw in rows.tolist()))
         return route, route_along(graph, route)
 
 
 def _lane_under(graph: LaneGraph, pose: Pose) -> Place | None:
-    """The driving lane under a pose that goes its way."""
-    lanes, along, gap = nearest_all(graph, (pose.x, pose.y), (LaneType.DRIVING,))
-    places = [Place(n, s) for n, s in zip(lanes.tolist(), along.tolist(), strict=True)]
-    turn = [abs(float(wrap_angle(graph.at(place.lane, place.s)[2] - pose.yaw))) for place in places]
-    good = [k for k in range(len(places)) if gap[k] <= 2.0 and turn[k] < math.pi / 3]
-    return places[min(good, key=lambda k: max(float(gap[k]), 0.0))] if good else None
+    """Return the driving lane under a pose with its direction."""
+    lanes, distances, lane_distances = nearest_all(graph, (pose.x, pose.y), (LaneType.DRIVING,))
+    places = [Place(lane, distance) for lane, distance in zip(lanes.tolist(), distances.tolist(), strict=True)]
+    heading_differences = [abs(float(wrap_angle(graph.at(place.lane, place.s)[2] - pose.yaw))) for place in places]
+    candidates = [
+        index
+        for index in range(len(places))
+        if lane_distances[index] <= 2.0 and heading_differences[index] < math.pi / 3
+    ]
+    return places[min(candidates, key=lambda index: max(float(lane_distances[index]), 0.0))] if candidates else None
 
 
 def _alike(town: LaneGraph, found: LaneGraph) -> bool:
     """Whether the lanes of a file are those of a town."""
-    same = town.lanes == found.lanes and np.array_equal(town.kind, found.kind)
-    ends: list[F64] = [graph.xy[graph.offset[:-1]].astype(np.float64) for graph in (town, found)] if same else []
-    return same and bool(np.abs(ends[0] - ends[1]).max() < ALIKE)
+    is_same_layout = town.lanes == found.lanes and np.array_equal(town.kind, found.kind)
+    start_points: list[F64] = (
+        [graph.xy[graph.offset[:-1]].astype(np.float64) for graph in (town, found)] if is_same_layout else []
+    )
+    return is_same_layout and bool(np.abs(start_points[0] - start_points[1]).max() < ALIKE)
 
 
 def _ruled(graph: LaneGraph) -> Mapping[int, tuple[int, ...]]:
-    """The lanes that each signal stops."""
-    found: dict[int, tuple[int, ...]] = {}
+    """Return the lanes that each signal stops."""
+    lanes_by_signal: dict[int, tuple[int, ...]] = {}
     for signal, lane in zip(graph.stop_signal.tolist(), graph.stop_lane.tolist(), strict=True):
-        found[signal] = (*found.get(signal, ()), lane)
-    return {signal: tuple(sorted(lanes)) for signal, lanes in found.items()}
+        lanes_by_signal[signal] = (*lanes_by_signal.get(signal, ()), lane)
+    return {signal: tuple(sorted(lanes)) for signal, lanes in lanes_by_signal.items()}

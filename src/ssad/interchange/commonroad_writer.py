@@ -1,7 +1,7 @@
-"""Scenarios as CommonRoad XML 2020a: the town's lanelets, obstacles with trajectories, and the ego's planning problem.
+"""Scenarios as CommonRoad XML 2020a: lanelets of the town, obstacles with trajectories, and a planning problem.
 
-A planning problem is a start, a goal and the time for it: the goal is the end of the ego's route, reached with at most
-its target speed. Positions are centres of bodies. What only this program understands stands in the attribute `source`.
+A planning problem is a start, a goal and a time limit: the goal is the end of the ego's route, reached with at most
+its target speed. Positions are centres of bodies. Facts that only SSAD understands are in the attribute `source`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from ssad.world.models import model
 from ssad.world.roads import route_along
 
 DATE: Final = "2026-01-01"  # required by the format; fixed, so that a scenario always gives the same text
-GOAL: Final = 10.0  # m around the end of the route that are the goal
-PARTS: Final = (1, 2, 4, 5, 10)  # of the world's step that a file's may be
+GOAL: Final = 10.0  # m, radius of the goal around the end of the route
+PARTS: Final = (1, 2, 4, 5, 10)  # a file's step may be the world's, or one of these fractions of it
 STILL: Final = (Controller.NONE, Controller.TRAJECTORY)
 _STATIC = {"barrier": "roadBoundary", "cone": "constructionZone"}
 
@@ -31,26 +31,27 @@ _STATIC = {"barrier": "roadBoundary", "cone": "constructionZone"}
 def commonroad_text(
     episode: Episode, graph: LaneGraph, *, number: int = 1, dt: float = 0.1
 ) -> tuple[str, tuple[str, ...]]:
-    """An episode as CommonRoad XML 2020a.
+    """Write an episode as CommonRoad XML 2020a.
 
     Args:
-        episode: The episode; all but the ego stand or follow a trajectory (`ssad.scenarios.dynamic.frozen`).
+        episode: The episode; all agents but the ego stand or follow a trajectory
+            (`ssad.scenarios.dynamic.frozen`).
         graph: Its town.
-        number: Of the scenario in its map.
+        number: Number of the scenario in its map.
         dt: Step of the world, s.
 
     Returns:
-        The text, the same for the same episode, and what it does not carry over, a line each.
+        The text, the same for the same episode, and the features that it does not carry over, one line each.
 
     Raises:
-        ValueError: Somebody else moves by rules of his own.
+        ValueError: Another agent makes decisions of its own.
     """
     return _Writer(episode, graph, dt).write(number)
 
 
 def benchmark_map(town: str) -> str:
-    """A town's name as benchmark ids have it: letters and digits."""
-    return "".join(c for c in town if c.isalnum() and c.isascii()) or "Town"
+    """Return a town's name as used in benchmark ids: letters and digits."""
+    return "".join(character for character in town if character.isalnum() and character.isascii()) or "Town"
 
 
 class _Writer:
@@ -62,11 +63,11 @@ class _Writer:
 
     def write(self, number: int) -> tuple[str, tuple[str, ...]]:
         episode, scenario = self.episode, self.episode.scenario
-        moving = [agent.name for agent in episode.agents[1:] if agent.controller not in STILL]
-        if moving:
-            raise ValueError(f"{scenario.name}: {', '.join(moving)} have no trajectory")
+        unreplayed = [agent.name for agent in episode.agents[1:] if agent.controller not in STILL]
+        if unreplayed:
+            raise ValueError(f"{scenario.name}: {', '.join(unreplayed)} have no trajectory")
         recorded = any(agent.trajectory for agent in episode.agents[1:])
-        own = {
+        metadata = {
             "name": scenario.name,
             "town": scenario.town,
             "group": scenario.group or scenario.type,
@@ -81,37 +82,37 @@ class _Writer:
                 "commonRoadVersion": VERSION,
                 "author": "SSAD",
                 "affiliation": "",
-                "source": own_source(own.items()),
+                "source": own_source(metadata.items()),
                 "date": DATE,
                 "benchmarkID": f"ZAM_{benchmark_map(scenario.town)}-{number}_1{'_T-1' if recorded else ''}",
             },
         )
-        place = node(root, "location")
+        location = node(root, "location")
         for tag, value in (("geoNameId", -999), ("gpsLatitude", 999), ("gpsLongitude", 999)):  # a made-up place
-            node(place, tag, value)
+            node(location, tag, value)
         node(node(root, "scenarioTags"), "simulated")
-        first = self.graph.lanes + 1
-        free, lost = write_lanes(root, self.graph, episode.signal_override, dt=self.dt, number=first)
+        first_free_id = self.graph.lanes + 1
+        first_id, lost = write_lanes(root, self.graph, episode.signal_override, dt=self.dt, number=first_free_id)
         self.lost += lost
         if episode.signal_override and episode.override_until < self.steps * self.dt:
             self.lost.append(f"signals are forced only until {episode.override_until:g} s: here they stay")
-        others = list(enumerate(episode.agents[1:], free))  # their ids keep their order
-        for k, agent in others:
+        others = list(enumerate(episode.agents[1:], first_id))  # ids in the order of the agents
+        for obstacle_id, agent in others:
             if self._stands(agent):
-                self._static(root, k, agent)
-        for k, agent in others:
+                self._static(root, obstacle_id, agent)
+        for obstacle_id, agent in others:
             if not self._stands(agent):
-                self._dynamic(root, k, agent)
+                self._dynamic(root, obstacle_id, agent)
         if len(episode.agents) > 1:
             self.lost.append("names of actors: obstacles have numbers")
-        self._problem(root, free + len(others))
+        self._problem(root, first_id + len(others))
         indent(root, " ")
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
         return text, tuple(self.lost)
 
     @staticmethod
     def _stands(agent: EpisodeAgent) -> bool:
-        """Whether it is a static obstacle: a parked vehicle or a thing."""
+        """Return whether an agent is a static obstacle: a parked vehicle or a prop."""
         return not agent.trajectory and model(agent.model).kind not in (AgentKind.WALKER, AgentKind.BICYCLE)
 
     def _shape(self, obstacle: Element, agent: EpisodeAgent) -> None:
@@ -122,42 +123,44 @@ class _Writer:
 
     def _static(self, root: Element, number: int, agent: EpisodeAgent) -> None:
         obstacle = node(root, "staticObstacle", id=number)
-        prop = model(agent.model).kind == AgentKind.PROP
-        node(obstacle, "type", _STATIC.get(agent.model, "unknown") if prop else "parkedVehicle")
+        is_prop = model(agent.model).kind == AgentKind.PROP
+        node(obstacle, "type", _STATIC.get(agent.model, "unknown") if is_prop else "parkedVehicle")
         self._shape(obstacle, agent)
         _state(node(obstacle, "initialState"), 0, agent.pose, 0.0)
 
     def _dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
-        first, rows = self._rows(agent)
+        first_step, rows = self._rows(agent)
         if len(rows) < 2:
             self.lost.append(f"{agent.name}, who is there for less than two steps")
             return
         obstacle = node(root, "dynamicObstacle", id=number)
         node(obstacle, "type", TYPES[model(agent.model).kind])
         self._shape(obstacle, agent)
-        step = np.diff(rows[:, :2], axis=0) / self.dt
-        ahead = np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], 1)
-        speed = (np.concatenate([step, step[-1:]]) * ahead).sum(1)
+        velocity = np.diff(rows[:, :2], axis=0) / self.dt
+        heading_vector = np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], 1)
+        speed = (np.concatenate([velocity, velocity[-1:]]) * heading_vector).sum(1)
         states = [
-            (first + k, Pose(*row), v) for k, (row, v) in enumerate(zip(rows.tolist(), speed.tolist(), strict=True))
+            (first_step + offset, Pose(*row), row_speed)
+            for offset, (row, row_speed) in enumerate(zip(rows.tolist(), speed.tolist(), strict=True))
         ]
+        # The format keeps the first state apart from the trajectory.
         _state(node(obstacle, "initialState"), *states[0])
-        path = node(obstacle, "trajectory")
+        trajectory = node(obstacle, "trajectory")
         for state in states[1:]:
-            _state(node(path, "state"), *state)
+            _state(node(trajectory, "state"), *state)
 
     def _rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
-        """First step, and x, y, yaw [T, 3] at each step that an agent is there."""
+        """Return the first step, and x, y, yaw [T, 3] at each step at which an agent exists."""
         if not agent.trajectory:
             return 0, np.tile([agent.pose.x, agent.pose.y, agent.pose.yaw], (self.steps + 1, 1))
         rows = np.array(agent.trajectory, np.float64)
-        first = max(0, math.ceil(rows[0, 0] / self.dt - 1e-6))
-        last = min(self.steps, math.floor(rows[-1, 0] / self.dt + 1e-6))
-        time = self.dt * np.arange(first, last + 1)
+        first_step = max(0, math.ceil(rows[0, 0] / self.dt - 1e-6))
+        last_step = min(self.steps, math.floor(rows[-1, 0] / self.dt + 1e-6))
+        times = self.dt * np.arange(first_step, last_step + 1)
         yaw = np.unwrap(rows[:, 3])
-        found = [np.interp(time, rows[:, 0], values) for values in (rows[:, 1], rows[:, 2], yaw)]
-        found[2] = np.asarray(wrap_angle(found[2]))
-        return first, np.stack(found, 1)
+        columns = [np.interp(times, rows[:, 0], values) for values in (rows[:, 1], rows[:, 2], yaw)]
+        columns[2] = np.asarray(wrap_angle(columns[2]))
+        return first_step, np.stack(columns, 1)
 
     def _problem(self, root: Element, number: int) -> None:
         ego = self.episode.agents[0]
@@ -171,14 +174,14 @@ class _Writer:
         node(node(start, "time"), "exact", 0)
         goal = node(problem, "goalState")
         _interval(node(goal, "time"), 0, self.steps)
-        end = Pose(float(ego.route.xy[-1, 0]), float(ego.route.xy[-1, 1]), float(ego.route.yaw[-1]))
+        goal_pose = Pose(float(ego.route.xy[-1, 0]), float(ego.route.xy[-1, 1]), float(ego.route.yaw[-1]))
         circle = node(node(goal, "position"), "circle")
         node(circle, "radius", GOAL)
         centre = node(circle, "center")
-        node(centre, "x", end.x)
-        node(centre, "y", end.y)
+        node(centre, "x", goal_pose.x)
+        node(centre, "y", goal_pose.y)
         _interval(node(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
-        self._check_way(ego, end)
+        self._check_way(ego, goal_pose)
 
     def _check_way(self, ego: EpisodeAgent, end: Pose) -> None:
         """Say what is lost where the shortest way to the goal is not the ego's route."""
@@ -195,12 +198,14 @@ class _Writer:
 
 
 def _fitting(episode: Episode, dt: float) -> float:
-    """The longest step (`dt`, or a part of it) in which all trajectories have their rows; at least the last part."""
+    """Return the longest step (`dt`, or a fraction of it) that fits the times of all rows, else the shortest."""
     times = np.array([row[0] for agent in episode.agents for row in agent.trajectory])
-    inside = times[(times > 0.0) & (times < episode.limits.max_steps * dt)]
-    steps = [dt / part for part in PARTS]
-    fits = (step for step in steps if np.all(np.abs(inside / step - np.round(inside / step)) < 1e-6))
-    return next(fits, steps[-1])
+    relevant_times = times[(times > 0.0) & (times < episode.limits.max_steps * dt)]
+    steps = [dt / divisor for divisor in PARTS]
+    candidates = (
+        step for step in steps if np.all(np.abs(relevant_times / step - np.round(relevant_times / step)) < 1e-6)
+    )
+    return next(candidates, steps[-1])
 
 
 def _state(element: Element, step: int, pose: Pose, speed: float) -> None:

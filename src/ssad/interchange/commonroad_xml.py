@@ -1,4 +1,4 @@
-"""What the writer and the reader of CommonRoad 2020a share: elements that hold text, and the names of things."""
+"""Shared parts of the writer and the reader of CommonRoad 2020a: elements with text, and names of the format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 VERSION: Final = "2020a"
 STEP: Final = 0.1  # s of the world
 DIGITS: Final = 6  # decimals that are written; the format allows no exponents
-STOP, YIELD, TOP_SPEED = "206", "205", "274"  # signs of Germany and of Zamunda, CommonRoad's country of made-up maps
+STOP, YIELD, TOP_SPEED = "206", "205", "274"  # signs of Germany and of Zamunda, CommonRoad's country of fictitious maps
 
 LANE_TYPES: Final[dict[LaneType, str]] = {
     LaneType.DRIVING: "urban",
@@ -79,7 +79,7 @@ KINDS_OF: Final[dict[str, tuple[AgentKind, ...]]] = {name: (kind,) for kind, nam
 
 
 def node(parent: Element, tag: str, text: Any = None, **attributes: Any) -> Element:
-    """A new element under a parent, with a text and attributes."""
+    """Add an element to a parent, with a text and attributes."""
     element = SubElement(parent, tag, {name: told(value) for name, value in attributes.items()})
     if text is not None:
         element.text = told(text)
@@ -87,20 +87,20 @@ def node(parent: Element, tag: str, text: Any = None, **attributes: Any) -> Elem
 
 
 def told(value: Any) -> str:
-    """A value as the format has it."""
+    """Format a value as text."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return decimal(float(value)) if isinstance(value, (float, np.floating)) else str(value)
 
 
 def decimal(value: float) -> str:
-    """A number without an exponent."""
+    """Format a number without an exponent."""
     text = f"{value:.{DIGITS}f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text
 
 
 def points(parent: Element, rows: npt.ArrayLike) -> None:
-    """Points [N, 2] or [N, 3] under an element."""
+    """Add points [N, 2] or [N, 3] to an element."""
     for row in np.asarray(rows, np.float64).tolist():
         point = node(parent, "point")
         for name, value in zip("xyz", row, strict=False):
@@ -108,13 +108,13 @@ def points(parent: Element, rows: npt.ArrayLike) -> None:
 
 
 class Texts:
-    """The texts of a document's elements as numbers; errors name the file and the element that has an id."""
+    """Reader of the numbers in a document's elements; errors name the file and the element with its id."""
 
     def __init__(self, where: str) -> None:
         self.where = where
 
     def fail(self, element: Element | str, message: str) -> FormatError:
-        """A FormatError that says where."""
+        """Return a FormatError that names the file and the element."""
         if isinstance(element, str):
             return FormatError(f"{self.where}: {element}: {message}")
         number = f" {element.get('id', '')[:20]}" if element.get("id") else ""
@@ -140,7 +140,7 @@ class Texts:
         return int(value)
 
     def ids(self, element: Element, tag: str) -> list[int]:
-        """What the children of a tag refer to."""
+        """Return the ids that the children with a tag refer to."""
         return [self.whole(child.get("ref"), element, f"{tag}: ref") for child in element.iterfind(tag)]
 
     def points(self, element: Element | None, within: Element, what: str) -> F64:
@@ -163,7 +163,10 @@ class Texts:
         if (exact := element.findtext("exact")) is not None:
             value = self.number(exact, within, what)
             return value, value
-        low, high = (self.number(element.findtext(k), within, f"{what}: {k}") for k in ("intervalStart", "intervalEnd"))
+        low, high = (
+            self.number(element.findtext(bound_tag), within, f"{what}: {bound_tag}")
+            for bound_tag in ("intervalStart", "intervalEnd")
+        )
         if low > high:
             raise self.fail(within, f"{what}: an interval from {low:g} to {high:g}")
         return low, high
@@ -171,8 +174,8 @@ class Texts:
 
 def own_values(source: str) -> dict[str, str]:
     """What a `source` of this program's says: `SSAD; name=...; ...`."""
-    first, *rest = (part.strip() for part in source.split(";"))
-    return dict(part.split("=", 1) for part in rest if "=" in part) if first == "SSAD" else {}
+    first, *rest = (field.strip() for field in source.split(";"))
+    return dict(field.split("=", 1) for field in rest if "=" in field) if first == "SSAD" else {}
 
 
 def own_source(values: Iterable[tuple[str, Any]]) -> str:

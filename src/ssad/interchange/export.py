@@ -1,4 +1,4 @@
-"""Folders of scenarios for other programs: a file each, and the maps of their towns beside them."""
+"""Folders of scenarios for other programs: one file per scenario, and the maps of their towns."""
 
 from __future__ import annotations
 
@@ -25,8 +25,11 @@ def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int =
 
     Args:
         scenarios: The scenarios.
-        out: Folder.
-        seed: Of the episodes.
+        out: Output folder.
+        seed: Seed of the episodes.
+
+    Returns:
+        The files, and what they do not carry over.
 
     Raises:
         SSADError: A scenario cannot be built, its town has no OpenDRIVE, or a file cannot be written.
@@ -40,26 +43,29 @@ def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int =
         write_atomic(files[-1], town_xodr(town))
     for scenario, name in zip(scenarios, names, strict=True):
         town = scenario.town
-        text, missing = openscenario_text(
+        text, omissions = openscenario_text(
             episode(scenario, seed), load_town(town), network=f"{Path(town).stem}.xodr", signals=town_signals(town)
         )
         files.append(folder / f"{name}.xosc")
         write_atomic(files[-1], text)
-        lost += missing
+        lost += omissions
     return files, lost
 
 
 def export_commonroad(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0, system: str = "autopilot") -> Written:
     """Write scenarios as CommonRoad XML 2020a, with the lanelets of their towns.
 
-    The format has trajectories alone: who answers to the ego, or draws lots, repeats what he does when a system drives
-    the ego.
+    The format has trajectories only: agents that react to the ego, or act at random, repeat what they did while
+    a system drove the ego.
 
     Args:
         scenarios: The scenarios.
-        out: Folder.
-        seed: Of the episodes.
-        system: Which system that is.
+        out: Output folder.
+        seed: Seed of the episodes.
+        system: Name of that system.
+
+    Returns:
+        The files, and what they do not carry over.
 
     Raises:
         SSADError: A scenario cannot be built or driven, or a file cannot be written.
@@ -71,19 +77,19 @@ def export_commonroad(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0
     numbers: Counter[str] = Counter()
     for scenario, name in zip(scenarios, names, strict=True):
         graph = load_town(scenario.town)
-        fixed, repeated = _with_trajectories(episode(scenario, seed), graph, system)
-        if repeated:
+        replayed, was_replayed = _with_trajectories(episode(scenario, seed), graph, system)
+        if was_replayed:
             lost.append(f"what others do by themselves: they repeat what they did beside '{system}'")
         numbers[scenario.town] += 1
-        text, missing = commonroad_text(fixed, graph, number=numbers[scenario.town])
+        text, omissions = commonroad_text(replayed, graph, number=numbers[scenario.town])
         files.append(folder / f"{name}.xml")
         write_atomic(files[-1], text)
-        lost += missing
+        lost += omissions
     return files, lost
 
 
 def _with_trajectories(nominal: Episode, graph: LaneGraph, system: str) -> tuple[Episode, bool]:
-    """An episode in which nobody but the ego decides anything, and whether that is another one than before."""
+    """Return an episode in which only the ego makes decisions, and whether it differs from the nominal one."""
     if all(agent.controller in STILL for agent in nominal.agents[1:]):
         return nominal, False
     from ssad.drivers import make_system
@@ -95,7 +101,7 @@ def _with_trajectories(nominal: Episode, graph: LaneGraph, system: str) -> tuple
 
 
 def episode(scenario: Scenario, seed: int) -> Episode:
-    """The nominal episode of a scenario; errors name it."""
+    """Build the nominal episode of a scenario; errors name the scenario."""
     try:
         return build_episode(scenario, load_town(scenario.town), seed=seed)
     except SSADError as error:
@@ -104,7 +110,7 @@ def episode(scenario: Scenario, seed: int) -> Episode:
 
 
 def file_names(scenarios: Sequence[Scenario]) -> list[str]:
-    """Names of files without folders. ConfigError where two scenarios would share one."""
+    """Return file names without folders. ConfigError if two scenarios would share one."""
     names = [scenario.name.replace("/", "-").replace(":", "-") for scenario in scenarios]
     for name in names:
         if names.count(name) > 1:

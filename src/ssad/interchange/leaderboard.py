@@ -1,9 +1,9 @@
 """Routes of the CARLA leaderboards: 2.0 (and Bench2Drive) in and out, 1.0 out; `ssad import routes` reads 1.0.
 
-A scenario of a leaderboard is a type, a trigger and numbers; who takes part and what they do is code of the
-leaderboard. `leaderboard_types` plays its types with the same actors. What is written holds beside the type the
-scenario itself, as a child that the leaderboard does not look at, so that it comes back as it was.
-CARLA's left-handed frame becomes ours here. Types and format: leaderboard 2.0 (leaderboard.carla.org) and Bench2Drive.
+A scenario of a leaderboard is a type, a trigger and numbers; its actors and their behaviour are code of the
+leaderboard. `leaderboard_types` plays its types with the same actors. An exported file holds, beside the type, the
+scenario itself as a child that the leaderboard ignores, so that it can be read back unchanged. CARLA's left-handed
+frame is converted here. Types and format: leaderboard 2.0 (leaderboard.carla.org) and Bench2Drive.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element as Node
 
 MAX_BYTES: Final = 64 * MIB
-OWN: Final = "ssad"  # the child of a scenario that holds what no type of the leaderboard says
-MOVED: Final = 0.01  # m
-ROUND: Final = 1.5  # times its points' distance is more than the way of a route may be
+OWN: Final = "ssad"  # child of a scenario element that holds the scenario in our own format
+MOVED: Final = 0.01  # m; larger shifts of a point count as edits of the file
+ROUND: Final = 1.5  # largest ratio of a route's length to the distance along its points
 TYPES_2: Final[Mapping[str, str]] = {
     "StraightObstacle": "DynamicObjectCrossing",
     "LaneChanging": "OtherLeadingVehicle",
@@ -67,13 +67,14 @@ TYPES_1: Final[Mapping[str, str]] = {
 
 
 def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]:
-    """The scenarios of a file of routes of leaderboard 2.0.
+    """Read the scenarios of a file of routes of leaderboard 2.0.
 
     Args:
         path: The file.
 
     Returns:
-        A scenario for each on a route that can be played here, and what is not carried over, a line each.
+        One scenario for each scenario element that can be played here, and the features that are not carried
+        over, one line each.
 
     Raises:
         FormatError: The file is broken, or no scenario in it can be played.
@@ -81,59 +82,72 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
     root = read_xml(path, limit=MAX_BYTES)
     if root.tag != "routes":
         raise FormatError(f"{path}: not a file of routes: its root is <{root.tag[:40]}>")
-    values, lost, found = Values(str(path), root), Counter[str](), list[Scenario]()
-    known = town_names()
+    values, lost, scenarios = Values(str(path), root), Counter[str](), list[Scenario]()
+    towns = town_names()
     for route in root.iterfind("route"):
-        ident, town = values.text(route, "id"), values.text(route, "town")
+        route_id, town = values.text(route, "id"), values.text(route, "town")
         points = _points(values, route)
         if route.find("weathers/weather") is not None:
             lost["weather of a route"] += 1
-        told = route.findall("scenarios/scenario")
-        if not told:
+        elements = route.findall("scenarios/scenario")
+        if not elements:
             lost["a route without a scenario"] += 1
-        for number, item in enumerate(told):
-            kind = values.text(item, "type")
-            base = Scenario(
-                f"leaderboard/{ident}/{kind}_{number:02d}",
+        for element_index, element in enumerate(elements):
+            type_name = values.text(element, "type")
+            template = Scenario(
+                f"leaderboard/{route_id}/{type_name}_{element_index:02d}",
                 CUSTOM,
                 town,
                 points,
                 limits=LIMITS,
-                group=kind,
-                source=f"leaderboard route {ident} of {path.name}",
+                group=type_name,
+                source=f"leaderboard route {route_id} of {path.name}",
             )
-            own = item.find(OWN)
-            if own is None and kind not in TYPES:
-                lost[f"type {kind}: {UNPLAYED.get(kind, 'it is not known here')}"] += 1
+            stored = element.find(OWN)
+            if stored is None and type_name not in TYPES:
+                lost[f"type {type_name}: {UNPLAYED.get(type_name, 'it is not known here')}"] += 1
                 continue
-            if town not in known:
+            if town not in towns:
                 lost[f"town {town} is not imported: its scenarios cannot be built (ssad import map)"] += 1
                 continue
             try:
-                scenario = _played(values, item, base, lost) if own is None else _kept(values, item, own, base)
+                scenario = (
+                    _played(values, element, template, lost)
+                    if stored is None
+                    else _kept(values, element, stored, template)
+                )
                 build_episode(scenario, load_town(town), seed=0)
             except FormatError:
                 raise
             except ConfigError as error:
-                raise FormatError(f"{path}: route {ident[:40]}: {error}") from None
+                raise FormatError(f"{path}: route {route_id[:40]}: {error}") from None
             except SSADError as error:
                 lost[str(error)] += 1
                 continue
-            found.append(scenario)
-    if not found:
-        why = "; ".join(list(lost)[:3]) or "it has no route"
-        raise FormatError(f"{path}: no scenario in it can be played here: {why}")
-    return tuple(found), tuple(f"{text}{f' ({n} times)' if n > 1 else ''}" for text, n in lost.items())
+            scenarios.append(scenario)
+    if not scenarios:
+        reasons = "; ".join(list(lost)[:3]) or "it has no route"
+        raise FormatError(f"{path}: no scenario in it can be played here: {reasons}")
+    return tuple(scenarios), tuple(
+        f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in lost.items()
+    )
 
 
 def _points(values: Values, route: Node) -> tuple[Pose, ...]:
-    """Key points of a route, each with the heading to the next."""
-    xy = [_place(values, item) for item in route.iterfind("waypoints/position")]
-    xy = [here for k, here in enumerate(xy) if k == 0 or math.dist(here, xy[k - 1]) > 0.1]
-    if len(xy) < 2:
-        raise values.fail(route, f"route {route.get('id', '?')[:40]} needs two positions, has {len(xy)}")
-    yaw = [math.atan2(b[1] - a[1], b[0] - a[0]) for a, b in pairwise(xy)]
-    return tuple(Pose(*here, angle) for here, angle in zip(xy, [*yaw, yaw[-1]], strict=True))
+    """Return the key points of a route, each with the heading to the next."""
+    positions = [_place(values, element) for element in route.iterfind("waypoints/position")]
+    # Repeated points have no heading to the next.
+    positions = [
+        position
+        for index, position in enumerate(positions)
+        if index == 0 or math.dist(position, positions[index - 1]) > 0.1
+    ]
+    if len(positions) < 2:
+        raise values.fail(route, f"route {route.get('id', '?')[:40]} needs two positions, has {len(positions)}")
+    headings = [math.atan2(end[1] - start[1], end[0] - start[0]) for start, end in pairwise(positions)]
+    return tuple(
+        Pose(*position, heading) for position, heading in zip(positions, [*headings, headings[-1]], strict=True)
+    )
 
 
 def _place(values: Values, item: Node) -> tuple[float, float]:
@@ -142,45 +156,50 @@ def _place(values: Values, item: Node) -> tuple[float, float]:
 
 def _played(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> Scenario:
     """The scenario of an item of a route, with the actors of its type. RouteError: its town does not allow it."""
-    kind = base.group
-    play = TYPES[kind]
+    type_name = base.group
+    add_actors = TYPES[type_name]
     trigger = item.find("trigger_point")
-    alone = getattr(play, "func", play) is nobody
+    is_empty = getattr(add_actors, "func", add_actors) is nobody
     if trigger is not None:
         yaw = -math.radians(math.remainder(values.number(trigger, "yaw"), 360.0))
-        base = replace(base, trigger=None if alone else Pose(*_place(values, trigger), yaw))
-    elif not alone:
-        raise values.fail(item, f"'{kind}' has no trigger_point")
-    scenario_from(scenario_data(base))  # names and places, before anybody relies on them
+        base = replace(base, trigger=None if is_empty else Pose(*_place(values, trigger), yaw))
+    elif not is_empty:
+        raise values.fail(item, f"'{type_name}' has no trigger_point")
+    scenario_from(scenario_data(base))  # checks names and places before they are used
     graph = load_town(base.town)
     route = route_along(graph, base.route)
-    told = sum(math.dist((a.x, a.y), (b.x, b.y)) for a, b in pairwise(base.route))
-    if route.length > ROUND * told + 50.0:
+    point_distance = sum(
+        math.dist((start_point.x, start_point.y), (end_point.x, end_point.y))
+        for start_point, end_point in pairwise(base.route)
+    )
+    if route.length > ROUND * point_distance + 50.0:
         raise RouteError(
-            f"scenario {base.name}: its points make {told:.0f} m, the lanes that join them {route.length:.0f} m"
+            f"scenario {base.name}: its points make {point_distance:.0f} m, the lanes that join "
+            f"them {route.length:.0f} m"
         )
-    start = 0 if alone else trigger_index(base, route)
+    start = 0 if is_empty else trigger_index(base, route)
     site = Site(base, graph, route, start, item, values, generator("leaderboard", base.name))
-    play(site)
-    for number in item:
-        if number.tag not in site.used and number.tag != "trigger_point":
-            lost[f"{number.tag[:40]} of {kind}"] += 1
+    add_actors(site)
+    for child in item:
+        if child.tag not in site.used and child.tag != "trigger_point":
+            lost[f"{child.tag[:40]} of {type_name}"] += 1
     return replace(base, actors=tuple(site.actors), signals=site.signals, target_speed=site.target_speed)
 
 
 def _kept(values: Values, item: Node, own: Node, base: Scenario) -> Scenario:
     """The scenario that SSAD wrote; its route and trigger are those of the file where somebody has moved them."""
     try:
-        data = json.loads(values.text(own, "scenario"))
+        content = json.loads(values.text(own, "scenario"))
     except (ValueError, RecursionError) as error:
         raise values.fail(own, f"scenario is not JSON: {str(error)[:100]}") from None
-    if not isinstance(data, dict):
+    if not isinstance(content, dict):
         raise values.fail(own, "scenario is not a mapping of keys")
-    scenario = scenario_from(data | {"town": base.town})
-    near = len(scenario.route) == len(base.route) and all(
-        math.dist((a.x, a.y), (b.x, b.y)) < MOVED for a, b in zip(scenario.route, base.route, strict=True)
+    scenario = scenario_from(content | {"town": base.town})
+    is_unmoved = len(scenario.route) == len(base.route) and all(
+        math.dist((stored_point.x, stored_point.y), (file_point.x, file_point.y)) < MOVED
+        for stored_point, file_point in zip(scenario.route, base.route, strict=True)
     )
-    scenario = scenario if near else replace(scenario, route=base.route)
+    scenario = scenario if is_unmoved else replace(scenario, route=base.route)
     trigger = item.find("trigger_point")
     if trigger is None or scenario.trigger is None:
         return scenario
@@ -198,57 +217,69 @@ def export_leaderboard(scenarios: Sequence[Scenario], out: Path, *, seed: int = 
 
     Args:
         scenarios: The scenarios.
-        out: Folder.
-        seed: Of the episodes that are built to check them.
+        out: Output folder.
+        seed: Seed of the episodes that are built to check the scenarios.
+
+    Returns:
+        The file, and the features that it does not carry over.
 
     Raises:
         SSADError: A scenario cannot be built, or a file cannot be written.
     """
-    root, lost = Element("routes"), list[str]()
-    for k, scenario in enumerate(scenarios):
-        built = episode(scenario, seed)
-        kind = TYPES_2.get(scenario.type, scenario.group if scenario.group in TYPES else ALONE)
-        if kind == ALONE:
-            lost.append(f"actors of a {scenario.type}: the leaderboard drives its ego alone ({ALONE})")
+    root, omissions = Element("routes"), list[str]()
+    for index, scenario in enumerate(scenarios):
+        built_episode = episode(scenario, seed)
+        type_name = TYPES_2.get(scenario.type, scenario.group if scenario.group in TYPES else ALONE)
+        if type_name == ALONE:
+            omissions.append(f"actors of a {scenario.type}: the leaderboard drives its ego alone ({ALONE})")
         else:
-            lost.append("who takes part, and how: the leaderboard's type has actors and numbers of its own")
-        route = SubElement(root, "route", id=str(k), town=scenario.town)
+            omissions.append("who takes part, and how: the leaderboard's type has actors and numbers of its own")
+        route = SubElement(root, "route", id=str(index), town=scenario.town)
         SubElement(SubElement(route, "weathers"), "weather", route_percentage="0", sun_altitude_angle="45.0")
-        places = SubElement(route, "waypoints")
+        waypoints = SubElement(route, "waypoints")
         for pose in scenario.route:
-            SubElement(places, "position", _xyz(pose))
-        item = SubElement(SubElement(route, "scenarios"), "scenario", name=scenario.name, type=kind)
-        SubElement(item, "trigger_point", _xyz(_trigger(built.scenario)) | {"yaw": _yaw(_trigger(built.scenario))})
-        SubElement(item, OWN, scenario=dump_json(scenario_data(scenario)))
-    return [_write(root, make_folder(out) / "routes.xml")], lost
+            SubElement(waypoints, "position", _xyz(pose))
+        element = SubElement(SubElement(route, "scenarios"), "scenario", name=scenario.name, type=type_name)
+        SubElement(
+            element,
+            "trigger_point",
+            _xyz(_trigger(built_episode.scenario)) | {"yaw": _yaw(_trigger(built_episode.scenario))},
+        )
+        SubElement(element, OWN, scenario=dump_json(scenario_data(scenario)))
+    return [_write(root, make_folder(out) / "routes.xml")], omissions
 
 
 def export_leaderboard1(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> Written:
     """Write routes.xml and scenarios.json of leaderboard 1.0; see `export_leaderboard`."""
-    root, lost = Element("routes"), list[str]()
+    root, omissions = Element("routes"), list[str]()
     towns: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for k, scenario in enumerate(_written(scenarios, TYPES_1, seed, lost)):
-        route = SubElement(root, "route", id=str(k), town=scenario.town)
-        built = episode(scenario, seed)
-        for pose in _dense(built):
+    for index, scenario in enumerate(_written(scenarios, TYPES_1, seed, omissions)):
+        route = SubElement(root, "route", id=str(index), town=scenario.town)
+        built_episode = episode(scenario, seed)
+        for pose in _dense(built_episode):
             SubElement(route, "waypoint", _xyz(pose) | {"pitch": "0.0", "roll": "0.0", "yaw": _yaw(pose)})
         trigger = _trigger(scenario)
         event: dict[str, Any] = {"transform": _xyz(trigger) | {"pitch": "0.0", "yaw": _yaw(trigger)}}
-        places = [(agent.model, agent.pose) for agent in built.agents[1:]]
-        event["other_actors"] = {"front": [_xyz(pose) | {"yaw": _yaw(pose)} for model, pose in places if model]}
+        actor_places = [(agent.model, agent.pose) for agent in built_episode.agents[1:]]
+        event["other_actors"] = {"front": [_xyz(pose) | {"yaw": _yaw(pose)} for model, pose in actor_places if model]}
         towns.setdefault(scenario.town, {}).setdefault(TYPES_1[scenario.type], []).append(event)
     blocks = [
-        {town: [{"scenario_type": kind, "available_event_configurations": events} for kind, events in kinds.items()]}
-        for town, kinds in towns.items()
+        {
+            town: [
+                {"scenario_type": type_name, "available_event_configurations": events}
+                for type_name, events in events_by_type.items()
+            ]
+        }
+        for town, events_by_type in towns.items()
     ]
     folder = make_folder(out)
     write_atomic(folder / "scenarios.json", dump_json({"available_scenarios": blocks}, indent=1) + "\n")
-    return [_write(root, folder / "routes.xml"), folder / "scenarios.json"], lost
+    return [_write(root, folder / "routes.xml"), folder / "scenarios.json"], omissions
 
 
 def _written(scenarios: Sequence[Scenario], types: Mapping[str, str], seed: int, lost: list[str]) -> list[Scenario]:
     """Those that have a type; what is lost of them."""
-    found = []
+    supported = []
     for scenario in scenarios:
         if scenario.type not in types:
             lost.append(f"scenarios of type {scenario.type}: the leaderboard has none such")
@@ -257,19 +288,19 @@ def _written(scenarios: Sequence[Scenario], types: Mapping[str, str], seed: int,
         lost.append("who takes part, and how: the leaderboard's type has actors and numbers of its own")
         if scenario.parameters:
             lost.append(f"parameters {', '.join(sorted(scenario.parameters))}")
-        found.append(scenario)
-    if not found:
+        supported.append(scenario)
+    if not supported:
         raise SSADError(f"none of these scenarios has a counterpart in the leaderboard; it plays: {', '.join(types)}")
-    return found
+    return supported
 
 
 def _dense(built: Episode) -> list[Pose]:
     """A point of the ego's route each 5 m, and its end: a trigger must lie on the lines between them."""
     route = built.agents[0].route
     assert route is not None
-    kept = [*range(0, len(route.xy) - 1, 5), len(route.xy) - 1]
+    row_indices = [*range(0, len(route.xy) - 1, 5), len(route.xy) - 1]
     rows = np.column_stack([route.xy, route.yaw]).astype(np.float64)
-    return [Pose(*row) for row in rows[kept].tolist()]
+    return [Pose(*row) for row in rows[row_indices].tolist()]
 
 
 def _trigger(scenario: Scenario) -> Pose:

@@ -1,4 +1,4 @@
-"""Where a scenario of a leaderboard takes place: places on the ego's route, and who is put there."""
+"""Places of a leaderboard scenario on the ego's route, and the actors at these places."""
 
 from __future__ import annotations
 
@@ -36,35 +36,34 @@ if TYPE_CHECKING:
 
     from ssad.interchange.openscenario_places import Values
 
-SPEED: Final = 8.0  # m/s that the ego is taken to drive where the leaderboard measures seconds to a place
-PICK_UP: Final = 2.5  # m/s^2 at which it is taken to start
+SPEED: Final = 8.0  # m/s, assumed speed of the ego where the leaderboard measures seconds to a place
+PICK_UP: Final = 2.5  # m/s^2, assumed acceleration of the ego at the start
 LIMITS: Final = Limits(max_steps=900, max_time=90.0)
-FLOW: Final = 45.0  # s for which cars of a flow keep coming
-LONGEST: Final = 600.0  # m of the way of a flow
+FLOW: Final = 45.0  # s during which a flow adds cars
+LONGEST: Final = 600.0  # m, largest length of a flow's path
 CARS: Final = ("compact", "coupe", "suv", "car")
 _ROAD = (LaneType.DRIVING, LaneType.PARKING, LaneType.BIKING, LaneType.SHOULDER)
-_NEAR = 10.0  # m from a lane within which a place of the file belongs to it
-_THIN = math.radians(0.5)  # turn, and
-_LONG = 20.0  # m, after which a trajectory has another row
+_NEAR = 10.0  # m between a place of the file and its lane
+_THIN = math.radians(0.5)  # rad of turning, and
+_LONG = 20.0  # m of driving, after which a trajectory gets another row
 
 
 @dataclass
 class Site:
-    """A scenario of a route file on its town, while its actors are put together.
+    """A scenario of a route file in its town, while its actors are being added.
 
     Attributes:
         scenario: Name, town, route and trigger.
         graph: Lane graph of the town.
-        route: The ego's way.
-        start: Point of the route at which the leaderboard starts the scenario.
+        route: The ego's route.
+        start: Route point at which the leaderboard starts the scenario.
         item: The element of the file.
-        values: Reads its numbers.
-        hand: -1 where y of the file points right.
+        values: Reads the attributes of elements.
         random: Draws what the leaderboard draws.
-        used: Tags of numbers that were read.
-        actors: Who takes part so far.
-        signals: What the traffic lights show.
-        target_speed: Of the ego, m/s.
+        used: Tags of the parameters that were read.
+        actors: Actors added so far.
+        signals: States of the traffic lights.
+        target_speed: Target speed of the ego, m/s.
     """
 
     scenario: Scenario
@@ -82,56 +81,59 @@ class Site:
     # ------------------------------------------------------------ the numbers of the file
 
     def number(self, tag: str, default: float, low: float, high: float) -> float:
-        """The number `value` of a child. FormatError where it is none, or outside its range."""
+        """Return the number `value` of a child. FormatError if it is none, or outside its range."""
         return self._bounded(tag, "value", default, low, high)
 
     def interval(self, tag: str, default: tuple[float, float], low: float, high: float) -> tuple[float, float]:
-        """The numbers `from` and `to` of a child, or twice its `value`; FormatError as `number`."""
-        told = self.item.find(tag)
-        if told is not None and told.get("from") is None:
+        """Return the numbers `from` and `to` of a child, or twice its `value`; FormatError as in `number`."""
+        element = self.item.find(tag)
+        if element is not None and element.get("from") is None:
             value = self.number(tag, default[0], low, high)
             return value, value
-        a, b = (self._bounded(tag, key, d, low, high) for key, d in zip(("from", "to"), default, strict=True))
-        return min(a, b), max(a, b)
+        start, end = (
+            self._bounded(tag, key, fallback, low, high) for key, fallback in zip(("from", "to"), default, strict=True)
+        )
+        return min(start, end), max(start, end)
 
     def _bounded(self, tag: str, key: str, default: float, low: float, high: float) -> float:
-        told = self.item.find(tag)
+        element = self.item.find(tag)
         self.used.add(tag)
-        if told is None:
+        if element is None:
             return default
-        value = self.values.number(told, key)
+        value = self.values.number(element, key)
         if not low <= value <= high:
-            raise self.values.fail(told, f"{key} is {value:g}, outside {low:g} to {high:g}")
+            raise self.values.fail(element, f"{key} is {value:g}, outside {low:g} to {high:g}")
         return value
 
     def word(self, tag: str, default: str, allowed: Sequence[str] = ()) -> str:
-        """The text `value` of a child. FormatError where it is not allowed."""
-        told = self.item.find(tag)
+        """Return the text `value` of a child. FormatError if it is not allowed."""
+        element = self.item.find(tag)
         self.used.add(tag)
-        value = default if told is None else self.values.text(told, "value")
+        value = default if element is None else self.values.text(element, "value")
         if allowed and value not in allowed:
             raise self.values.fail(tag, f"'{value[:40]}' is not one of {', '.join(allowed)}")
         return value
 
     def side(self) -> float:
-        """1 where the scenario comes from the right of the road, -1 from the left."""
+        """Return 1 if the scenario comes from the right of the road, -1 if from the left."""
         return 1.0 if self.word("direction", "right", ("left", "right")) == "right" else -1.0
 
     def lane_at(self, tag: str) -> Place:
         """The lane under a place of the file. FormatError where it is missing, RouteError off the road."""
-        told = self.item.find(tag)
+        element = self.item.find(tag)
         self.used.add(tag)
-        if told is None:
+        if element is None:
             raise self.values.fail(self.item, f"'{self.item.get('type')}' has no {tag}")
-        xy = self.values.number(told, "x"), 0.0 - self.values.number(told, "y")
-        lane, s, gap = nearest_all(self.graph, xy, (LaneType.DRIVING, LaneType.BIKING))
-        k = int(np.argmin(gap))
-        if gap[k] > _NEAR:
-            raise self.fail(f"{tag} is {gap[k]:.0f} m off the road")
-        return Place(int(lane[k]), float(s[k]))
+        # The file has CARLA's left-handed frame. 0.0 - y instead of -y avoids a negative zero.
+        position = self.values.number(element, "x"), 0.0 - self.values.number(element, "y")
+        lane, s, gap = nearest_all(self.graph, position, (LaneType.DRIVING, LaneType.BIKING))
+        nearest = int(np.argmin(gap))
+        if gap[nearest] > _NEAR:
+            raise self.fail(f"{tag} is {gap[nearest]:.0f} m off the road")
+        return Place(int(lane[nearest]), float(s[nearest]))
 
     def fail(self, message: str) -> RouteError:
-        """A RouteError that names the scenario."""
+        """Return a RouteError that names the scenario."""
         return RouteError(f"scenario {self.scenario.name}: {message}")
 
     # ------------------------------------------------------------ places
@@ -149,87 +151,109 @@ class Site:
         return index
 
     def pose(self, index: int, right: float = 0.0, turn: float = 0.0) -> Pose:
-        """The pose of a route point, moved to the right, m, and turned to the left, rad."""
+        """Return the pose of a route point, moved to the right, m, and turned to the left, rad."""
         x, y = self.route.xy[index].tolist()
         return shifted(Pose(x, y, float(self.route.yaw[index])), 0.0, -right, turn)
 
     def place(self, index: int) -> Place:
-        """The lane under a route point."""
+        """Return the lane under a route point."""
         return route_place(self.graph, self.scenario, self.route, index)
 
     def width(self, index: int) -> float:
-        """Width of the lane there, m."""
+        """Return the width of the lane at a route point, m."""
         return width_at(self.graph, self.place(index))
 
     def edge(self, index: int, side: float, kinds: Sequence[LaneType] = _ROAD) -> float:
-        """How far to that side the last lane of these kinds ends, m; to the left it counts the oncoming ones."""
-        here, pose = self.place(index), self.pose(index)
-        last, along = here, "right" if side > 0.0 else "left"
-        while (after := beside(self.graph, last, along)) is not None and self.graph.kind[after.lane] in kinds:
-            if not self.graph.same_direction(last.lane, after.lane):
-                along = "right"
-            last = after
-        other = pose_at(self.graph, last)
-        return math.dist((pose.x, pose.y), (other.x, other.y)) + 0.5 * width_at(self.graph, last)
+        """Return the distance to the outer edge of the last lane of these kinds, m, oncoming lanes included."""
+        ego_lane, pose = self.place(index), self.pose(index)
+        outermost, neighbour_side = ego_lane, "right" if side > 0.0 else "left"
+        while (neighbour := beside(self.graph, outermost, neighbour_side)) is not None and self.graph.kind[
+            neighbour.lane
+        ] in kinds:
+            # Seen from an oncoming lane, the next lane further out is to its right.
+            if not self.graph.same_direction(outermost.lane, neighbour.lane):
+                neighbour_side = "right"
+            outermost = neighbour
+        outermost_pose = pose_at(self.graph, outermost)
+        return math.dist((pose.x, pose.y), (outermost_pose.x, outermost_pose.y)) + 0.5 * width_at(self.graph, outermost)
 
     def oncoming(self, index: int) -> Place:
-        """The lane to the left whose traffic comes towards the ego. RouteError where there is none."""
-        after = beside(self.graph, self.place(index), "left")
+        """Return the lane to the left with oncoming traffic. RouteError if there is none."""
+        neighbour = beside(self.graph, self.place(index), "left")
         if (
-            after is None
-            or self.graph.kind[after.lane] != LaneType.DRIVING
-            or self.graph.same_direction(self.place(index).lane, after.lane)
+            neighbour is None
+            or self.graph.kind[neighbour.lane] != LaneType.DRIVING
+            or self.graph.same_direction(self.place(index).lane, neighbour.lane)
         ):
             raise self.fail(f"{self.item.get('type')} needs an oncoming lane to the left of the ego's")
-        return after
+        return neighbour
 
     def junction(self) -> tuple[int, int]:
-        """Route points where the first junction after the trigger begins and where it has ended."""
+        """Return the route points at which the first junction after the trigger begins and ends."""
         return junction_span(self.graph, self.scenario, self.route)
 
     def approach(self, sides: Sequence[float]) -> tuple[Place, int]:
-        """End of a lane into the ego's junction from these sides, rad, best first, and the lane straight on from it.
+        """Find the lane into the ego's junction from given sides, and the lane straight on from it.
 
-        Of several it is the one whose way comes nearest to the ego's.
+        If several lanes qualify, the one whose path comes nearest to the ego's is taken.
+
+        Args:
+            sides: Headings relative to the ego's, rad, in order of preference.
+
+        Returns:
+            The end of the lane into the junction, and the lane inside it.
+
+        Raises:
+            RouteError: There is no such lane.
         """
-        enter, leave = self.junction()
-        number = int(self.graph.junction[self.route.lane[enter]])
-        heading = float(self.route.yaw[max(enter - 1, 0)])
-        own = self.route.xy[enter : leave + 15].astype(np.float64)
+        entry_point, exit_point = self.junction()
+        junction = int(self.graph.junction[self.route.lane[entry_point]])
+        heading = float(self.route.yaw[max(entry_point - 1, 0)])
+        ego_path = self.route.xy[entry_point : exit_point + 15].astype(np.float64)
         best: tuple[int, float, Place, int] | None = None
-        for inside in np.flatnonzero((self.graph.junction == number) & (self.graph.kind == LaneType.DRIVING)).tolist():
-            for before in self.graph.predecessors(inside).tolist():
-                if self.graph.junction[before] == number or before == self.place(max(enter - 1, 0)).lane:
+        for junction_lane in np.flatnonzero(
+            (self.graph.junction == junction) & (self.graph.kind == LaneType.DRIVING)
+        ).tolist():
+            for entry_lane in self.graph.predecessors(junction_lane).tolist():
+                if (
+                    self.graph.junction[entry_lane] == junction
+                    or entry_lane == self.place(max(entry_point - 1, 0)).lane
+                ):
                     continue
-                yaw = pose_at(self.graph, Place(before, float(self.graph.length[before]))).yaw
+                yaw = pose_at(self.graph, Place(entry_lane, float(self.graph.length[entry_lane]))).yaw
                 turns = [abs(float(wrap_angle(yaw - heading - side))) for side in sides]
-                rank = next((k for k, turn in enumerate(turns) if turn < math.radians(45)), None)
-                if rank is None or abs(turn_of(self.graph, inside)) > math.radians(45):
+                rank = next((side_index for side_index, turn in enumerate(turns) if turn < math.radians(45)), None)
+                if rank is None or abs(turn_of(self.graph, junction_lane)) > math.radians(45):
                     continue
-                way = lane_path(self.graph, Place(inside, 0.0), float(self.graph.length[inside]) + 15.0)
-                gap = float(np.hypot(*(own[:, None] - way[None]).transpose(2, 0, 1)).min())
+                crossing_path = lane_path(
+                    self.graph, Place(junction_lane, 0.0), float(self.graph.length[junction_lane]) + 15.0
+                )
+                gap = float(np.hypot(*(ego_path[:, None] - crossing_path[None]).transpose(2, 0, 1)).min())
                 if best is None or (rank, gap) < best[:2]:
-                    best = rank, gap, Place(before, float(self.graph.length[before])), inside
+                    best = rank, gap, Place(entry_lane, float(self.graph.length[entry_lane])), junction_lane
         if best is None:
-            raise self.fail(f"no lane comes into junction {number} from where {self.item.get('type')} wants it")
+            raise self.fail(f"no lane comes into junction {junction} from where {self.item.get('type')} wants it")
         return best[2], best[3]
 
     def before_junction(self, place: Place, distance: float) -> Place:
-        """The place that far back along lanes, but not through a junction."""
-        back = place
-        for metres in np.arange(2.0, distance + 0.1, 2.0).tolist():
-            here = behind(self.graph, place, metres)
-            if self.graph.junction[here.lane] >= 0:
+        """Return the place `distance` m back along lanes, or the last one before a junction."""
+        farthest = place
+        for step_back in np.arange(2.0, distance + 0.1, 2.0).tolist():
+            candidate = behind(self.graph, place, step_back)
+            if self.graph.junction[candidate.lane] >= 0:
                 break
-            back = here
-        return back
+            farthest = candidate
+        return farthest
 
     # ------------------------------------------------------------ when
 
     def reaches(self, index: int, actor: Pose) -> Condition:
-        """When the ego comes to a route point: as a distance from the next actor that is added, which waits there."""
-        at = self.route.xy[min(max(index, 0), len(self.route.xy) - 1)].tolist()
-        return Condition("ego_distance", math.dist(at, (actor.x, actor.y)), len(self.actors))
+        """Return the condition that the ego reaches a route point.
+
+        It is expressed as a distance from the next actor to be added, which waits at `actor`.
+        """
+        position = self.route.xy[min(max(index, 0), len(self.route.xy) - 1)].tolist()
+        return Condition("ego_distance", math.dist(position, (actor.x, actor.y)), len(self.actors))
 
     def seconds_before(self, index: int, seconds: float, least: float, actor: Pose) -> Condition:
         """When the ego is so many seconds, or at least so many metres, before a route point; see `reaches`."""
@@ -242,62 +266,76 @@ class Site:
     # ------------------------------------------------------------ who
 
     def add(self, name: str, model: str, pose: Pose, phases: Sequence[Phase] = (), path: F64 | None = None) -> None:
-        """An actor that stands, or does what its phases say along a path [N, 2]."""
-        way = () if path is None else tuple((round(x, 3), round(y, 3)) for x, y in path.tolist())
-        self.actors.append(Actor(name, model, pose, tuple(phases), way))
+        """Add an actor that stands, or follows its phases along a path [N, 2]."""
+        rounded_path = () if path is None else tuple((round(x, 3), round(y, 3)) for x, y in path.tolist())
+        self.actors.append(Actor(name, model, pose, tuple(phases), rounded_path))
 
     def car(self) -> str:
-        """Some model of a car."""
+        """Draw a model of a car."""
         return str(self.random.choice(CARS))
 
     def driver(self, name: str, start: Place, distance: float, speed: float) -> None:
-        """A car that the Autopilot drives straight on for a distance; it sees the ego."""
-        way = lane_path(self.graph, start, distance)
-        steps = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-        at = np.linspace(0.0, steps[-1], max(2, math.ceil(steps[-1] / 40.0)))
-        keys = tuple((float(np.interp(s, steps, way[:, 0])), float(np.interp(s, steps, way[:, 1]))) for s in at)
+        """Add a car that the Autopilot drives straight on for a distance; it reacts to the ego."""
+        lane_points = lane_path(self.graph, start, distance)
+        distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane_points, axis=0).T))])
+        key_distances = np.linspace(0.0, distances[-1], max(2, math.ceil(distances[-1] / 40.0)))
+        key_points = tuple(
+            (
+                float(np.interp(key_distance, distances, lane_points[:, 0])),
+                float(np.interp(key_distance, distances, lane_points[:, 1])),
+            )
+            for key_distance in key_distances
+        )
         pose = pose_at(self.graph, start)
-        self.actors.append(Actor(name, self.car(), pose, path=keys, policy="autopilot", target_speed=speed))
+        self.actors.append(Actor(name, self.car(), pose, path=key_points, policy="autopilot", target_speed=speed))
 
     def oncoming_cars(self, index: int, gap: tuple[float, float], *, after: float = 5.0) -> None:
-        """Cars towards the ego: the first passes a route point some seconds after an ego that then waits there."""
+        """Add oncoming cars.
+
+        The first passes a route point `after` seconds after an ego that then waits there.
+
+        Args:
+            index: The route point.
+            gap: Range of the distance between two cars, m.
+            after: Time after the ego's arrival, s.
+        """
         lane = self.oncoming(index)
         speed = min(float(self.route.speed_limit[index]), 1.5 * SPEED)
-        far = speed * (self.arrival(index) + after) - 0.5 * speed**2 / MODELS["compact"].max_accel
-        last: Place | None = None
+        distance_back = speed * (self.arrival(index) + after) - 0.5 * speed**2 / MODELS["compact"].max_accel
+        previous_start: Place | None = None
         for _ in range(6):
-            start = behind(self.graph, lane, far)
-            if last is not None and self.apart(start, last) < 8.0:
-                return  # the road begins here
+            start = behind(self.graph, lane, distance_back)
+            if previous_start is not None and self.apart(start, previous_start) < 8.0:
+                return  # the road begins here, so no car can start further back
             if self.graph.junction[start.lane] < 0:
-                self.driver(f"oncoming car {len(self.actors)}", start, far + 80.0, speed)
-                last = start
-            far += float(self.random.uniform(*gap))
+                self.driver(f"oncoming car {len(self.actors)}", start, distance_back + 80.0, speed)
+                previous_start = start
+            distance_back += float(self.random.uniform(*gap))
 
     def flow(self, way: F64, gap: tuple[float, float], speed: float, *, models: Sequence[str] = CARS) -> None:
         """Vehicles that come one after another along a way [N, 2] at a steady speed, whatever is in their way.
 
         They appear where it begins and leave where it ends; at the start they are all along it.
         """
-        length = float(np.hypot(*np.diff(way, axis=0).T).sum())
-        if length > LONGEST:
-            raise self.fail(f"the way of its flow has {length:.0f} m, more than {LONGEST:.0f} m")
-        table = _timed(way, speed)
-        passing = -float(table[-1, 0])
-        while (passing := passing + float(self.random.uniform(*gap)) / speed) < FLOW:
-            rows = table.copy()
-            rows[:, 0] += passing
+        path_length = float(np.hypot(*np.diff(way, axis=0).T).sum())
+        if path_length > LONGEST:
+            raise self.fail(f"the way of its flow has {path_length:.0f} m, more than {LONGEST:.0f} m")
+        template = _timed(way, speed)
+        start_time = -float(template[-1, 0])
+        while (start_time := start_time + float(self.random.uniform(*gap)) / speed) < FLOW:
+            rows = template.copy()
+            rows[:, 0] += start_time
             rows = rows.round(3)
-            body = str(self.random.choice(models))
-            name = f"{'cyclist' if body == 'bicycle' else 'car'} {len(self.actors)}"
+            model = str(self.random.choice(models))
+            actor_name = f"{'cyclist' if model == 'bicycle' else 'car'} {len(self.actors)}"
             pose = Pose(*rows[0, 1:].tolist())
-            self.actors.append(Actor(name, body, pose, trajectory=tuple(map(tuple, rows.tolist()))))
+            self.actors.append(Actor(actor_name, model, pose, trajectory=tuple(map(tuple, rows.tolist()))))
 
     def way(self, start: Place, end: Place) -> F64:
-        """The lanes' way [N, 2] from one place to another. RouteError where there is none."""
-        a, b = pose_at(self.graph, start), pose_at(self.graph, end)
+        """Return the path [N, 2] along lanes from one place to another. RouteError if there is none."""
+        start_pose, end_pose = pose_at(self.graph, start), pose_at(self.graph, end)
         try:
-            return route_along(self.graph, [a, b]).xy.astype(np.float64)
+            return route_along(self.graph, [start_pose, end_pose]).xy.astype(np.float64)
         except RouteError as error:
             raise self.fail(str(error)) from None
 
@@ -309,38 +347,54 @@ class Site:
         return moved
 
     def along(self, index: int, distance: float, right: float, *, into: float = 0.0) -> F64:
-        """The ego's way from a route point on, from beside it; after `into` m it is in its lane (0: never)."""
-        way = self.route.xy[index : index + max(3, round(distance / self.route.spacing))].astype(np.float64)
-        if len(way) < 3:
+        """Return a path beside the ego's route.
+
+        Args:
+            index: Route point at which it begins.
+            distance: Length, m.
+            right: Offset to the right, m.
+            into: Length after which it has merged into the ego's lane, m; 0: never.
+
+        Raises:
+            RouteError: The route is too short.
+        """
+        path = self.route.xy[index : index + max(3, round(distance / self.route.spacing))].astype(np.float64)
+        if len(path) < 3:
             raise self.fail("the route ends too soon")
-        share = np.ones(len(way))
+        offset_share = np.ones(len(path))
         if into > 0.0:
-            part = np.clip(self.route.spacing * np.arange(len(way)) / into, 0.0, 1.0)
-            share = 0.5 * (1.0 + np.cos(np.pi * part))
-        return self.offset(way, right * share)
+            progress = np.clip(self.route.spacing * np.arange(len(path)) / into, 0.0, 1.0)
+            # A half cosine has no kink at either end, so a vehicle can follow it.
+            offset_share = 0.5 * (1.0 + np.cos(np.pi * progress))
+        return self.offset(path, right * offset_share)
 
     def beyond(self, start: Place, distance: float) -> Place:
-        """The place that far ahead along lanes, straight on."""
+        """Return the place `distance` m ahead along lanes, straight on."""
         return ahead(self.graph, start, distance)
 
     def apart(self, one: Place, other: Place) -> float:
         """Metres between two places."""
-        a, b = pose_at(self.graph, one), pose_at(self.graph, other)
-        return math.dist((a.x, a.y), (b.x, b.y))
+        first_pose, second_pose = pose_at(self.graph, one), pose_at(self.graph, other)
+        return math.dist((first_pose.x, first_pose.y), (second_pose.x, second_pose.y))
 
 
 def _timed(way: F64, speed: float) -> F64:
     """Rows [M, 4] of time, x, y and yaw of a drive along a way at a speed; few where it is straight."""
-    step = np.diff(way, axis=0)
-    way, step = way[np.concatenate([[True], np.hypot(*step.T) > 1e-6])], step[np.hypot(*step.T) > 1e-6]
-    if len(step) < 1:
+    steps = np.diff(way, axis=0)
+    way, steps = way[np.concatenate([[True], np.hypot(*steps.T) > 1e-6])], steps[np.hypot(*steps.T) > 1e-6]
+    if len(steps) < 1:
         raise RouteError("a flow needs a way of some metres")
-    s = np.concatenate([[0.0], np.cumsum(np.hypot(*step.T))])
-    yaw = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    distances = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
+    yaw = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    # Headings belong to segments: at a point, take the mean of both sides.
     yaw = np.concatenate([yaw[:1], 0.5 * (yaw[1:] + yaw[:-1]), yaw[-1:]])
-    kept = [0]
-    for k in range(1, len(s)):
-        last = kept[-1]
-        if k == len(s) - 1 or abs(yaw[k] - yaw[last]) > _THIN or s[k] - s[last] > _LONG:
-            kept.append(k)
-    return np.column_stack([s / speed, way, yaw])[kept]
+    row_indices = [0]
+    for index in range(1, len(distances)):
+        previous = row_indices[-1]
+        if (
+            index == len(distances) - 1
+            or abs(yaw[index] - yaw[previous]) > _THIN
+            or distances[index] - distances[previous] > _LONG
+        ):
+            row_indices.append(index)
+    return np.column_stack([distances / speed, way, yaw])[row_indices]

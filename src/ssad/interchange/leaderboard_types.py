@@ -1,7 +1,7 @@
-"""The scenario types of leaderboard 2.0 and Bench2Drive: who takes part, what sets them off, in which order.
+"""The scenario types of leaderboard 2.0 and Bench2Drive: actors, triggers, and order of events.
 
-Each function puts the actors of a type at their `Site`. Facts (places, speeds, seconds): the documentation and sources
-of ScenarioRunner 0.9.15 (MIT) and, for the types that Bench2Drive adds, its list of scenarios.
+Each function adds the actors of a type to a `Site`. Facts (places, speeds, seconds): the documentation and sources of
+ScenarioRunner 0.9.15 (MIT) and, for the types that Bench2Drive adds, its list of scenarios.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from ssad.world.models import MODELS
 
 Play = Callable[[Site], None]
 ONCOMING: Final = math.pi
-LEFT: Final = -0.5 * math.pi  # a car from the left is headed to the right
+LEFT: Final = -0.5 * math.pi  # rad; a car from the left is headed to the right
 RIGHT: Final = 0.5 * math.pi
 KMH: Final = 1.0 / 3.6
 _LANES = (LaneType.DRIVING, LaneType.BIKING)
 
 
-# ---------------------------------------------------------------- things and cars in the way
+# ---------------------------------------------------------------- obstacles and standing cars
 
 
 def _warning(site: Site) -> None:
-    """What warns of an obstacle: a cone beside the road where the scenario starts."""
+    """Add the warning of an obstacle: a cone beside the road where the scenario starts."""
     side = site.side()
     site.add("warning", "cone", site.pose(site.start, side * (site.edge(site.start, side) + 0.6)))
 
 
 def accident(site: Site, *, two_ways: bool) -> None:
-    """A police car and two cars that have crashed stand in the lane."""
+    """Add a police car and two crashed cars that stand in the lane."""
     _warning(site)
     distance, side = site.number("distance", 120.0, 0.0, 500.0), site.side()
-    first = site.point(distance)
-    for name, further in (("police car", 0.0), ("first car", 10.0), ("second car", 16.0)):
-        index = site.point(distance + further)
-        right = side * 0.3 * site.width(index)
-        site.add(name, "car" if name == "police car" else "compact", site.pose(index, right))
+    accident_point = site.point(distance)
+    for name, offset in (("police car", 0.0), ("first car", 10.0), ("second car", 16.0)):
+        index = site.point(distance + offset)
+        lateral_offset = side * 0.3 * site.width(index)
+        site.add(name, "car" if name == "police car" else "compact", site.pose(index, lateral_offset))
     if two_ways:
-        site.oncoming_cars(first, site.interval("frequency", (20.0, 100.0), 8.0, 1000.0))
+        site.oncoming_cars(accident_point, site.interval("frequency", (20.0, 100.0), 8.0, 1000.0))
 
 
 def parked(site: Site, *, two_ways: bool) -> None:
-    """A car stands in the lane."""
+    """Add a car that stands in the lane."""
     _warning(site)
     index = site.point(site.number("distance", 120.0, 0.0, 500.0))
     site.add("parked car", site.car(), site.pose(index, site.side() * 0.35 * site.width(index)))
@@ -59,59 +59,66 @@ def parked(site: Site, *, two_ways: bool) -> None:
 
 
 def construction(site: Site, *, two_ways: bool) -> None:
-    """A sign and cones close the lane."""
+    """Add a sign and cones that close the lane."""
     _warning(site)
     side = site.side()
     index = site.point(site.number("distance", 100.0, 0.0, 500.0), in_junction=True)
     site.add("sign", "barrier", site.pose(max(index - 5, 0), 0.0, 0.5 * math.pi))
-    half = 0.425 * site.width(index)
-    for k, right in enumerate([*(-half * side,) * 5, *(side * half * share for share in (-0.3, 0.3, 1.0))]):
-        here = index + min(2 * k, 8)
-        site.add(f"cone {k}", "cone", site.pose(min(here, len(site.route.xy) - 1), right))
+    half_width = 0.425 * site.width(index)
+    for cone_index, lateral_offset in enumerate(
+        [*(-half_width * side,) * 5, *(side * half_width * width_share for width_share in (-0.3, 0.3, 1.0))]
+    ):
+        cone_point = index + min(2 * cone_index, 8)
+        site.add(f"cone {cone_index}", "cone", site.pose(min(cone_point, len(site.route.xy) - 1), lateral_offset))
     if two_ways:
         site.oncoming_cars(index, site.interval("frequency", (20.0, 100.0), 8.0, 1000.0))
 
 
 def bicycles(site: Site, *, two_ways: bool) -> None:
-    """Two bicycles ride slowly at the edge of the lane, from when the ego passes the trigger, and then stop."""
-    distance, way = site.number("distance", 100.0, 0.0, 500.0), site.number("bicycle_drive_distance", 50.0, 1.0, 500.0)
+    """Add two slow bicycles at the edge of the lane: they start when the ego passes the trigger, and then stop."""
+    distance, ride_distance = (
+        site.number("distance", 100.0, 0.0, 500.0),
+        site.number("bicycle_drive_distance", 50.0, 1.0, 500.0),
+    )
     speed = site.number("bicycle_speed", 10.0, 1.0, 40.0) * KMH  # the leaderboard gives it in km/h
-    for k, further in enumerate((0.0, 9.0)):
-        index = site.point(distance + further)
-        right = 0.275 * site.width(index)
-        pose = site.pose(index, right)
-        phases = (Phase(speed, site.reaches(site.start, pose)), Phase(0.0, Condition("travelled", way)))
-        site.add(f"cyclist {k}", "bicycle", pose, phases, site.along(index, way + 10.0, right))
+    for cyclist_index, offset in enumerate((0.0, 9.0)):
+        index = site.point(distance + offset)
+        lateral_offset = 0.275 * site.width(index)
+        pose = site.pose(index, lateral_offset)
+        phases = (Phase(speed, site.reaches(site.start, pose)), Phase(0.0, Condition("travelled", ride_distance)))
+        site.add(
+            f"cyclist {cyclist_index}", "bicycle", pose, phases, site.along(index, ride_distance + 10.0, lateral_offset)
+        )
     if two_ways:
         site.oncoming_cars(site.point(distance), site.interval("frequency", (100.0, 100.0), 8.0, 1000.0))
 
 
 def blocked(site: Site) -> None:
-    """A car stands where the ego leaves the junction, and goes on 10 s after the ego has come to the junction.
+    """Add a car that stands at the exit of the junction, and leaves 10 s after the ego has reached the junction.
 
-    In the leaderboard the 10 s begin where the ego is within 13 m of the car, where an ego that waits before the
-    junction never comes.
+    In the leaderboard the 10 s begin when the ego is within 13 m of the car; an ego that waits before the
+    junction never comes that close.
     """
-    enter, leave = site.junction()
-    index = min(leave + 5, len(site.route.xy) - 3)
+    entry_point, exit_point = site.junction()
+    index = min(exit_point + 5, len(site.route.xy) - 3)
     pose = site.pose(index)
     site.signals = SignalPlan("green", "red")
-    near = site.reaches(enter - 12, pose)  # who waits for its exit to be free comes no further
+    arrival = site.reaches(entry_point - 12, pose)  # an ego that waits for a free exit comes no further
     site.add(
         "stopped car",
         site.car(),
         pose,
-        (Phase(0.0, near), Phase(SPEED, Condition("after", 10.0))),
+        (Phase(0.0, arrival), Phase(SPEED, Condition("after", 10.0))),
         lane_path(site.graph, site.place(index), 120.0),
     )
 
 
 def hard_brake(site: Site) -> None:
-    """The car ahead drives as the ego does, stops hard as the ego passes the trigger, and goes on after 10 s."""
+    """Add a car ahead that drives like the ego, brakes hard as the ego passes the trigger, and leaves after 10 s."""
     index = min(14, len(site.route.xy) - 3)
-    way = max(10.0, site.start * site.route.spacing)
-    stop, go = Phase(0.0, Condition("travelled", way)), Phase(SPEED, Condition("after", 10.0))
-    phases = (Phase(SPEED, Condition("ego_speed", 0.5)), stop, go)
+    brake_distance = max(10.0, site.start * site.route.spacing)
+    stop, restart = Phase(0.0, Condition("travelled", brake_distance)), Phase(SPEED, Condition("after", 10.0))
+    phases = (Phase(SPEED, Condition("ego_speed", 0.5)), stop, restart)
     site.add("car ahead", site.car(), site.pose(index), phases, site.along(index, 1000.0, 0.0))
 
 
@@ -132,51 +139,57 @@ def _crossing(
     idle: float = 0.0,
 ) -> None:
     """Somebody who goes straight across `idle` s after the ego is near route point `index`; stops behind the road."""
-    near, gone = site.seconds_before(index, seconds, least, pose), Phase(0.0, Condition("travelled", way))
-    waits = (Phase(0.0, near), Phase(speed, Condition("after", idle))) if idle else (Phase(speed, near),)
-    site.add(name, model, pose, (*waits, gone))
+    trigger, final_stop = site.seconds_before(index, seconds, least, pose), Phase(0.0, Condition("travelled", way))
+    start_phases = (Phase(0.0, trigger), Phase(speed, Condition("after", idle))) if idle else (Phase(speed, trigger),)
+    site.add(name, model, pose, (*start_phases, final_stop))
 
 
 def _from_side(site: Site, index: int, side: float, further: float, angle: float = 0.0) -> tuple[Pose, float]:
     """A pose beside the road that faces it, and how far the other edge is."""
-    out = side * (site.edge(index, side) + further)
-    across = site.edge(index, 1.0) + site.edge(index, -1.0) + 2.0 * further
-    return site.pose(index, out, side * (0.5 * math.pi + angle)), across / max(math.cos(angle), 0.2)
+    lateral_offset = side * (site.edge(index, side) + further)
+    road_width = site.edge(index, 1.0) + site.edge(index, -1.0) + 2.0 * further
+    return site.pose(index, lateral_offset, side * (0.5 * math.pi + angle)), road_width / max(math.cos(angle), 0.2)
 
 
 def walker(site: Site, *, vehicle: bool) -> None:
-    """A walker steps onto the road from behind something that stands at its edge."""
+    """Add a walker that steps onto the road from behind an obstacle at its edge."""
     angle = site.number("crossing_angle", 0.0, -90.0, 90.0)
     side, index = site.side(), site.point(site.number("distance", 12.0, 0.0, 500.0), in_junction=True)
-    body = (
+    blocker = (
         "compact"
         if vehicle or "vehicle" in site.word("blocker_model", "static.prop.vendingmachine")
         else "vending_machine"
     )
-    half = 0.5 * (MODELS[body].length if body == "compact" else MODELS[body].width)
-    aside = site.edge(index, side) + 0.5 * MODELS[body].width + 0.2
-    there = min(index + math.ceil(half + 0.5), len(site.route.xy) - 1)
-    pose, across = _from_side(site, there, side, 0.6, math.radians(angle))
+    half_length = 0.5 * (MODELS[blocker].length if blocker == "compact" else MODELS[blocker].width)
+    lateral_offset = site.edge(index, side) + 0.5 * MODELS[blocker].width + 0.2
+    walker_point = min(index + math.ceil(half_length + 0.5), len(site.route.xy) - 1)
+    pose, crossing_distance = _from_side(site, walker_point, side, 0.6, math.radians(angle))
     seconds = (2.15 if vehicle else 2.1) + 0.1 * math.floor(angle / 5.0)
-    _crossing(site, "walker", "walker", pose, there, way=across, speed=2.0, seconds=seconds, least=6.0)
-    turn = 0.0 if body == "compact" else 0.5 * math.pi
-    site.add("car" if body == "compact" else "thing", body, site.pose(index, side * aside, turn))
+    _crossing(
+        site, "walker", "walker", pose, walker_point, way=crossing_distance, speed=2.0, seconds=seconds, least=6.0
+    )
+    blocker_turn = 0.0 if blocker == "compact" else 0.5 * math.pi
+    site.add("car" if blocker == "compact" else "thing", blocker, site.pose(index, side * lateral_offset, blocker_turn))
 
 
 def pedestrians(site: Site) -> None:
-    """Three walkers cross before the junction, one shortly after another."""
+    """Add three walkers that cross before the junction, one shortly after another."""
     index = max(site.junction()[0] - 1, 1)
-    for k, (ahead, aside) in enumerate(((0.4, 1.5), (1.0, 2.5), (1.6, 0.5))):
-        pose, across = _from_side(site, index, 1.0, aside)
-        pose = Pose(pose.x + ahead * math.cos(pose.yaw - RIGHT), pose.y + ahead * math.sin(pose.yaw - RIGHT), pose.yaw)
+    for walker_index, (forward_offset, margin) in enumerate(((0.4, 1.5), (1.0, 2.5), (1.6, 0.5))):
+        pose, crossing_distance = _from_side(site, index, 1.0, margin)
+        pose = Pose(
+            pose.x + forward_offset * math.cos(pose.yaw - RIGHT),
+            pose.y + forward_offset * math.sin(pose.yaw - RIGHT),
+            pose.yaw,
+        )
         idle, speed = float(site.random.uniform(0.0, 1.5)), float(site.random.uniform(1.3, 2.0))
         _crossing(
             site,
-            f"walker {k}",
+            f"walker {walker_index}",
             "walker",
             pose,
             index,
-            way=1.15 * across,
+            way=1.15 * crossing_distance,
             speed=round(speed, 3),
             seconds=3.5,
             least=12.0,
@@ -185,81 +198,87 @@ def pedestrians(site: Site) -> None:
 
 
 def turning(site: Site, *, model: str) -> None:
-    """Somebody crosses the road that the ego turns into."""
-    enter, leave = site.junction()
-    turn = float(np.unwrap(site.route.yaw[[max(enter - 1, 0), min(leave, len(site.route.yaw) - 1)]])[1])
-    turn -= float(site.route.yaw[max(enter - 1, 0)])
-    index = min(leave + (11 if model == "bicycle" else 1), len(site.route.xy) - 1)
+    """Add an agent that crosses the road into which the ego turns."""
+    entry_point, exit_point = site.junction()
+    turn = float(np.unwrap(site.route.yaw[[max(entry_point - 1, 0), min(exit_point, len(site.route.yaw) - 1)]])[1])
+    turn -= float(site.route.yaw[max(entry_point - 1, 0)])
+    index = min(exit_point + (11 if model == "bicycle" else 1), len(site.route.xy) - 1)
     side = 1.0 if model == "bicycle" or turn > 0.0 else -1.0  # a walker comes from the outer side of the turn
-    pose, across = _from_side(site, index, side, 1.0)
+    pose, crossing_distance = _from_side(site, index, side, 1.0)
     seconds = 1.8 if model == "bicycle" else 2.2
     name = "cyclist" if model == "bicycle" else "walker"
-    _crossing(site, name, model, pose, index, way=across, speed=1.8, seconds=seconds, least=6.0)
+    _crossing(site, name, model, pose, index, way=crossing_distance, speed=1.8, seconds=seconds, least=6.0)
 
 
 # ---------------------------------------------------------------- cars that cut in
 
 
 def parking_cut_in(site: Site) -> None:
-    """A car that is parked pulls out in front of the ego, from behind another one that stays."""
+    """Add a parked car that pulls out in front of the ego from behind another parked car."""
     side = site.side()
     for name, distance, seconds in (("parked car", 28.0, 0.0), ("adversary", 35.0, 2.35)):
         index = site.point(distance, in_junction=True)
-        right = side * (site.edge(index, side, _LANES) + 0.5 * MODELS["compact"].width + 0.1)
-        pose = site.pose(index, right)
+        lateral_offset = side * (site.edge(index, side, _LANES) + 0.5 * MODELS["compact"].width + 0.1)
+        pose = site.pose(index, lateral_offset)
         if not seconds:
             site.add(name, "compact", pose)
             continue
         phases = (Phase(20.0 * KMH, site.seconds_before(index, seconds, 10.0, pose)),)
-        site.add(name, "compact", pose, phases, site.along(index, 1000.0, right, into=10.0))
+        site.add(name, "compact", pose, phases, site.along(index, 1000.0, lateral_offset, into=10.0))
 
 
 def static_cut_in(site: Site) -> None:
-    """One of a queue that stands in the next lane cuts in."""
-    side, first = site.side(), site.number("distance", 100.0, 0.0, 500.0)
-    for k in range(6):
-        index = site.point(first + 11.0 * k, in_junction=True)
-        lane = beside(site.graph, site.place(index), "right" if side > 0.0 else "left")
-        if lane is None or site.graph.kind[lane.lane] not in (LaneType.DRIVING, LaneType.PARKING):
+    """Add a queue that stands in the next lane; one car of it cuts in."""
+    side, first_distance = site.side(), site.number("distance", 100.0, 0.0, 500.0)
+    for car_index in range(6):
+        index = site.point(first_distance + 11.0 * car_index, in_junction=True)
+        neighbour_lane = beside(site.graph, site.place(index), "right" if side > 0.0 else "left")
+        if neighbour_lane is None or site.graph.kind[neighbour_lane.lane] not in (LaneType.DRIVING, LaneType.PARKING):
             raise site.fail("StaticCutIn needs a lane beside the ego's")
-        pose, here = pose_at(site.graph, lane), site.pose(index)
-        pose = Pose(pose.x, pose.y, here.yaw)
-        if k != 2:
-            site.add(f"standing car {k}", "compact", pose)
+        pose, route_pose = pose_at(site.graph, neighbour_lane), site.pose(index)
+        pose = Pose(pose.x, pose.y, route_pose.yaw)
+        if car_index != 2:
+            site.add(f"standing car {car_index}", "compact", pose)
             continue
-        right = side * math.dist((pose.x, pose.y), (here.x, here.y))
+        lateral_offset = side * math.dist((pose.x, pose.y), (route_pose.x, route_pose.y))
         phases = (Phase(60.0 * KMH, site.seconds_before(index, 2.7, 15.0, pose)),)
-        site.add("adversary", "compact", pose, phases, site.along(index, 1000.0, right, into=9.0))
+        site.add("adversary", "compact", pose, phases, site.along(index, 1000.0, lateral_offset, into=9.0))
 
 
 def highway_cut_in(site: Site) -> None:
-    """A car comes from a ramp as the ego passes, and changes into its lane close ahead of it."""
+    """Add a car that comes from a ramp as the ego passes, and changes into its lane close ahead of it."""
     start = site.lane_at("other_actor_location")
-    way = lane_path(site.graph, start, 400.0)
-    own = site.route.xy.astype(np.float64)
-    gap = np.hypot(*(way[:, None] - own[None]).transpose(2, 0, 1))
-    near = np.flatnonzero((gap.min(1) < 5.0) & (gap.argmin(1) < len(own) - 2))
-    steps = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-    if not len(near):
+    car_path = lane_path(site.graph, start, 400.0)
+    ego_path = site.route.xy.astype(np.float64)
+    distances = np.hypot(*(car_path[:, None] - ego_path[None]).transpose(2, 0, 1))
+    meeting_indices = np.flatnonzero((distances.min(1) < 5.0) & (distances.argmin(1) < len(ego_path) - 2))
+    path_distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(car_path, axis=0).T))])
+    if not len(meeting_indices):
         raise site.fail("the car of HighwayCutIn never comes beside the ego's way")
-    meet, speed, body = int(near[0]), 0.8 * SPEED, MODELS["coupe"]
-    begin = float(steps[meet]) + 5.0
-    keep = steps < begin + 60.0
-    way, steps = way[keep], steps[keep]
-    at = gap[: len(way)].argmin(1)
-    yaw = site.route.yaw[at]
-    left = np.cos(yaw) * (own[at, 1] - way[:, 1]) - np.sin(yaw) * (own[at, 0] - way[:, 0])
-    part = np.clip((steps - begin) / (2.0 * speed), 0.0, 1.0)
-    way = site.offset(way, -left * 0.5 * (1.0 - np.cos(np.pi * part)))
-    # it is 10 m ahead of the ego where both come together: soon enough, or as fast as it must be
-    wanted, fast = site.arrival(max(int(at[meet]) - 10, 0)), SPEED
-    while time_to_cover(begin, fast, body.max_accel) > wanted and fast < 25.0:
-        fast += 0.1
-    wait = int(at[meet]) - 10 - round(SPEED * time_to_cover(begin, fast, body.max_accel))
+    meeting_index, speed, car_model = int(meeting_indices[0]), 0.8 * SPEED, MODELS["coupe"]
+    change_start = float(path_distances[meeting_index]) + 5.0
+    is_kept = path_distances < change_start + 60.0
+    car_path, path_distances = car_path[is_kept], path_distances[is_kept]
+    nearest_points = distances[: len(car_path)].argmin(1)
+    route_headings = site.route.yaw[nearest_points]
+    lateral_offsets = np.cos(route_headings) * (ego_path[nearest_points, 1] - car_path[:, 1]) - np.sin(
+        route_headings
+    ) * (ego_path[nearest_points, 0] - car_path[:, 0])
+    change_share = np.clip((path_distances - change_start) / (2.0 * speed), 0.0, 1.0)
+    car_path = site.offset(car_path, -lateral_offsets * 0.5 * (1.0 - np.cos(np.pi * change_share)))
+    # it must be 10 m ahead of the ego where both paths meet: it starts early enough, or drives faster
+    ego_arrival, approach_speed = site.arrival(max(int(nearest_points[meeting_index]) - 10, 0)), SPEED
+    while time_to_cover(change_start, approach_speed, car_model.max_accel) > ego_arrival and approach_speed < 25.0:
+        approach_speed += 0.1
+    waiting_point = (
+        int(nearest_points[meeting_index])
+        - 10
+        - round(SPEED * time_to_cover(change_start, approach_speed, car_model.max_accel))
+    )
     pose = pose_at(site.graph, start)
-    when = site.reaches(wait, pose) if wait > 10 else Condition("ego_speed", 0.5)
-    phases = (Phase(round(fast, 3), when), Phase(speed, Condition("travelled", begin)))
-    site.add("car from the ramp", body.name, pose, phases, way)
+    start_condition = site.reaches(waiting_point, pose) if waiting_point > 10 else Condition("ego_speed", 0.5)
+    phases = (Phase(round(approach_speed, 3), start_condition), Phase(speed, Condition("travelled", change_start)))
+    site.add("car from the ramp", car_model.name, pose, phases, car_path)
 
 
 # ---------------------------------------------------------------- flows
@@ -276,11 +295,11 @@ def _gaps(site: Site, default: tuple[float, float]) -> tuple[float, float]:
 def turn_flow(site: Site, *, sides: tuple[float, ...], signals: SignalPlan, back: float, on: float) -> None:
     """Cars go straight on through the junction in which the ego turns."""
     speed, gaps = _flow_speed(site, 20.0), _gaps(site, (25.0, 50.0))
-    entry, inside = site.approach(sides)
-    start = site.before_junction(entry, back * speed)
-    way = site.way(start, site.beyond(entry, float(site.graph.length[inside]) + on * speed))
+    entry_place, junction_lane = site.approach(sides)
+    start = site.before_junction(entry_place, back * speed)
+    flow_path = site.way(start, site.beyond(entry_place, float(site.graph.length[junction_lane]) + on * speed))
     site.signals = signals
-    site.flow(way, gaps, speed)
+    site.flow(flow_path, gaps, speed)
 
 
 def actor_flow(site: Site, *, lanes: bool = False, back: bool = False) -> None:
@@ -296,19 +315,28 @@ def actor_flow(site: Site, *, lanes: bool = False, back: bool = False) -> None:
     site.flow(site.way(start, end), gaps, speed)
     site.target_speed = max(SPEED, min(speed, float(site.route.speed_limit[site.start])))
     for side in ("left", "right") if lanes else ():
-        a, b = beside(site.graph, start, side), beside(site.graph, end, side)
-        kind, same = site.graph.kind, site.graph.same_direction
-        if a and b and kind[a.lane] == kind[b.lane] == LaneType.DRIVING and same(start.lane, a.lane):
-            site.flow(site.way(a, b), gaps, speed)
+        flow_start, flow_end = beside(site.graph, start, side), beside(site.graph, end, side)
+        lane_kinds, same_direction = site.graph.kind, site.graph.same_direction
+        if (
+            flow_start
+            and flow_end
+            and lane_kinds[flow_start.lane] == lane_kinds[flow_end.lane] == LaneType.DRIVING
+            and same_direction(start.lane, flow_start.lane)
+        ):
+            site.flow(site.way(flow_start, flow_end), gaps, speed)
     if back:
-        a, b = beside(site.graph, end, "left"), beside(site.graph, start, "left")
-        if a is None or b is None or LaneType.DRIVING not in (site.graph.kind[a.lane], site.graph.kind[b.lane]):
+        flow_start, flow_end = beside(site.graph, end, "left"), beside(site.graph, start, "left")
+        if (
+            flow_start is None
+            or flow_end is None
+            or LaneType.DRIVING not in (site.graph.kind[flow_start.lane], site.graph.kind[flow_end.lane])
+        ):
             raise site.fail(f"{site.item.get('type')} needs a lane for the second flow")
-        site.flow(site.way(a, b), gaps, speed)
+        site.flow(site.way(flow_start, flow_end), gaps, speed)
 
 
 def bicycle_flow(site: Site) -> None:
-    """Bicycles cross the road that the ego takes."""
+    """Add bicycles that cross the road of the ego."""
     speed, gaps = min(_flow_speed(site, 10.0), 12.0), _gaps(site, (20.0, 50.0))
     start, end = site.lane_at("start_actor_flow"), site.lane_at("end_actor_flow")
     site.signals = SignalPlan("green", "red")
@@ -316,48 +344,52 @@ def bicycle_flow(site: Site) -> None:
 
 
 def invading(site: Site) -> None:
-    """Cars that come towards the ego drive partly in its lane, beside cones in their own."""
+    """Add oncoming cars that drive partly in the ego's lane, beside cones in their own."""
     distance, offset = site.number("distance", 100.0, 20.0, 500.0), site.number("offset", 0.25, -1.0, 1.5)
-    far = site.point(distance + 30.0, in_junction=True)
-    source, sink = site.oncoming(far), site.oncoming(site.start)
-    for k in range(1 + math.ceil(0.1 * distance)):
-        here = site.beyond(source, 15.0 + 5.0 * k)
-        pose, width = pose_at(site.graph, here), float(site.graph.at(here.lane, here.s)[3])
-        out = 0.4 * width
-        site.add(f"cone {k}", "cone", Pose(pose.x + out * math.sin(pose.yaw), pose.y - out * math.cos(pose.yaw)))
-    width = float(site.graph.at(sink.lane, sink.s)[3])
-    way = site.offset(site.way(source, sink), -(offset + 0.5 * width - 0.7))
-    site.flow(way, (40.0, 40.0), min(float(site.route.speed_limit[far]), SPEED), models=CARS)
+    far_point = site.point(distance + 30.0, in_junction=True)
+    flow_start, flow_end = site.oncoming(far_point), site.oncoming(site.start)
+    for cone_index in range(1 + math.ceil(0.1 * distance)):
+        cone_place = site.beyond(flow_start, 15.0 + 5.0 * cone_index)
+        pose, lane_width = pose_at(site.graph, cone_place), float(site.graph.at(cone_place.lane, cone_place.s)[3])
+        cone_offset = 0.4 * lane_width
+        site.add(
+            f"cone {cone_index}",
+            "cone",
+            Pose(pose.x + cone_offset * math.sin(pose.yaw), pose.y - cone_offset * math.cos(pose.yaw)),
+        )
+    lane_width = float(site.graph.at(flow_end.lane, flow_end.s)[3])
+    flow_path = site.offset(site.way(flow_start, flow_end), -(offset + 0.5 * lane_width - 0.7))
+    site.flow(flow_path, (40.0, 40.0), min(float(site.route.speed_limit[far_point]), SPEED), models=CARS)
 
 
 # ---------------------------------------------------------------- single cars
 
 
 def taking_priority(site: Site, *, signals: SignalPlan) -> None:
-    """A car comes fast into the junction, from the side that the file names, as the ego does."""
-    told = site.word("direction", "right", ("left", "right", "opposite"))
-    side = {"left": LEFT, "right": RIGHT, "opposite": ONCOMING}[told]
+    """Add a car that enters the junction fast, from the side that the file names, at the same time as the ego."""
+    direction = site.word("direction", "right", ("left", "right", "opposite"))
+    side = {"left": LEFT, "right": RIGHT, "opposite": ONCOMING}[direction]
     speed = 60.0 * KMH
     place = meeting_place(
         site.graph, site.scenario, site.route, sides=(side,), trigger_distance=35.0, speed=speed, body="coupe"
     )
     site.signals = signals
-    when = Condition("ego_distance", 35.0, len(site.actors))
-    way = lane_path(site.graph, place, 150.0)
-    site.add("emergency car", "coupe", pose_at(site.graph, place), (Phase(speed, when),), way)
+    start_condition = Condition("ego_distance", 35.0, len(site.actors))
+    car_path = lane_path(site.graph, place, 150.0)
+    site.add("emergency car", "coupe", pose_at(site.graph, place), (Phase(speed, start_condition),), car_path)
 
 
 def emergency(site: Site) -> None:
-    """A car comes from behind, 25 km/h faster than the ego, and wants to pass."""
-    back = site.number("distance", 140.0, 10.0, 500.0)
-    start = behind(site.graph, site.place(0), back)
+    """Add a car that comes from behind, 25 km/h faster than the ego, and wants to pass."""
+    start_distance = site.number("distance", 140.0, 10.0, 500.0)
+    start = behind(site.graph, site.place(0), start_distance)
     if site.apart(start, site.place(0)) < 8.0:
         raise site.fail("there is no road behind the ego")
-    site.driver("emergency car", start, back + site.route.length + 50.0, SPEED + 25.0 * KMH)
+    site.driver("emergency car", start, start_distance + site.route.length + 50.0, SPEED + 25.0 * KMH)
 
 
 def nobody(site: Site, *, signals: SignalPlan = SignalPlan()) -> None:  # noqa: B008  frozen
-    """Only the ego takes part."""
+    """Add no actors: the ego is alone."""
     site.signals = signals
 
 

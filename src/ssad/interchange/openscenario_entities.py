@@ -1,4 +1,4 @@
-"""Who takes part in an OpenSCENARIO document, and the models that play them."""
+"""Entities of an OpenSCENARIO document, and the models that represent them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ EGO_NAMES: Final = ("ego", "hero", "ego_vehicle", "egovehicle")
 
 @dataclass
 class Entity:
-    """An entity of the document, and what the storyboard has it do."""
+    """An entity of the document, and its behaviour in the storyboard."""
 
     name: str
     model: str
-    centre: tuple[float, float]  # of the body, seen from the reference point
+    centre: tuple[float, float]  # of the body, relative to the reference point
     ego: bool
     placed: bool = True
     speed: float = 0.0
@@ -34,75 +34,90 @@ class Entity:
     route: tuple[Pose, ...] = ()
     path: tuple[Pose, ...] = ()
     phases: tuple[Phase, ...] = ()
-    event: str = ""  # that made the last of them
+    event: str = ""  # name of the event that added the last phase
     rows: tuple[tuple[float, float, float, float], ...] = ()
     leaves: float = math.inf
     change: tuple[float, int, float] | None = None  # m from the start, lanes to the left, m that it takes
 
 
 def read_entities(root: Element, values: Values, lost: Counter[str], *, centred: bool) -> dict[str, Entity]:
-    """The entities of a document, by name, in its order; one of them is the ego.
+    """Return the entities of a document, by name, in its order; one of them is the ego.
 
     Args:
         root: The document.
-        values: Its values.
-        lost: Takes what is not carried over.
+        values: Reads the attributes of elements.
+        lost: Counter of the features that are not carried over.
         centred: Positions are those of the bodies' centres, whatever their bounding boxes say.
 
     Raises:
-        FormatError: It has none that could be the ego, or one is broken.
+        FormatError: No entity could be the ego, or an entity is broken.
     """
-    found: dict[str, Entity] = {}
+    entities: dict[str, Entity] = {}
     egos: list[str] = []
-    for item in root.iterfind("Entities/ScenarioObject"):
-        name = values.text(item, "name")
-        if name in found:
-            raise values.fail(item, f"there are two entities '{name}'")
-        body = next((one for one in item if one.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
+    for scenario_object in root.iterfind("Entities/ScenarioObject"):
+        name = values.text(scenario_object, "name")
+        if name in entities:
+            raise values.fail(scenario_object, f"there are two entities '{name}'")
+        body = next((child for child in scenario_object if child.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
         if body is None:
-            what = item[0].tag if len(item) else "nothing"
-            lost[f"entity '{name}': a {what} instead of its body: it is taken for a car"] += 1
-            found[name] = Entity(name, "car", (0.0, 0.0), False)
+            content = scenario_object[0].tag if len(scenario_object) else "nothing"
+            lost[f"entity '{name}': a {content} instead of its body: it is taken for a car"] += 1
+            entities[name] = Entity(name, "car", (0.0, 0.0), False)
         else:
-            found[name] = Entity(name, *_body(name, body, values, lost, centred), False)
-        kinds = {p.get("value", "") for p in item.iter("Property") if p.get("name") == "type"}
-        if "ego_vehicle" in kinds or name.lower() in EGO_NAMES:
+            entities[name] = Entity(name, *_body(name, body, values, lost, centred), False)
+        type_properties = {
+            property_element.get("value", "")
+            for property_element in scenario_object.iter("Property")
+            if property_element.get("name") == "type"
+        }
+        if "ego_vehicle" in type_properties or name.lower() in EGO_NAMES:
             egos.append(name)
-    if not found:
+    if not entities:
         raise values.fail("Entities", "there is no ScenarioObject")
     if len(egos) > 1:
         lost[f"of {len(egos)} egos only '{egos[0]}' is driven by the system under test"] += 1
-    vehicles = [n for n, e in found.items() if e.model not in ("walker", "vending_machine", "barrier", "cone")]
+    vehicles = [
+        entity_name
+        for entity_name, entity in entities.items()
+        if entity.model not in ("walker", "vending_machine", "barrier", "cone")
+    ]
     if not egos and not vehicles:
         raise values.fail("Entities", "no vehicle could be the ego")
     if not egos:
         lost[f"no entity is called ego or hero: '{vehicles[0]}' is taken for it"] += 1
-    found[(egos or vehicles)[0]].ego = True
-    if len(found) > MAX_AGENTS:
-        raise values.fail("Entities", f"{len(found)} entities; a scene has room for {MAX_AGENTS}")
-    return found
+    entities[(egos or vehicles)[0]].ego = True
+    if len(entities) > MAX_AGENTS:
+        raise values.fail("Entities", f"{len(entities)} entities; a scene has room for {MAX_AGENTS}")
+    return entities
 
 
 def _body(
     name: str, body: Element, values: Values, lost: Counter[str], centred: bool
 ) -> tuple[str, tuple[float, float]]:
-    """The model that plays a body, and where the body's centre is."""
-    told = [p.get("value", "") for p in body.iter("Property") if p.get("name") == "ssad.model"]
-    box = body.find("BoundingBox/Dimensions")
+    """Return the model that represents a body, and the position of the body's centre."""
+    model_names = [
+        property_element.get("value", "")
+        for property_element in body.iter("Property")
+        if property_element.get("name") == "ssad.model"
+    ]
+    dimensions = body.find("BoundingBox/Dimensions")
     centre = body.find("BoundingBox/Center")
-    if box is None or centre is None:
+    if dimensions is None or centre is None:
         raise values.fail(body, f"entity '{name}' has no BoundingBox")
-    size = [values.number(box, key) for key in ("length", "width", "height")]
-    middle = (0.0, 0.0) if centred else (values.number(centre, "x"), values.number(centre, "y"))
-    if told and told[0] in MODELS:
-        return told[0], middle
+    size = [values.number(dimensions, key) for key in ("length", "width", "height")]
+    offset = (0.0, 0.0) if centred else (values.number(centre, "x"), values.number(centre, "y"))
+    if model_names and model_names[0] in MODELS:
+        return model_names[0], offset
     category = {"Pedestrian": "pedestrian", "MiscObject": "prop"}.get(body.tag)
     if category is None:
         category = values.text(body, "vehicleCategory")
     model = MODEL_OF.get(values.text(body, "name", "")) or nearest_model(category, size)
     if model is None:
         raise values.fail(body, f"entity '{name}': nobody here is like a {category[:40]}")
-    own = (MODELS[model].length, MODELS[model].width, MODELS[model].height)
-    if max(abs(a - b) for a, b in zip(own, size, strict=True)) > 0.05:
-        lost[f"the body of '{name}' ({size[0]:g} x {size[1]:g} m) becomes '{model}' ({own[0]:g} x {own[1]:g} m)"] += 1
-    return model, middle
+    model_size = (MODELS[model].length, MODELS[model].width, MODELS[model].height)
+    if max(abs(model_extent - extent) for model_extent, extent in zip(model_size, size, strict=True)) > 0.05:
+        lost[
+            f"the body of '{name}' ({size[0]:g} x {size[1]:g} m) becomes '{model}' "
+            f"({model_size[0]:g} x {model_size[1]:g} m)"
+        ] += 1
+    return model, offset

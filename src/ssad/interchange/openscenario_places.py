@@ -20,14 +20,14 @@ from ssad.world.roads.query import nearest_all
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-LONGEST = 1.0e4  # m along lanes from one entity to another
+LONGEST = 1.0e4  # m along lanes between two entities
 LANES = 20
-NEAR = 2.0  # m outside a lane at which somebody still belongs to it
+NEAR = 2.0  # m outside a lane within which an entity still belongs to it
 _PARAMETER = re.compile(r"^\$\{?\s*(\w+)\s*\}?$")
 
 
 class Values:
-    """Attributes of elements, with the document's parameters put in; errors name file and element."""
+    """Attributes of elements with the document's parameters substituted; errors name file and element."""
 
     def __init__(self, where: str, root: Element) -> None:
         self.where = where
@@ -36,7 +36,7 @@ class Values:
         }
 
     def fail(self, element: Element | str, message: str) -> FormatError:
-        """A FormatError that says where."""
+        """Return a FormatError that names the file and the element."""
         tag = element if isinstance(element, str) else element.tag
         return FormatError(f"{self.where}: {tag}: {message}")
 
@@ -45,24 +45,24 @@ class Values:
         value = element.get(name, default)
         if value is None:
             raise self.fail(element, f"attribute '{name}' is missing")
-        found = _PARAMETER.match(value)
-        if found is None:
+        reference = _PARAMETER.match(value)
+        if reference is None:
             if value.startswith("$"):
                 raise self.fail(element, f"{name}: expressions are not read, only $parameter: {value[:60]}")
             return value
-        if found[1] not in self.parameters:
-            raise self.fail(element, f"{name}: parameter ${found[1]} is not declared")
-        return self.parameters[found[1]]
+        if reference[1] not in self.parameters:
+            raise self.fail(element, f"{name}: parameter ${reference[1]} is not declared")
+        return self.parameters[reference[1]]
 
     def number(self, element: Element, name: str, default: float | None = None) -> float:
-        """An attribute as a finite number. FormatError if it is none."""
-        told = self.text(element, name, None if default is None else repr(default))
+        """Return an attribute as a finite number. FormatError if it is none."""
+        number_text = self.text(element, name, None if default is None else repr(default))
         try:
-            value = float(told)
+            value = float(number_text)
         except ValueError:
-            raise self.fail(element, f"{name} is '{told[:40]}', not a number") from None
+            raise self.fail(element, f"{name} is '{number_text[:40]}', not a number") from None
         if not math.isfinite(value):
-            raise self.fail(element, f"{name} is '{told[:40]}', not a finite number")
+            raise self.fail(element, f"{name} is '{number_text[:40]}', not a finite number")
         return value
 
     def lanes(self, element: Element, name: str) -> int:
@@ -74,18 +74,18 @@ class Values:
 
 
 class Places:
-    """Positions as poses in the world frame; what is only nearly right is counted in `lost`."""
+    """Positions as poses in the world frame; inexact conversions are counted in `lost`."""
 
     def __init__(
         self, values: Values, graph: LaneGraph, *, mirrored: bool, lost: Counter[str], starts: Mapping[str, Element]
     ) -> None:
-        """Positions of one document.
+        """Create the reader of one document.
 
         Args:
-            values: Its values.
-            graph: Its town.
+            values: Reads the attributes of elements.
+            graph: Lane graph of the town.
             mirrored: World positions are in CARLA's left-handed frame.
-            lost: Takes what is not carried over.
+            lost: Counter of the features that are not carried over.
             starts: Name of an entity -> its position at the start.
         """
         self.values, self.graph, self.lost, self.starts = values, graph, lost, starts
@@ -102,7 +102,7 @@ class Places:
         }
 
     def pose(self, position: Element | None, *, within: Element) -> Pose:
-        """The pose that a Position means. FormatError if it is missing, broken or of a kind that is not read."""
+        """Return the pose of a Position. FormatError if it is missing, broken or of an unsupported kind."""
         if position is None or not len(position):
             raise self.values.fail(within, "Position is missing or empty")
         kind = position[0].tag
@@ -111,11 +111,11 @@ class Places:
         return self._kinds[kind](position[0])
 
     def reads(self, position: Element | None) -> bool:
-        """Whether a position is of a kind that is read; a missing one is not: `pose` says so."""
+        """Return whether a position is of a supported kind; true if it is missing, which `pose` reports."""
         return position is None or not len(position) or position[0].tag in self._kinds
 
     def start(self, entity: str, *, within: Element) -> Pose:
-        """Where an entity is at the start. FormatError if it has no place, or places refer to each other in a ring."""
+        """Return the start pose of an entity. FormatError if it has none, or positions refer to each other."""
         if entity not in self.starts:
             raise self.values.fail(within, f"entity '{entity}' has no position at the start")
         if entity in self._open:
@@ -127,95 +127,105 @@ class Places:
             self._open.discard(entity)
 
     def lane_under(self, pose: Pose, *, aligned: bool = True) -> Place | None:
-        """The driving lane under a pose, if any goes its way."""
-        lane, s, gap = nearest_all(self.graph, (pose.x, pose.y), (LaneType.DRIVING,))
+        """Return the driving lane under a pose; with `aligned`, only one with its direction."""
+        lanes, positions, distances = nearest_all(self.graph, (pose.x, pose.y), (LaneType.DRIVING,))
         best: tuple[float, Place] | None = None
-        for one, along, off in zip(lane.tolist(), s.tolist(), gap.tolist(), strict=True):
-            turn = abs(float(wrap_angle(self.graph.at(one, along)[2] - pose.yaw)))
-            if off <= NEAR and (not aligned or turn < math.pi / 3) and (best is None or max(off, 0) < best[0]):
-                best = max(off, 0.0), Place(one, along)
+        for candidate, lane_position, distance in zip(
+            lanes.tolist(), positions.tolist(), distances.tolist(), strict=True
+        ):
+            heading_difference = abs(float(wrap_angle(self.graph.at(candidate, lane_position)[2] - pose.yaw)))
+            if (
+                distance <= NEAR
+                and (not aligned or heading_difference < math.pi / 3)
+                and (best is None or max(distance, 0) < best[0])
+            ):
+                best = max(distance, 0.0), Place(candidate, lane_position)
         return best[1] if best else None
 
     def _world(self, element: Element) -> Pose:
         x, y, yaw = (self.values.number(element, name, 0.0 if name == "h" else None) for name in ("x", "y", "h"))
+        # Adding 0.0 turns a negative zero into zero.
         return Pose(x, self._hand * y + 0.0, self._hand * yaw + 0.0)
 
     def _turned(self, element: Element, pose: Pose) -> Pose:
-        """The pose with an Orientation of the element; relative unless it says absolute."""
-        told = element.find("Orientation")
-        if told is None:
+        """Return the pose with an Orientation of the element, relative unless it says absolute."""
+        orientation = element.find("Orientation")
+        if orientation is None:
             return pose
-        h = self._hand * self.values.number(told, "h", 0.0)
-        absolute = self.values.text(told, "type", "absolute") == "absolute"
-        return Pose(pose.x, pose.y, h if absolute else float(wrap_angle(pose.yaw + h)))
+        heading = self._hand * self.values.number(orientation, "h", 0.0)
+        absolute = self.values.text(orientation, "type", "absolute") == "absolute"
+        return Pose(pose.x, pose.y, heading if absolute else float(wrap_angle(pose.yaw + heading)))
 
     def _on_lane(self, element: Element, lane: int, s: float) -> Place:
-        """The place at s of a lane by its OpenDRIVE ids; s is measured along the lane itself."""
+        """Return the place at s of a lane by its OpenDRIVE ids; s is measured along the lane itself."""
         graph = self.graph
         road = int(self.values.number(element, "roadId"))
-        rows = np.flatnonzero((graph.road == road) & (graph.lane_id == lane))
-        if not len(rows):
+        sections = np.flatnonzero((graph.road == road) & (graph.lane_id == lane))
+        if not len(sections):
             raise self.values.fail(element, f"town '{graph.name}' has no lane {lane} of road {road}")
-        rows = rows[np.argsort(graph.section[rows])]
-        total = float(graph.length[rows].sum())
-        if not -1.0 <= s <= total + 1.0:
-            raise self.values.fail(element, f"s is {s:g} m; lane {lane} of road {road} has {total:.1f} m")
+        sections = sections[np.argsort(graph.section[sections])]
+        road_length = float(graph.length[sections].sum())
+        if not -1.0 <= s <= road_length + 1.0:
+            raise self.values.fail(element, f"s is {s:g} m; lane {lane} of road {road} has {road_length:.1f} m")
         self.lost["positions by road and s are taken along the lane, not along the road's reference line"] += 1
-        for row in rows.tolist():
-            length = float(graph.length[row])
-            if s <= length or row == rows[-1]:
-                return Place(row, min(max(s, 0.0), length) if lane < 0 else min(max(length - s, 0.0), length))
+        for section in sections.tolist():
+            length = float(graph.length[section])
+            if s <= length or section == sections[-1]:
+                # Lanes with a positive id run against s.
+                return Place(section, min(max(s, 0.0), length) if lane < 0 else min(max(length - s, 0.0), length))
             s -= length
         raise AssertionError
 
     def _lane(self, element: Element) -> Pose:
-        lane = int(self.values.number(element, "laneId"))
-        place = self._on_lane(element, lane, self.values.number(element, "s"))
-        aside = self.values.number(element, "offset", 0.0) * (1.0 if lane < 0 else -1.0)
-        return self._turned(element, shifted(pose_at(self.graph, place), 0.0, aside))
+        lane_id = int(self.values.number(element, "laneId"))
+        place = self._on_lane(element, lane_id, self.values.number(element, "s"))
+        lateral_offset = self.values.number(element, "offset", 0.0) * (1.0 if lane_id < 0 else -1.0)
+        return self._turned(element, shifted(pose_at(self.graph, place), 0.0, lateral_offset))
 
     def _road(self, element: Element) -> Pose:
         t = self.values.number(element, "t")
-        road = int(self.values.number(element, "roadId"))
-        rows = np.flatnonzero((self.graph.road == road) & (self.graph.kind == LaneType.DRIVING))
-        if not len(rows):
-            raise self.values.fail(element, f"town '{self.graph.name}' has no driving lane of road {road}")
-        ids = sorted({int(n) for n in self.graph.lane_id[rows]}, key=abs)
-        lane = next((n for n in ids if n * t > 0.0), ids[0])
-        place = self._on_lane(element, lane, self.values.number(element, "s"))
+        road_id = int(self.values.number(element, "roadId"))
+        driving_lanes = np.flatnonzero((self.graph.road == road_id) & (self.graph.kind == LaneType.DRIVING))
+        if not len(driving_lanes):
+            raise self.values.fail(element, f"town '{self.graph.name}' has no driving lane of road {road_id}")
+        lane_ids = sorted({int(lane_id) for lane_id in self.graph.lane_id[driving_lanes]}, key=abs)
+        nearest_id = next((lane_id for lane_id in lane_ids if lane_id * t > 0.0), lane_ids[0])
+        place = self._on_lane(element, nearest_id, self.values.number(element, "s"))
         width = self.graph.at(place.lane, place.s)[3]
-        middle = math.copysign((abs(lane) - 0.5) * width, lane)
-        aside = (t - middle) * (1.0 if lane < 0 else -1.0)
-        return self._turned(element, shifted(pose_at(self.graph, place), 0.0, aside))
+        middle = math.copysign((abs(nearest_id) - 0.5) * width, nearest_id)
+        lateral_offset = (t - middle) * (1.0 if nearest_id < 0 else -1.0)
+        return self._turned(element, shifted(pose_at(self.graph, place), 0.0, lateral_offset))
 
     def _relative(self, element: Element) -> Pose:
-        base = self.start(self.values.text(element, "entityRef"), within=element)
-        dx = self.values.number(element, "dx", 0.0)
-        dy = self._hand * self.values.number(element, "dy", 0.0)
+        reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
+        forward = self.values.number(element, "dx", 0.0)
+        leftward = self._hand * self.values.number(element, "dy", 0.0)
         if element.tag == "RelativeWorldPosition":
-            return self._turned(element, Pose(base.x + dx, base.y + dy, base.yaw))
-        return self._turned(element, shifted(base, dx, dy))
+            return self._turned(
+                element, Pose(reference_pose.x + forward, reference_pose.y + leftward, reference_pose.yaw)
+            )
+        return self._turned(element, shifted(reference_pose, forward, leftward))
 
     def _along(self, element: Element) -> Pose:
-        base = self.start(self.values.text(element, "entityRef"), within=element)
-        place = self.lane_under(base)
+        reference_pose = self.start(self.values.text(element, "entityRef"), within=element)
+        place = self.lane_under(reference_pose)
         if place is None:
             raise self.values.fail(element, "no lane under the entity that it refers to")
-        dt = self.values.number(element, "dt" if element.tag == "RelativeRoadPosition" else "offset", 0.0)
-        ds = self.values.number(element, "ds", self.values.number(element, "dsLane", 0.0))
-        over = self.values.lanes(element, "dLane")
-        if abs(ds) > LONGEST:
-            raise self.values.fail(element, f"ds is {ds:g} m, beyond {LONGEST:g} m")
-        place = ahead(self.graph, place, ds) if ds >= 0.0 else behind(self.graph, place, -ds)
+        lateral_offset = self.values.number(element, "dt" if element.tag == "RelativeRoadPosition" else "offset", 0.0)
+        distance = self.values.number(element, "ds", self.values.number(element, "dsLane", 0.0))
+        lane_count = self.values.lanes(element, "dLane")
+        if abs(distance) > LONGEST:
+            raise self.values.fail(element, f"ds is {distance:g} m, beyond {LONGEST:g} m")
+        place = ahead(self.graph, place, distance) if distance >= 0.0 else behind(self.graph, place, -distance)
         pose = pose_at(self.graph, place)
-        left = over > 0
-        for _ in range(abs(over)):
-            lane = int((self.graph.left if left else self.graph.right)[place.lane])
+        to_left = lane_count > 0
+        for _ in range(abs(lane_count)):
+            lane = int((self.graph.left if to_left else self.graph.right)[place.lane])
             if lane < 0:
-                raise self.values.fail(element, f"there is no lane {over} beside the entity that it refers to")
-            found = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[lane])),))
-            at = int(np.flatnonzero(found[0] == lane)[0])
-            left ^= not self.graph.same_direction(place.lane, lane)  # what is further left is on the right of those
-            place = Place(lane, float(found[1][at]))
+                raise self.values.fail(element, f"there is no lane {lane_count} beside the entity that it refers to")
+            nearest = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[lane])),))
+            match = int(np.flatnonzero(nearest[0] == lane)[0])
+            to_left ^= not self.graph.same_direction(place.lane, lane)  # what is further left is on the right of those
+            place = Place(lane, float(nearest[1][match]))
             pose = pose_at(self.graph, place)
-        return self._turned(element, shifted(pose, 0.0, dt))
+        return self._turned(element, shifted(pose, 0.0, lateral_offset))

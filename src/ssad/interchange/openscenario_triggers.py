@@ -1,4 +1,4 @@
-"""Triggers of an OpenSCENARIO document as conditions of phases."""
+"""Triggers of an OpenSCENARIO document, converted to conditions of phases."""
 
 from __future__ import annotations
 
@@ -20,93 +20,109 @@ _OUTER: Final = ("Condition", "ByEntityCondition", "ByValueCondition", "EntityCo
 
 
 class Triggers:
-    """The triggers of a document; what has no counterpart is counted in `lost`."""
+    """The triggers of a document; triggers without a counterpart are counted in `lost`."""
 
     def __init__(self, places: Places, entities: Mapping[str, Entity], lost: Counter[str]) -> None:
         self.values, self.places, self.entities, self.lost = places.values, places, entities, lost
         self.ego = next(entity for entity in entities.values() if entity.ego)
-        self._order = [name for name, one in entities.items() if not one.ego and one.placed]  # as conditions count
+        self._order = [
+            name for name, candidate in entities.items() if not candidate.ego and candidate.placed
+        ]  # as conditions count
 
     def who(self, element: Element) -> Entity:
-        """The entity that an element refers to. FormatError if there is none of that name."""
+        """Return the entity that an element refers to. FormatError if there is none of that name."""
         name = self.values.text(element, "entityRef")
         if name not in self.entities:
             raise self.values.fail(element, f"there is no entity '{name}'")
         return self.entities[name]
 
     def conditions(self, event: Element, entity: Entity, label: str) -> tuple[Condition, ...] | None:
-        """What the trigger of an event or act waits for, one after the other; None: for nothing with a counterpart."""
-        found: list[tuple[Condition, ...]] = []
-        after: list[Condition] = []  # delays since the event before
-        left, ends = list[str](), 0
-        for told in event.iterfind("StartTrigger/ConditionGroup/Condition"):
-            inner = next((one for one in told.iter() if one.tag.endswith("Condition") and one.tag not in _OUTER), None)
-            if inner is None:
-                raise self.values.fail(told, f"the condition of '{label}' is empty")
-            delay = max(self.values.number(told, "delay", 0.0), 0.0)
-            if inner.tag == "StoryboardElementStateCondition":
-                state = self.values.text(inner, "state")
+        """Return the sequence of conditions that the trigger of an event or act waits for.
+
+        Returns:
+            The conditions, in their order; None if no part of the trigger has a counterpart.
+        """
+        alternatives: list[tuple[Condition, ...]] = []
+        delays: list[Condition] = []  # delays since the previous event
+        unread, completed = list[str](), 0
+        for condition in event.iterfind("StartTrigger/ConditionGroup/Condition"):
+            condition_type = next(
+                (
+                    sequence
+                    for sequence in condition.iter()
+                    if sequence.tag.endswith("Condition") and sequence.tag not in _OUTER
+                ),
+                None,
+            )
+            if condition_type is None:
+                raise self.values.fail(condition, f"the condition of '{label}' is empty")
+            delay = max(self.values.number(condition, "delay", 0.0), 0.0)
+            if condition_type.tag == "StoryboardElementStateCondition":
+                state = self.values.text(condition_type, "state")
                 if state not in ("runningState", "completeState", "startTransition"):
-                    left.append(f"{inner.tag} {state}")
-                elif delay and self.values.text(inner, "storyboardElementRef") != entity.event:
+                    unread.append(f"{condition_type.tag} {state}")
+                elif delay and self.values.text(condition_type, "storyboardElementRef") != entity.event:
                     self.lost[f"the delay of the trigger of '{label}' after another event than the one before"] += 1
                 elif delay:
-                    after.append(Condition("after", delay))
-                    ends += state == "completeState"
-                continue  # phases come one after the other
-            when = self._one(told, inner, entity)
-            if when is None:
-                left.append(inner.tag)
+                    delays.append(Condition("after", delay))
+                    completed += state == "completeState"
+                continue  # phases follow each other in any case
+            converted = self._one(condition, condition_type, entity)
+            if converted is None:
+                unread.append(condition_type.tag)
                 continue
-            if when.kind in ("always", "time") and delay:
-                when, delay = Condition("time", when.value + delay), 0.0
-            one = (when, Condition("after", delay)) if delay else (when,)
-            if one not in found:
-                found.append(one)
-        if after and ends == len(after):
+            if converted.kind in ("always", "time") and delay:
+                converted, delay = Condition("time", converted.value + delay), 0.0
+            sequence = (converted, Condition("after", delay)) if delay else (converted,)
+            if sequence not in alternatives:
+                alternatives.append(sequence)
+        # Our writer gives each delay for a running and for a completed event; other files may have only the latter.
+        if delays and completed == len(delays):
             self.lost[f"the delay of the trigger of '{label}' is counted from where the event before begins"] += 1
-        real = [one for one in found if one != (Condition("always"),)] or ([] if after else found)
-        for tag in left:
-            self.lost[f"{tag} of the trigger of '{label}'"] += 1
-        if len(real) > 1:
-            self.lost[f"all but the first of the {len(real)} conditions of the trigger of '{label}'"] += 1
-        if real or after:
-            return (*after[:1], *(real[0] if real else ()))
-        return None if left else (Condition("always"),)
+        required = [sequence for sequence in alternatives if sequence != (Condition("always"),)] or (
+            [] if delays else alternatives
+        )
+        for unread_tag in unread:
+            self.lost[f"{unread_tag} of the trigger of '{label}'"] += 1
+        if len(required) > 1:
+            self.lost[f"all but the first of the {len(required)} conditions of the trigger of '{label}'"] += 1
+        if required or delays:
+            return (*delays[:1], *(required[0] if required else ()))
+        return None if unread else (Condition("always"),)
 
     def _one(self, told: Element, inner: Element, entity: Entity) -> Condition | None:
         rule = self.values.text(inner, "rule", "")
-        refs = [self.who(ref) for ref in told.iterfind(".//TriggeringEntities/EntityRef")]
+        triggering = [self.who(reference) for reference in told.iterfind(".//TriggeringEntities/EntityRef")]
         value = self.values.number(inner, "value", 0.0)
         if inner.tag == "SimulationTimeCondition" and rule in _GREATER:
             return Condition("time", value) if value > 0.0 else Condition("always")
-        if inner.tag == "TraveledDistanceCondition" and refs == [entity]:
+        if inner.tag == "TraveledDistanceCondition" and triggering == [entity]:
             return Condition("travelled", value)
-        if inner.tag == "SpeedCondition" and refs == [self.ego] and rule in _GREATER:
+        if inner.tag == "SpeedCondition" and triggering == [self.ego] and rule in _GREATER:
             return Condition("ego_speed", value)
-        if inner.tag == "RelativeDistanceCondition" and rule in _LESS and len(refs) == 1:
-            pair = [refs[0], self.who(inner)]
-            others = [one for one in pair if one is not self.ego]
-            kind = self.values.text(inner, "relativeDistanceType", "")
-            if len(others) != 1 or kind == "lateral":
+        if inner.tag == "RelativeDistanceCondition" and rule in _LESS and len(triggering) == 1:
+            entities = [triggering[0], self.who(inner)]
+            others = [entity_of_pair for entity_of_pair in entities if entity_of_pair is not self.ego]
+            distance_type = self.values.text(inner, "relativeDistanceType", "")
+            if len(others) != 1 or distance_type == "lateral":
                 return None
             if self.values.text(inner, "freespace", "false") == "true":
                 value += 0.5 * (MODELS[self.ego.model].length + MODELS[others[0].model].length)
                 self.lost[
                     "distances between bodies are taken as those between their centres, half the lengths added"
                 ] += 1
-            if kind == "longitudinal":
+            if distance_type == "longitudinal":
                 self.lost["distances along the road are taken as straight ones"] += 1
             if others[0].name not in self._order:
                 return None
             return Condition("ego_distance", value, self._order.index(others[0].name))
-        reaches = inner.tag == "ReachPositionCondition" or (inner.tag == "DistanceCondition" and rule in _LESS)
+        is_reach = inner.tag == "ReachPositionCondition" or (inner.tag == "DistanceCondition" and rule in _LESS)
         position = inner.find("Position")
-        if reaches and refs == [self.ego] and entity.placed and not entity.ego and self.places.reads(position):
-            # who waits stands: the ego is then so far from it
-            place, here = self.places.pose(position, within=inner), self.places.start(entity.name, within=inner)
-            more = self.values.number(inner, "tolerance", value)
+        if is_reach and triggering == [self.ego] and entity.placed and not entity.ego and self.places.reads(position):
+            # a waiting actor stands still, so the place is a distance from it
+            target, start = self.places.pose(position, within=inner), self.places.start(entity.name, within=inner)
+            tolerance = self.values.number(inner, "tolerance", value)
             self.lost[f"a place that the ego reaches is taken as its distance from '{entity.name}'"] += 1
-            gap = math.dist((place.x, place.y), (here.x, here.y))
-            return Condition("ego_distance", gap + more, self._order.index(entity.name))
+            gap = math.dist((target.x, target.y), (start.x, start.y))
+            return Condition("ego_distance", gap + tolerance, self._order.index(entity.name))
         return None

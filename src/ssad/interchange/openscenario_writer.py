@@ -1,8 +1,8 @@
-"""Scenarios as OpenSCENARIO XML 1.2: the episode that a scenario means, with everybody's place, path and triggers.
+"""Scenarios as OpenSCENARIO XML 1.2: the episode of a scenario, with places, paths and triggers of all agents.
 
-A vehicle's reference point is the centre of its body, which its bounding box and axles say too. The ego is left to
-whoever drives it: it has a start, a route and a target speed. What only this program understands stands in properties
-whose names begin with `ssad.`; what no program could understand is told to the caller.
+A vehicle's reference point is the centre of its body, as its bounding box and axles state. The ego is left to the
+system under test: it has a start, a route and a target speed. Facts that only SSAD understands are properties whose
+names begin with `ssad.`; facts that the format cannot express are reported to the caller.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from ssad.simulators.carla.blueprints import BLUEPRINTS, CATEGORY
 from ssad.world.models import model
 
 DATE: Final = "2026-01-01T00:00:00"  # required by the format; fixed, so that a scenario always gives the same text
-FAR: Final = 500.0  # m that who goes straight on is told to go
-EVERY: Final = 20  # points of a route between the waypoints that are written
+FAR: Final = 500.0  # m, length of the path of an agent that drives straight on
+EVERY: Final = 20  # every 20th point of a route becomes a waypoint
 _POLICIES = {Controller.AUTOPILOT: "autopilot", Controller.FOLLOW: "blind"}
 _MASS = {AgentKind.WALKER: 75.0, AgentKind.PROP: 50.0}  # kg; required by the format, used by nothing here
 
@@ -39,7 +39,7 @@ _MASS = {AgentKind.WALKER: 75.0, AgentKind.PROP: 50.0}  # kg; required by the fo
 def openscenario_text(
     episode: Episode, graph: LaneGraph, *, network: str, signals: Mapping[int, str], dt: float = 0.1
 ) -> tuple[str, tuple[str, ...]]:
-    """An episode as OpenSCENARIO XML 1.2.
+    """Write an episode as OpenSCENARIO XML 1.2.
 
     Args:
         episode: The episode.
@@ -49,7 +49,7 @@ def openscenario_text(
         dt: Step of the world, s.
 
     Returns:
-        The text, the same for the same episode, and what it does not carry over, a line each.
+        The text, the same for the same episode, and the features that it does not carry over, one line each.
     """
     return _Writer(episode, graph, signals, dt).write(network)
 
@@ -65,7 +65,7 @@ def _text(value: Any) -> str:
 
 
 class _Writer:
-    """The parts of one document."""
+    """Builder of one document."""
 
     def __init__(self, episode: Episode, graph: LaneGraph, signals: Mapping[int, str], dt: float) -> None:
         self.episode, self.graph, self.signals = episode, graph, signals
@@ -80,7 +80,7 @@ class _Writer:
         header = _node(
             root, "FileHeader", revMajor=1, revMinor=2, date=DATE, author="SSAD", description=f"{scenario.name}"
         )
-        own = {
+        metadata = {
             "type": scenario.type,
             "group": scenario.group or scenario.type,
             "source": scenario.source,
@@ -93,7 +93,7 @@ class _Writer:
             ),
         }
         properties = _node(header, "Properties")
-        for name, value in own.items():
+        for name, value in metadata.items():
             _node(properties, "Property", name=f"ssad.{name}", value=_text(value))
         _node(root, "ParameterDeclarations")
         _node(root, "CatalogLocations")
@@ -101,34 +101,45 @@ class _Writer:
         entities = _node(root, "Entities")
         for name, agent in zip(self.names, self.episode.agents, strict=True):
             self._entity(entities, name, agent)
-        board = _node(root, "Storyboard")
-        self._init(_node(_node(board, "Init"), "Actions"))
-        self._story(board)
-        self._stop(_node(board, "StopTrigger"))
+        storyboard = _node(root, "Storyboard")
+        self._init(_node(_node(storyboard, "Init"), "Actions"))
+        self._story(storyboard)
+        self._stop(_node(storyboard, "StopTrigger"))
         indent(root, " ")
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
         return text, tuple(self.lost)
 
-    # ------------------------------------------------------------ who
+    # ------------------------------------------------------------ entities
 
     def _entity(self, entities: Element, name: str, agent: EpisodeAgent) -> None:
-        body = model(agent.model)
-        item = _node(entities, "ScenarioObject", name=name)
+        agent_model = model(agent.model)
+        scenario_object = _node(entities, "ScenarioObject", name=name)
         blueprint = BLUEPRINTS.get(agent.model, agent.model)
-        mass = _MASS.get(body.kind, 1500.0)
-        if body.kind == AgentKind.WALKER:
-            one = _node(item, "Pedestrian", name=blueprint, mass=mass, pedestrianCategory="pedestrian", model=blueprint)
-        elif body.kind == AgentKind.PROP:
-            one = _node(item, "MiscObject", name=blueprint, mass=mass, miscObjectCategory="obstacle")
+        mass = _MASS.get(agent_model.kind, 1500.0)
+        if agent_model.kind == AgentKind.WALKER:
+            body_element = _node(
+                scenario_object,
+                "Pedestrian",
+                name=blueprint,
+                mass=mass,
+                pedestrianCategory="pedestrian",
+                model=blueprint,
+            )
+        elif agent_model.kind == AgentKind.PROP:
+            body_element = _node(
+                scenario_object, "MiscObject", name=blueprint, mass=mass, miscObjectCategory="obstacle"
+            )
         else:
-            one = _node(item, "Vehicle", name=blueprint, mass=mass, vehicleCategory=CATEGORY[body.kind])
-        _node(one, "ParameterDeclarations")
-        box = _node(one, "BoundingBox")
-        _node(box, "Center", x=0.0, y=0.0, z=0.5 * body.height)
-        _node(box, "Dimensions", width=body.width, length=body.length, height=body.height)
-        if body.kind not in _MASS:
-            _vehicle(one, body)
-        properties = _node(one, "Properties")
+            body_element = _node(
+                scenario_object, "Vehicle", name=blueprint, mass=mass, vehicleCategory=CATEGORY[agent_model.kind]
+            )
+        _node(body_element, "ParameterDeclarations")
+        bounding_box = _node(body_element, "BoundingBox")
+        _node(bounding_box, "Center", x=0.0, y=0.0, z=0.5 * agent_model.height)
+        _node(bounding_box, "Dimensions", width=agent_model.width, length=agent_model.length, height=agent_model.height)
+        if agent_model.kind not in _MASS:
+            _vehicle(body_element, agent_model)
+        properties = _node(body_element, "Properties")
         _node(properties, "Property", name="type", value="simulation" if agent is not self._ego else "ego_vehicle")
         _node(properties, "Property", name="ssad.model", value=agent.model)
 
@@ -139,45 +150,58 @@ class _Writer:
     # ------------------------------------------------------------ the start
 
     def _init(self, actions: Element) -> None:
-        named = {k: state for k, state in sorted(self.episode.signal_override.items()) if k in self.signals}
-        unnamed = len(self.episode.signal_override) - len(named)
-        for signal, state in named.items():
-            place = _node(_node(actions, "GlobalAction"), "InfrastructureAction")
-            told = _node(place, "TrafficSignalAction")
-            _node(told, "TrafficSignalStateAction", name=self.signals[signal], state=SignalState(state).name.lower())
-        if unnamed:
-            self.lost.append(f"{unnamed} signals that are forced are not in the map: other programs do not know them")
+        mapped_signals = {
+            signal_index: state
+            for signal_index, state in sorted(self.episode.signal_override.items())
+            if signal_index in self.signals
+        }
+        unmapped_count = len(self.episode.signal_override) - len(mapped_signals)
+        for signal, state in mapped_signals.items():
+            infrastructure = _node(_node(actions, "GlobalAction"), "InfrastructureAction")
+            signal_action = _node(infrastructure, "TrafficSignalAction")
+            _node(
+                signal_action,
+                "TrafficSignalStateAction",
+                name=self.signals[signal],
+                state=SignalState(state).name.lower(),
+            )
+        if unmapped_count:
+            self.lost.append(
+                f"{unmapped_count} signals that are forced are not in the map: other programs do not know them"
+            )
         if self.episode.signal_override and self.episode.override_until < self.until:
             self.lost.append(f"signals are forced only until {self.episode.override_until:g} s: others keep them")
-        free = int((~self.graph.signal_virtual).sum()) - len(set(self.episode.signal_override) & set(self.signals))
-        if free:
-            self.lost.append(f"the programme of {free} other signals of the town is not written")
+        uncontrolled_count = int((~self.graph.signal_virtual).sum()) - len(
+            set(self.episode.signal_override) & set(self.signals)
+        )
+        if uncontrolled_count:
+            self.lost.append(f"the programme of {uncontrolled_count} other signals of the town is not written")
         for name, agent in zip(self.names, self.episode.agents, strict=True):
             if agent.trajectory and agent.trajectory[0][0] > 0.0:
-                continue  # it is added later
-            private = _node(actions, "Private", entityRef=name)
-            action = _node(private, "PrivateAction")
+                continue  # an event adds it later
+            agent_actions = _node(actions, "Private", entityRef=name)
+            action = _node(agent_actions, "PrivateAction")
             _position(_node(action, "TeleportAction"), agent.pose)
             if model(agent.model).kind == AgentKind.PROP:
                 continue
-            _speed(_node(private, "PrivateAction"), agent.speed, "step", "time", 0.0)
+            _speed(_node(agent_actions, "PrivateAction"), agent.speed, "step", "time", 0.0)
             policy = agent.policy or _POLICIES.get(agent.controller, "")
             if agent is self._ego or policy:
-                self._driver(private, agent, policy or "system under test")
+                self._driver(agent_actions, agent, policy or "system under test")
             if agent.wake_distance > 0.0:
                 self.lost.append(f"{name} waits until the ego is within {agent.wake_distance:g} m: it starts at once")
 
     def _driver(self, private: Element, agent: EpisodeAgent, driver: str) -> None:
-        assign = _node(_node(_node(private, "PrivateAction"), "ControllerAction"), "AssignControllerAction")
-        properties = _node(_node(assign, "Controller", name=driver), "Properties")
+        controller_action = _node(_node(_node(private, "PrivateAction"), "ControllerAction"), "AssignControllerAction")
+        properties = _node(_node(controller_action, "Controller", name=driver), "Properties")
         module = "external_control" if agent is self._ego else "npc_vehicle_control"
         for key, value in {"module": module, "target_speed": float(agent.target_speed)}.items():
             _node(properties, "Property", name=key, value=_text(value))
         points = self._key_points(agent)
         if not points:
             return
-        follow = _node(_node(_node(private, "PrivateAction"), "RoutingAction"), "AssignRouteAction")
-        route = _node(follow, "Route", name=f"route of {driver}", closed=False)
+        route_action = _node(_node(_node(private, "PrivateAction"), "RoutingAction"), "AssignRouteAction")
+        route = _node(route_action, "Route", name=f"route of {driver}", closed=False)
         for pose in points:
             _position(_node(route, "Waypoint", routeStrategy="shortest"), pose)
 
@@ -185,16 +209,16 @@ class _Writer:
         scenario = self.episode.scenario
         if agent is self._ego:
             return scenario.route
-        number = self.episode.agents.index(agent) - 1
-        if scenario.actors and scenario.actors[number].path:
-            return tuple(Pose(x, y) for x, y in scenario.actors[number].path)
+        actor_index = self.episode.agents.index(agent) - 1
+        if scenario.actors and scenario.actors[actor_index].path:
+            return tuple(Pose(x, y) for x, y in scenario.actors[actor_index].path)
         if agent.route is None:
             return ()
         rows = np.column_stack([agent.route.xy, agent.route.yaw]).astype(np.float64)
-        kept = [*range(0, len(rows) - 1, EVERY), len(rows) - 1]
-        return tuple(Pose(*row) for row in rows[kept].tolist())
+        row_indices = [*range(0, len(rows) - 1, EVERY), len(rows) - 1]
+        return tuple(Pose(*row) for row in rows[row_indices].tolist())
 
-    # ------------------------------------------------------------ what happens
+    # ------------------------------------------------------------ the storyboard
 
     def _story(self, board: Element) -> None:
         act = None
@@ -211,35 +235,35 @@ class _Writer:
                 self._recorded(maneuver, name, agent)
             else:
                 self._scripted(maneuver, name, agent)
-        if act is None:  # the format asks for one
+        if act is None:  # the format requires an act in a story
             return
         trigger = _node(act, "StartTrigger")
         _by_time(_node(trigger, "ConditionGroup"), "start of the act", 0.0)
 
     def _recorded(self, maneuver: Element, name: str, agent: EpisodeAgent) -> None:
         rows = np.array(agent.trajectory)
-        if rows[0, 0] < 0.0 < rows[-1, 0]:  # what was before the start plays no part
-            after = int(np.searchsorted(rows[:, 0], 0.0, side="right"))
-            now = np.array([0.0, agent.pose.x, agent.pose.y, agent.pose.yaw])
-            rows = np.concatenate([now[None], rows[after:]])
-        begin, end = float(rows[0, 0]), float(rows[-1, 0])
-        if begin > 0.0:
+        if rows[0, 0] < 0.0 < rows[-1, 0]:  # rows before the start have no effect
+            first_future = int(np.searchsorted(rows[:, 0], 0.0, side="right"))
+            current_row = np.array([0.0, agent.pose.x, agent.pose.y, agent.pose.yaw])
+            rows = np.concatenate([current_row[None], rows[first_future:]])
+        begin_time, end_time = float(rows[0, 0]), float(rows[-1, 0])
+        if begin_time > 0.0:
             event = self._event(maneuver, f"{name} appears", "parallel")
             action = _node(_node(event, "Action", name=f"add {name}"), "GlobalAction")
             entity = _node(_node(action, "EntityAction", entityRef=name), "AddEntityAction")
             _position(entity, Pose(*rows[0, 1:].tolist()))
-            _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"{name} is due", begin)
+            _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"{name} is due", begin_time)
         event = self._event(maneuver, f"{name} drives", "override")
-        follow = self._follow(event, name, [(row[0], Pose(*row[1:])) for row in rows.tolist()])
-        timing = _node(follow, "TimeReference")
+        follow_action = self._follow(event, name, [(row[0], Pose(*row[1:])) for row in rows.tolist()])
+        timing = _node(follow_action, "TimeReference")
         _node(timing, "Timing", domainAbsoluteRelative="absolute", scale=1.0, offset=0.0)
-        _node(follow, "TrajectoryFollowingMode", followingMode="position")
-        _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"start of {name}", max(begin, 0.0))
-        if end < self.until:
+        _node(follow_action, "TrajectoryFollowingMode", followingMode="position")
+        _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"start of {name}", max(begin_time, 0.0))
+        if end_time < self.until:
             event = self._event(maneuver, f"{name} is gone", "parallel")
             action = _node(_node(event, "Action", name=f"delete {name}"), "GlobalAction")
             _node(_node(action, "EntityAction", entityRef=name), "DeleteEntityAction")
-            _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"end of {name}", end)
+            _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"end of {name}", end_time)
 
     def _scripted(self, maneuver: Element, name: str, agent: EpisodeAgent) -> None:
         event = self._event(maneuver, f"{name} keeps its path", "parallel")
@@ -247,70 +271,75 @@ class _Writer:
             rows = np.column_stack([agent.route.xy, agent.route.yaw]).astype(np.float64)
             points = [Pose(*row) for row in rows.tolist()]
         else:
-            here = agent.pose
-            there = Pose(here.x + FAR * math.cos(here.yaw), here.y + FAR * math.sin(here.yaw), here.yaw)
-            points = [here, there]
-        follow = self._follow(event, name, [(None, pose) for pose in points])
-        _node(_node(follow, "TimeReference"), "None")
-        _node(follow, "TrajectoryFollowingMode", followingMode="position")
+            start = agent.pose
+            end = Pose(start.x + FAR * math.cos(start.yaw), start.y + FAR * math.sin(start.yaw), start.yaw)
+            points = [start, end]
+        follow_action = self._follow(event, name, [(None, pose) for pose in points])
+        _node(_node(follow_action, "TimeReference"), "None")
+        _node(follow_action, "TrajectoryFollowingMode", followingMode="position")
         _by_time(_node(_node(event, "StartTrigger"), "ConditionGroup"), f"path of {name}", 0.0)
-        body = model(agent.model)
-        speed, before = agent.speed, ""
-        for k, phase in enumerate(agent.phases):
-            event = self._event(maneuver, f"{name} phase {k}", "override")
-            action = _node(_node(event, "Action", name=f"{name} speed {k}"), "PrivateAction")
-            if body.kind == AgentKind.WALKER:
+        agent_model = model(agent.model)
+        speed, previous_event = agent.speed, ""
+        for phase_index, phase in enumerate(agent.phases):
+            event = self._event(maneuver, f"{name} phase {phase_index}", "override")
+            action = _node(_node(event, "Action", name=f"{name} speed {phase_index}"), "PrivateAction")
+            if agent_model.kind == AgentKind.WALKER:
                 _speed(action, phase.speed, "step", "time", 0.0)
             else:
-                rate = body.max_accel if phase.speed >= speed else body.max_brake
-                _speed(action, phase.speed, "linear", "rate", rate)
+                acceleration = agent_model.max_accel if phase.speed >= speed else agent_model.max_brake
+                _speed(action, phase.speed, "linear", "rate", acceleration)
             trigger = _node(event, "StartTrigger")
-            # phases are latched, one after the other: an event waits for the one before it to run, or to be over
-            for state in ("runningState", "completeState") if before else ("",):
-                group = _node(trigger, "ConditionGroup")
+            # phases are latched, one after another: an event waits until the previous one runs or is complete
+            for state in ("runningState", "completeState") if previous_event else ("",):
+                condition_group = _node(trigger, "ConditionGroup")
                 if phase.when.kind != "after":
-                    self._condition(group, f"{name} condition {k}", name, phase.when)
-                elif not before:
-                    _by_time(group, f"{name} condition {k}", phase.when.value)
+                    self._condition(condition_group, f"{name} condition {phase_index}", name, phase.when)
+                elif not previous_event:
+                    _by_time(condition_group, f"{name} condition {phase_index}", phase.when.value)
                 if state:
                     delay = phase.when.value if phase.when.kind == "after" else 0.0
-                    by = _node(_condition(group, f"{name} {k} after {k - 1}", delay), "ByValueCondition")
+                    value_condition = _node(
+                        _condition(condition_group, f"{name} {phase_index} after {phase_index - 1}", delay),
+                        "ByValueCondition",
+                    )
                     _node(
-                        by,
+                        value_condition,
                         "StoryboardElementStateCondition",
                         storyboardElementType="event",
-                        storyboardElementRef=before,
+                        storyboardElementRef=previous_event,
                         state=state,
                     )
-            speed, before = phase.speed, f"{name} phase {k}"
+            speed, previous_event = phase.speed, f"{name} phase {phase_index}"
 
     def _event(self, maneuver: Element, name: str, priority: str) -> Element:
         return _node(maneuver, "Event", name=name, priority=priority, maximumExecutionCount=1)
 
     def _follow(self, event: Element, name: str, vertices: list[tuple[float | None, Pose]]) -> Element:
         action = _node(_node(event, "Action", name=f"path of {name}"), "PrivateAction")
-        follow = _node(_node(action, "RoutingAction"), "FollowTrajectoryAction")
-        told = _node(_node(follow, "TrajectoryRef"), "Trajectory", name=f"trajectory of {name}", closed=False)
-        line = _node(_node(told, "Shape"), "Polyline")
+        follow_action = _node(_node(action, "RoutingAction"), "FollowTrajectoryAction")
+        trajectory = _node(
+            _node(follow_action, "TrajectoryRef"), "Trajectory", name=f"trajectory of {name}", closed=False
+        )
+        polyline = _node(_node(trajectory, "Shape"), "Polyline")
         for time, pose in vertices:
-            vertex = _node(line, "Vertex", **({} if time is None else {"time": time}))
+            vertex = _node(polyline, "Vertex", **({} if time is None else {"time": time}))
             _position(vertex, pose)
-        return follow
+        return follow_action
 
     def _condition(self, group: Element, label: str, name: str, when: Condition) -> None:
         if when.kind in ("always", "time"):
             _by_time(group, label, when.value if when.kind == "time" else 0.0)
             return
         ego = self.names[0]
-        who = name if when.kind == "travelled" else ego
-        entity = _by_entity(group, label, who)
+        subject = name if when.kind == "travelled" else ego
+        entity_condition = _by_entity(group, label, subject)
         if when.kind == "travelled":
-            _node(entity, "TraveledDistanceCondition", value=float(when.value))
+            _node(entity_condition, "TraveledDistanceCondition", value=float(when.value))
         elif when.kind == "ego_speed":
-            _node(entity, "SpeedCondition", value=float(when.value), rule="greaterThan")
+            _node(entity_condition, "SpeedCondition", value=float(when.value), rule="greaterThan")
         else:
             _node(
-                entity,
+                entity_condition,
                 "RelativeDistanceCondition",
                 entityRef=self.names[1 + when.actor],
                 value=float(when.value),
@@ -327,27 +356,29 @@ class _Writer:
             _by_time(_node(trigger, "ConditionGroup"), "max_time", limits.max_time)
         ego = self.names[0]
         if limits.max_distance < Limits().max_distance:
-            entity = _by_entity(_node(trigger, "ConditionGroup"), "max_distance", ego)
-            _node(entity, "TraveledDistanceCondition", value=float(limits.max_distance))
+            entity_condition = _by_entity(_node(trigger, "ConditionGroup"), "max_distance", ego)
+            _node(entity_condition, "TraveledDistanceCondition", value=float(limits.max_distance))
         if limits.contact == "end":
             for name in self.names[1:]:
-                entity = _by_entity(_node(trigger, "ConditionGroup"), f"collision with {name}", ego)
-                _node(_node(entity, "CollisionCondition"), "EntityRef", entityRef=name)
+                entity_condition = _by_entity(_node(trigger, "ConditionGroup"), f"collision with {name}", ego)
+                _node(_node(entity_condition, "CollisionCondition"), "EntityRef", entityRef=name)
         elif limits.contact == "remove":
             self.lost.append("who touches the ego is taken away: there is no such action, contacts are only counted")
-        entity = _by_entity(_node(trigger, "ConditionGroup"), "end of the route", ego)
-        _position(_node(entity, "ReachPositionCondition", tolerance=10.0), self.episode.scenario.route[-1])
+        entity_condition = _by_entity(_node(trigger, "ConditionGroup"), "end of the route", ego)
+        _position(_node(entity_condition, "ReachPositionCondition", tolerance=10.0), self.episode.scenario.route[-1])
 
 
 def _unique(names: list[str]) -> list[str]:
-    """The names, with a number behind those that are there twice."""
-    found: list[str] = []
+    """Return the names, with a number behind repeated ones."""
+    unique: list[str] = []
     for name in names:
-        plain, number = name or "actor", 2
-        while (told := plain if number == 2 and plain not in found else f"{plain} {number}") in found:
-            number += 1
-        found.append(told)
-    return found
+        base_name, suffix = name or "actor", 2
+        while (
+            candidate := base_name if suffix == 2 and base_name not in unique else f"{base_name} {suffix}"
+        ) in unique:
+            suffix += 1
+        unique.append(candidate)
+    return unique
 
 
 def _vehicle(item: Element, body: Model) -> None:
@@ -376,9 +407,9 @@ def _position(parent: Element, pose: Pose) -> None:
 
 
 def _speed(action: Element, speed: float, shape: str, dimension: str, value: float) -> None:
-    told = _node(_node(action, "LongitudinalAction"), "SpeedAction")
-    _node(told, "SpeedActionDynamics", dynamicsShape=shape, dynamicsDimension=dimension, value=float(value))
-    _node(_node(told, "SpeedActionTarget"), "AbsoluteTargetSpeed", value=float(speed))
+    speed_action = _node(_node(action, "LongitudinalAction"), "SpeedAction")
+    _node(speed_action, "SpeedActionDynamics", dynamicsShape=shape, dynamicsDimension=dimension, value=float(value))
+    _node(_node(speed_action, "SpeedActionTarget"), "AbsoluteTargetSpeed", value=float(speed))
 
 
 def _condition(group: Element, name: str, delay: float = 0.0) -> Element:
@@ -386,11 +417,11 @@ def _condition(group: Element, name: str, delay: float = 0.0) -> Element:
 
 
 def _by_time(group: Element, name: str, time: float) -> None:
-    by = _node(_condition(group, name), "ByValueCondition")
-    _node(by, "SimulationTimeCondition", value=float(time), rule="greaterOrEqual")
+    value_condition = _node(_condition(group, name), "ByValueCondition")
+    _node(value_condition, "SimulationTimeCondition", value=float(time), rule="greaterOrEqual")
 
 
 def _by_entity(group: Element, name: str, who: str) -> Element:
-    by = _node(_condition(group, name), "ByEntityCondition")
-    _node(_node(by, "TriggeringEntities", triggeringEntitiesRule="any"), "EntityRef", entityRef=who)
-    return _node(by, "EntityCondition")
+    entity_condition = _node(_condition(group, name), "ByEntityCondition")
+    _node(_node(entity_condition, "TriggeringEntities", triggeringEntitiesRule="any"), "EntityRef", entityRef=who)
+    return _node(entity_condition, "EntityCondition")

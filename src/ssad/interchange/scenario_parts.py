@@ -1,4 +1,4 @@
-"""Parts of a scenario that every reader of a foreign format makes in the same way."""
+"""Parts of a scenario that all readers of foreign formats build in the same way."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CHOICES: Final[tuple[Literal["program", "off", "red", "green"], ...]] = ("progr
 
 
 def scenario_name(text: str) -> str:
-    """A text as the name of a scenario: other characters become -; "" where nothing is left."""
+    """Convert a text to a scenario name: invalid characters become -; "" if nothing remains."""
     parts = [_OTHER.sub("-", part).strip("-._:@+") for part in text.strip().split("/")]
     return "/".join(part for part in parts if part)[:120]
 
@@ -32,9 +32,9 @@ def plan_of(graph: LaneGraph, route: Route, states: Mapping[int, SignalState], u
     Returns:
         The plan; None: no plan does that.
     """
-    for ego in _CHOICES:
-        for others in _CHOICES:
-            plan = SignalPlan(ego, others, until)
+    for ego_choice in _CHOICES:
+        for other_choice in _CHOICES:
+            plan = SignalPlan(ego_choice, other_choice, until)
             if forced_signals(graph, route, plan) == states:
                 return plan
     return None

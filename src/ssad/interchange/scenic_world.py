@@ -1,7 +1,8 @@
-"""The embedded world as a simulator of Scenic 3: its driving library's actions move the world's bodies.
+"""The embedded world as a simulator of Scenic 3: actions of its driving library move the world's bodies.
 
-Vehicles are driven by throttle, brake and wheel, with the dynamics that all drivers here have; walkers go as they are
-told. Scenic's headings count from north, the world's from east. Needs the extra `scenic`.
+Vehicles are controlled by throttle, brake and steering, with the dynamics that all drivers here have; walkers follow
+their commanded heading and speed. Scenic's headings count from north, the world's from east. Needs the extra
+`scenic`.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from ssad.world.world import World
 
 STEP: Final = 0.1  # s
 _QUARTER = 0.5 * math.pi
-_FAR = 9000.0  # m ahead of the ego that a route lies that it never comes to: a program says itself when it ends
-_MOVES = (AgentKind.WALKER, AgentKind.PROP)  # that are placed, not driven
+_FAR = 9000.0  # m from the ego to a route that it never reaches: the program itself decides when it ends
+_MOVES = (AgentKind.WALKER, AgentKind.PROP)  # kinds that are placed, not driven
 
 
 @dataclass
 class Pedals:
-    """The controls of a vehicle; each stays as it is until it is set again. steer: left positive."""
+    """Controls of a vehicle; each keeps its value until it is set again. steer: positive to the left."""
 
     throttle: float = 0.0
     brake: float = 0.0
@@ -44,7 +45,7 @@ class Pedals:
 
 @dataclass
 class _Body:
-    """An object of Scenic in the world: its model, its controls, and how a walker goes."""
+    """An object of Scenic in the world: its model, its controls, and the commanded motion of a walker."""
 
     name: str
     model: Model
@@ -58,7 +59,7 @@ class _Body:
 
 
 class ScenicWorld(DrivingSimulator):  # type: ignore[misc]
-    """A simulator of Scenic that runs the embedded world."""
+    """A Scenic simulator that runs the embedded world."""
 
     def __init__(self, map_file: str, timestep: float = STEP) -> None:
         super().__init__()
@@ -67,7 +68,7 @@ class ScenicWorld(DrivingSimulator):  # type: ignore[misc]
         self.graph = load_town(Path(map_file).stem)
 
     def createSimulation(self, scene: Any, *, timestep: float | None, **options: Any) -> ScenicDrive:
-        """A simulation of a scene."""
+        """Create a simulation of a scene."""
         if timestep is not None and abs(timestep - STEP) > 1e-9:
             raise SimulationCreationError(f"a step has {STEP} s here, not {timestep}")
         return ScenicDrive(scene, self.graph, timestep=STEP, **options)
@@ -77,8 +78,8 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
     """One scene in the world.
 
     Attributes:
-        names: Of the bodies, the ego first.
-        models: The model that is most like each body.
+        names: Names of the bodies, the ego first.
+        models: Nearest model of each body.
         rows: [T, A, 4] x, y, yaw and speed of each body at every step.
     """
 
@@ -89,7 +90,7 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
         self.rows: list[np.ndarray[Any, Any]] = []
         super().__init__(scene, **options)
 
-    # ------------------------------------------------------------ what Scenic calls
+    # ------------------------------------------------------------ interface to Scenic
 
     def setup(self) -> None:
         """Create all objects, and the world with them."""
@@ -104,9 +105,9 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
                 Controller.PLACED if body.model.kind in _MOVES else Controller.EXTERNAL,
                 body.pose,
                 speed=body.speed,
-                route=_nowhere(body.pose) if k == 0 else None,
+                route=_nowhere(body.pose) if index == 0 else None,
             )
-            for k, body in enumerate(bodies)
+            for index, body in enumerate(bodies)
         ]
         limits = Limits(max_steps=100_000, max_time=1e9, contact="count")
         town = self.graph.name
@@ -116,87 +117,88 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
         self._read()
 
     def createObjectInSimulator(self, obj: Any) -> None:
-        """Keep an object for `setup`; objects that appear while the simulation runs are refused."""
+        """Store an object for `setup`; objects that appear during the simulation are refused."""
         if self._world is not None:
             raise SimulationCreationError(f"{type(obj).__name__}: objects cannot appear while a simulation runs")
         category = getattr(obj, "category", "prop")
         nearest = nearest_model(category, (float(obj.length), float(obj.width)))
         assert nearest is not None, category
-        like = MODELS[nearest]
-        number = 1 + sum(body.name.startswith(f"{type(obj).__name__}-") for body in self._bodies.values())
-        name = "ego" if not self._bodies else f"{type(obj).__name__}-{number}"
-        wheelbase = like.wheelbase / like.length * float(obj.length)
+        nearest_body = MODELS[nearest]
+        name_number = 1 + sum(body.name.startswith(f"{type(obj).__name__}-") for body in self._bodies.values())
+        name = "ego" if not self._bodies else f"{type(obj).__name__}-{name_number}"
+        wheelbase = nearest_body.wheelbase / nearest_body.length * float(obj.length)
         model = Model(
             name,
-            like.kind,
+            nearest_body.kind,
             float(obj.length),
             float(obj.width),
             float(obj.height),
             wheelbase,
-            like.max_steer,
-            like.max_accel,
-            like.max_brake,
-            like.max_speed,
+            nearest_body.max_steer,
+            nearest_body.max_accel,
+            nearest_body.max_brake,
+            nearest_body.max_speed,
         )
         yaw = float(wrap_angle(float(obj.heading) + _QUARTER))
         velocity = np.array([float(obj.velocity.x), float(obj.velocity.y)])
-        along = float(velocity @ (math.cos(yaw), math.sin(yaw)))
-        speed = along if like.kind not in _MOVES else float(np.hypot(*velocity))
+        forward_speed = float(velocity @ (math.cos(yaw), math.sin(yaw)))
+        speed = forward_speed if nearest_body.kind not in _MOVES else float(np.hypot(*velocity))
         pose = Pose(float(obj.position.x), float(obj.position.y), yaw)
-        heading = math.atan2(velocity[1], velocity[0]) if speed and like.kind in _MOVES else yaw
+        heading = math.atan2(velocity[1], velocity[0]) if speed and nearest_body.kind in _MOVES else yaw
         self._bodies[id(obj._dynamicProxy)] = _Body(name, model, nearest, pose, speed, Pedals(), heading, speed)
 
     def step(self) -> None:
-        """Advance the world by a step."""
+        """Advance the world by one step."""
         assert self._world is not None
-        count = len(self._bodies)
-        controls, places = np.zeros((1, count, 4), np.float32), np.zeros((1, count, 4), np.float32)
-        for k, body in enumerate(self._bodies.values()):
+        body_count = len(self._bodies)
+        controls, placements = np.zeros((1, body_count, 4), np.float32), np.zeros((1, body_count, 4), np.float32)
+        for index, body in enumerate(self._bodies.values()):
             pedals = body.pedals
             brake = 1.0 if pedals.handbrake else pedals.brake
-            controls[0, k] = pedals.throttle, brake, pedals.steer, float(pedals.reverse)
-            ahead = STEP * body.pace
-            x, y = body.pose.x + ahead * math.cos(body.heading), body.pose.y + ahead * math.sin(body.heading)
-            places[0, k] = x, y, body.heading if body.pace else body.pose.yaw, body.pace
-        self._world.place(places)
+            controls[0, index] = pedals.throttle, brake, pedals.steer, float(pedals.reverse)
+            travel = STEP * body.pace
+            x, y = body.pose.x + travel * math.cos(body.heading), body.pose.y + travel * math.sin(body.heading)
+            # Vehicles get a placement too; the world ignores it, since their controller is external.
+            placements[0, index] = x, y, body.heading if body.pace else body.pose.yaw, body.pace
+        self._world.place(placements)
         self._world.step(controls)
         self._read()
 
     def getProperties(self, obj: Any, properties: Any) -> dict[str, Any]:
-        """Where an object is and how it moves."""
+        """Return the position and motion of an object."""
         body = self._body(obj)
         yaw = body.pose.yaw
         heading = float(wrap_angle(yaw - _QUARTER))
-        local, _, _ = obj.parentOrientation.globalToLocalAngles(heading, 0, 0)
-        way = body.heading if body.model.kind in _MOVES else yaw
-        values: dict[str, Any] = {
+        local_yaw, _, _ = obj.parentOrientation.globalToLocalAngles(heading, 0, 0)
+        direction = body.heading if body.model.kind in _MOVES else yaw
+        state: dict[str, Any] = {
             "position": Vector(body.pose.x, body.pose.y, 0.0),
-            "yaw": local,
+            "yaw": local_yaw,
             "pitch": 0,
             "roll": 0,
-            "velocity": Vector(body.speed * math.cos(way), body.speed * math.sin(way), 0.0),
+            "velocity": Vector(body.speed * math.cos(direction), body.speed * math.sin(direction), 0.0),
             "speed": abs(body.speed),
             "angularSpeed": body.turned,
             "angularVelocity": Vector(0.0, 0.0, body.turned),
         }
         if "elevation" in properties:
-            values["elevation"] = 0.0
-        return values
+            state["elevation"] = 0.0
+        return state
 
-    # ------------------------------------------------------------ what the model calls
+    # ------------------------------------------------------------ interface to the world model
 
     def pedals(self, obj: Any) -> Pedals:
-        """The controls of a vehicle."""
+        """Return the controls of a vehicle."""
         return self._body(obj).pedals
 
     def walk(self, obj: Any, *, heading: float | None = None, speed: float | None = None) -> None:
-        """Let a walker go into a direction (Scenic's heading, rad) or at a speed, m/s."""
+        """Set the direction (Scenic's heading, rad) or the speed, m/s, of a walker."""
         body = self._body(obj)
         body.heading = body.heading if heading is None else float(wrap_angle(float(heading) + _QUARTER))
         body.pace = body.pace if speed is None else min(float(speed), body.model.max_speed)
 
     def put_position(self, obj: Any, place: Any) -> None:
-        """Move an object to another place at once."""
+        """Move an object to another position at once."""
         assert self._world is not None
         body = self._body(obj)
         body.pose = Pose(float(place[0]), float(place[1]), body.pose.yaw)
@@ -205,18 +207,18 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
         self._world.put("pose", poses)
 
     def put_velocity(self, obj: Any, velocity: Any) -> None:
-        """Give an object another velocity at once; a vehicle keeps its heading."""
+        """Set the velocity of an object at once; a vehicle keeps its heading."""
         assert self._world is not None
-        body, (vx, vy) = self._body(obj), (float(velocity[0]), float(velocity[1]))
+        body, (velocity_x, velocity_y) = self._body(obj), (float(velocity[0]), float(velocity[1]))
         if body.model.kind in _MOVES:
-            body.pace = math.hypot(vx, vy)
-            body.heading = math.atan2(vy, vx) if body.pace else body.heading
+            body.pace = math.hypot(velocity_x, velocity_y)
+            body.heading = math.atan2(velocity_y, velocity_x) if body.pace else body.heading
             return
         speeds = self._world.array("speed").copy()
-        speeds[0, self._number(obj)] = vx * math.cos(body.pose.yaw) + vy * math.sin(body.pose.yaw)
+        speeds[0, self._number(obj)] = velocity_x * math.cos(body.pose.yaw) + velocity_y * math.sin(body.pose.yaw)
         self._world.put("speed", speeds)
 
-    # ------------------------------------------------------------ inside
+    # ------------------------------------------------------------ internals
 
     @property
     def names(self) -> list[str]:
@@ -225,7 +227,7 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
 
     @property
     def models(self) -> list[str]:
-        """The model that is most like each body."""
+        """Nearest model of each body."""
         return [body.nearest for body in self._bodies.values()]
 
     @property
@@ -240,19 +242,19 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
         return list(self._bodies).index(id(obj._dynamicProxy))
 
     def _read(self) -> None:
-        """Take over where the world has everybody."""
+        """Copy the state of the world into the bodies."""
         assert self._world is not None
         state = self._world.state()
-        for k, body in enumerate(self._bodies.values()):
-            x, y, yaw = state.pose[0, k].tolist()
+        for index, body in enumerate(self._bodies.values()):
+            x, y, yaw = state.pose[0, index].tolist()
             body.turned = float(wrap_angle(yaw - body.pose.yaw)) / STEP if self.rows else 0.0
-            body.pose, body.speed = Pose(x, y, yaw), float(state.speed[0, k])
+            body.pose, body.speed = Pose(x, y, yaw), float(state.speed[0, index])
         self.rows.append(np.column_stack([state.pose[0], state.speed[0]]).astype(np.float64))
 
 
 def _nowhere(pose: Pose) -> Route:
-    """A route that its owner never gets to."""
-    xy = np.array([[pose.x + _FAR + k, pose.y] for k in range(3)], np.float32)
+    """Return a route that its owner never reaches."""
+    xy = np.array([[pose.x + _FAR + point_index, pose.y] for point_index in range(3)], np.float32)
     return Route(
         xy=xy,
         yaw=np.zeros(3, np.float32),

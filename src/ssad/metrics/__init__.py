@@ -1,4 +1,4 @@
-"""What an episode is worth, and how sure we are: pure functions, records in, numbers out."""
+"""Metrics of episodes and their confidence intervals: pure functions from records to numbers."""
 
 from ssad.metrics.aggregate import FAMILIES as FAMILIES
 from ssad.metrics.aggregate import METRICS as METRICS

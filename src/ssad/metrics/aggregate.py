@@ -1,8 +1,8 @@
-"""From episodes to the numbers of a table, with the denominator always in sight.
+"""Aggregation of episodes to the numbers of a table, with explicit denominators.
 
-A failed episode is never dropped in silence: it counts in the denominator of every proportion as "not known" (the mean
-takes it as no event, the upper limit of the interval as an event), its route completion and driving score are 0, and
-every other mean is over the episodes that ran, whose number is `Estimate.n`. What was not measured is left out.
+A failed episode is never dropped silently: it counts in the denominator of every proportion as unknown (no event for
+the mean, an event for the upper limit of the interval), its route completion and driving score are 0, and every
+other mean is over the episodes that ran, whose number is `Estimate.n`. Unmeasured values are left out.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ FAMILIES = {"pre-crash": "Avg.", "natural": "Avg. natural", "other": "Avg. other
 
 @dataclass(frozen=True)
 class Metric:
-    """A column of a table: its symbol, the field of `EpisodeMetrics` behind it, its unit and which way is better.
+    """A column of a table: symbol, field of `EpisodeMetrics`, unit and direction of improvement.
 
     Attributes:
         kind: "share" of episodes where the field is not 0, "bounded" by 0 and `scale`, or "mean".
-        failed: what a failed episode counts as; NaN: not at all, or as unknown in a share.
+        failed: Value of a failed episode; NaN: not counted, or unknown in a share.
     """
 
     symbol: str
@@ -88,14 +88,14 @@ METRICS: dict[str, Metric] = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one episode gave, and what tells it from others.
+    """Result of one episode, with the keys that group it.
 
     Attributes:
         metrics: None if the episode failed.
-        group: what it is shown under: the pre-crash scenario, the town.
-        cluster: what episodes share: the scenario or route.
-        case: names the motion; two outcomes of one system with the same case are copies.
-        family: a key of `FAMILIES`.
+        group: Group in tables: the pre-crash scenario, the town.
+        cluster: Scenario or route that dependent episodes share.
+        case: Key of the motion; two outcomes of one system with the same case are copies.
+        family: A key of `FAMILIES`.
     """
 
     metrics: EpisodeMetrics | None
@@ -135,11 +135,10 @@ class GroupRow:
 
 
 def aggregate(outcomes: Sequence[Outcome]) -> dict[str, Estimate]:
-    """Estimates of all metrics of one system, by their symbols in `METRICS`; the order of the outcomes does not matter.
+    """Return estimates of all metrics of one system, by symbol; the order of the outcomes does not matter.
 
-    Within one group, the estimate is the mean over its distinct episodes; over several groups, it is the unweighted
-    mean of the groups' means. All driving figures come from here: tables, cards, figures and files show these
-    estimates.
+    Within one group, the estimate is the mean over its distinct episodes; over several groups, the unweighted
+    mean of the groups' means. All driving figures in tables, cards, plots and files are these estimates.
 
     Args:
         outcomes: The episodes of one system.
@@ -147,12 +146,12 @@ def aggregate(outcomes: Sequence[Outcome]) -> dict[str, Estimate]:
     Returns:
         Symbol of `METRICS` -> its estimate.
     """
-    result = {}
+    estimates = {}
     for symbol, metric in METRICS.items():
         if metric.field:
-            values = [_value(o, metric) for o in outcomes]
-            result[symbol] = estimate(values, metric.kind, scale=metric.scale, least=0.0)
-    return {symbol: result.get(symbol) or _overall(outcomes) for symbol in METRICS}
+            values = [_value(outcome, metric) for outcome in outcomes]
+            estimates[symbol] = estimate(values, metric.kind, scale=metric.scale, least=0.0)
+    return {symbol: estimates.get(symbol) or _overall(outcomes) for symbol in METRICS}
 
 
 def aggregate_groups(outcomes: Iterable[tuple[str, Outcome]]) -> list[GroupRow]:
@@ -160,22 +159,25 @@ def aggregate_groups(outcomes: Iterable[tuple[str, Outcome]]) -> list[GroupRow]:
 
     A family other than the paper's has an average only if it has several groups.
     """
-    found: dict[str, list[Outcome]] = {}
+    outcomes_by_system: dict[str, list[Outcome]] = {}
     for system, outcome in outcomes:
-        found.setdefault(system, []).append(outcome)
+        outcomes_by_system.setdefault(system, []).append(outcome)
     rows = []
-    for system, own in found.items():
-        for group in dict.fromkeys(o.group for o in own):
-            rows.append(GroupRow(system, group, aggregate([o for o in own if o.group == group])))
+    for system, system_outcomes in outcomes_by_system.items():
+        for group in dict.fromkeys(episode.group for episode in system_outcomes):
+            rows.append(
+                GroupRow(system, group, aggregate([episode for episode in system_outcomes if episode.group == group]))
+            )
         for family, name in FAMILIES.items():
-            members = [o for o in own if o.family == family]
-            if len({o.group for o in members}) > (family != "pre-crash"):
+            members = [episode for episode in system_outcomes if episode.family == family]
+            # The average of a single group would repeat its row.
+            if len({episode.group for episode in members}) > (family != "pre-crash"):
                 rows.append(GroupRow(system, name, aggregate(members)))
     return rows
 
 
 def _value(outcome: Outcome, metric: Metric) -> CaseValue:
-    """What an episode gives to a metric."""
+    """Return the value that an episode contributes to a metric."""
     number = None if outcome.metrics is None else getattr(outcome.metrics, metric.field)
     if outcome.metrics is None:
         number = metric.failed
@@ -186,35 +188,36 @@ def _value(outcome: Outcome, metric: Metric) -> CaseValue:
 
 
 def _overall(outcomes: Sequence[Outcome]) -> Estimate:
-    """SafeBench's score of the means, averaged over the groups; the interval is that of the unrounded score.
+    """Return SafeBench's score of the means, averaged over the groups, with the interval of the unrounded score.
 
-    The score is a weighted sum of means, so an episode has one too: its collision, distances, incomplete route and
-    time. Of a failed episode the distances and the time are taken as the group's mean; whether it collided is unknown.
+    The score is a weighted sum of means, so an episode has one too: from its collision, distances, incomplete
+    route and time. For a failed episode, distances and time are the group's means, and the collision is unknown.
     """
     groups: dict[str, list[Outcome]] = {}
-    for o in outcomes:
-        groups.setdefault(o.group, []).append(o)
+    for outcome in outcomes:
+        groups.setdefault(outcome.group, []).append(outcome)
     scores: list[float] = []
-    least: list[CaseValue] = []
-    most: list[CaseValue] = []
+    optimistic: list[CaseValue] = []
+    pessimistic: list[CaseValue] = []
     for group, members in groups.items():
         means = {
-            name: estimate([_value(o, METRICS[name]) for o in members], METRICS[name].kind).mean
+            name: estimate([_value(outcome, METRICS[name]) for outcome in members], METRICS[name].kind).mean
             for name in ("CR", "OR", "DR", "RC", "TS")
         }
         if any(math.isnan(value) for value in means.values()):
             continue
         scores.append(overall_score(means))
-        for into, unknown in ((least, 0.0), (most, 1.0)):
-            for o in members:
-                own = dict(means) | {"CR": unknown, "RC": 0.0}
-                if o.metrics is not None:
-                    own = {name: float(getattr(o.metrics, METRICS[name].field)) for name in means}
-                own["IR"] = 1.0 - own["RC"]
-                score = math.fsum(WEIGHTS[name] * own[name] / DIVISORS[name] for name in WEIGHTS)
-                into.append(CaseValue(score, o.cluster, o.case, group, o.metrics is None))
+        # Whether a failed episode collided is unknown: the lower limit assumes none, the upper one all.
+        for case_values, unknown in ((optimistic, 0.0), (pessimistic, 1.0)):
+            for outcome in members:
+                terms = dict(means) | {"CR": unknown, "RC": 0.0}
+                if outcome.metrics is not None:
+                    terms = {name: float(getattr(outcome.metrics, METRICS[name].field)) for name in means}
+                terms["IR"] = 1.0 - terms["RC"]
+                score = math.fsum(WEIGHTS[name] * terms[name] / DIVISORS[name] for name in WEIGHTS)
+                case_values.append(CaseValue(score, outcome.cluster, outcome.case, group, outcome.metrics is None))
     if not scores:
-        return replace(NOTHING, failed=sum(o.metrics is None for o in outcomes))
+        return replace(NOTHING, failed=sum(outcome.metrics is None for outcome in outcomes))
     mean = math.fsum(scores) / len(scores)
-    first, second = estimate(least, "mean", least=0.0), estimate(most, "mean")
-    return replace(first, mean=mean, low=min(first.low, mean), high=max(second.high, mean))
+    lower_estimate, upper_estimate = estimate(optimistic, "mean", least=0.0), estimate(pessimistic, "mean")
+    return replace(lower_estimate, mean=mean, low=min(lower_estimate.low, mean), high=max(upper_estimate.high, mean))

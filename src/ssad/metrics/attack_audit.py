@@ -1,8 +1,8 @@
-"""Was an attack as strong as it could be? What the records of a run say against it, in plain sentences.
+"""Audit of attacks: checks the records of a run for signs that an attack was weaker than it could be.
 
-An attack that is badly tuned, follows a wrong gradient or breaks its budget leaves traces in its results: it grows
-weaker with more steps, it is weaker than a single step, it is no stronger than noise. Source of most rules: Carlini et
-al., On Evaluating Adversarial Robustness (2019), section 4.
+A badly tuned attack, a wrong gradient or a broken budget leaves traces in the results: the attack gets weaker with
+more steps, it is weaker than a single step, or no stronger than noise. Source of most rules: Carlini et al., On
+Evaluating Adversarial Robustness (2019), section 4.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
-NOISE = 0.02  # share of the clean score that two attacks may differ by without meaning
-LEFT = 0.05  # share of the clean score under which an attack has done its work
-RESTARTS = 0.05  # share of the clean score that restarts may take away besides
+NOISE = 0.02  # share of the clean score within which two attacks count as equal
+LEFT = 0.05  # share of the clean score under which the detector counts as defeated
+RESTARTS = 0.05  # share of the clean score that restarts may gain without a finding
 GRADIENT = 0.25  # relative error of a gradient; that of losses with a detached target is up to a fifth
 COUPLED = 0.01  # relative change of an image's loss by another image of the batch
-USED = 0.25  # share of its budget that an attack uses at least, unless it has done its work
+USED = 0.25  # minimum share of the budget that an attack uses, unless the detector is defeated
 MANY = 5  # steps from which an attack is expected to beat a single step on any loss
 WHOLE = frozenset({"full", "classification", "vanish", "margin"})  # losses about all that a detector finds
 UNBOUNDED = 64.0  # code values from which an L-infinity budget hides any picture
@@ -25,24 +25,29 @@ UNBOUNDED = 64.0  # code values from which an L-infinity budget hides any pictur
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One attack on one detector, as its record tells it; what it does not tell is None.
+    """One attack on one detector, as recorded; values missing from the record are None.
 
     Attributes:
-        detector: name.
-        attack: name; "noise" for random noise of the size of the budget.
-        score: of the detector under it (mAP).
-        clean: of the detector without it.
-        loss: what was ascended; "" where nobody says.
-        norm, radius: of the budget, 8-bit code values.
-        steps: gradient steps of one start.
+        detector: Name.
+        attack: Name; "noise" for random noise of the size of the budget.
+        score: Score of the attacked detector (mAP).
+        clean: Score of the detector without attack.
+        loss: The ascended loss; "" if unknown.
+        norm: Norm of the budget.
+        radius: Radius of the budget, 8-bit code values.
+        steps: Gradient steps of one start.
         access: "white-box", "black-box", "none".
-        options: further settings, as text; `restarts` is read from it.
-        draws: bootstrap replicates of the score, paired between attempts.
-        before, after: mean of the ascended loss.
-        gradient_error, coupling, used, change: see `ssad.experiments.perception.digital.attacked_scenes`.
-        source: what the pictures were made against, if it was not what they are shown to.
-        group: what else must be equal for scores to be compared, such as a defence or a target; part of what the
-            sentences call the detector.
+        options: Further settings, as text; `restarts` is read from it.
+        draws: Bootstrap replicates of the score, paired between attempts.
+        before: Mean of the ascended loss before the attack.
+        after: Mean of the ascended loss after the attack.
+        gradient_error: See `ssad.evaluation.attacked_scenes`, as for the next three.
+        coupling: Relative change of an image's loss by the rest of its batch.
+        used: Share of the budget that is used.
+        change: Largest distance of a stored image from the clean one.
+        source: Detector that the images were made against, if another one is evaluated.
+        group: Further condition that must be equal for scores to be compared, such as a defence or a target; part
+            of the detector's name in findings.
     """
 
     detector: str
@@ -67,13 +72,13 @@ class Attempt:
 
     @property
     def restarts(self) -> int:
-        """Random starts besides the first."""
-        told = dict(pair.split("=", 1) for pair in self.options.split() if "=" in pair)
-        return int(told.get("restarts", "0"))
+        """Random starts after the first."""
+        settings = dict(setting.split("=", 1) for setting in self.options.split() if "=" in setting)
+        return int(settings.get("restarts", "0"))
 
     @property
     def title(self) -> str:
-        """What a sentence calls it."""
+        """Description of the attempt in a sentence."""
         parts = [self.attack, f"on loss {self.loss}" if self.loss and self.attack != "noise" else ""]
         parts.append("" if self.attack == "noise" else f"with {self.steps} step{'s' if self.steps != 1 else ''}")
         parts.append(f"at {self.radius:g} px" + (" (L2)" if self.norm == "l2" else ""))
@@ -84,7 +89,7 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What speaks against an attack: the rule it breaks, the detector, a sentence."""
+    """An objection against an attack: the violated rule, the detector, a sentence."""
 
     rule: str
     detector: str
@@ -93,11 +98,11 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What an audit found.
+    """Result of an audit.
 
     Attributes:
-        compared: rule -> how often it could be applied; 0 where the run has nothing that it needs.
-        faults: all that were found.
+        compared: Rule -> number of comparisons; 0 if the run lacks what the rule needs.
+        faults: All faults.
     """
 
     compared: Mapping[str, int]
@@ -105,20 +110,23 @@ class Verdict:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing speaks against the attacks, and something was looked at."""
+        """True if there is no fault, and at least one comparison."""
         return not self.faults and any(self.compared.values())
 
     @property
     def text(self) -> str:
         """The verdict in a sentence or two."""
-        left = [RULES[rule][0] for rule, count in self.compared.items() if not count]
-        unseen = f" Not in this run: {'; '.join(left)}." if left else ""
+        skipped_rules = [RULES[rule][0] for rule, count in self.compared.items() if not count]
+        skipped_text = f" Not in this run: {'; '.join(skipped_rules)}." if skipped_rules else ""
         if not any(self.compared.values()):
-            return f"Audit: nothing to look at.{unseen}"
+            return f"Audit: nothing to look at.{skipped_text}"
         if self.passed:
-            return f"Audit passed: {sum(self.compared.values())} comparisons, no fault.{unseen}"
+            return f"Audit passed: {sum(self.compared.values())} comparisons, no fault.{skipped_text}"
         count = len(self.faults)
-        return f"Audit: {count} fault{'s' if count > 1 else ''} in {sum(self.compared.values())} comparisons.{unseen}"
+        return (
+            f"Audit: {count} fault{'s' if count > 1 else ''} in {sum(self.compared.values())} "
+            f"comparisons.{skipped_text}"
+        )
 
 
 Finding = str | None  # a sentence, or None where a comparison found no fault
@@ -129,21 +137,22 @@ def audit(attempts: Iterable[Attempt]) -> Verdict:
     """Apply all rules to the attempts of each detector.
 
     Args:
-        attempts: Of one run; those without noise, black-box attacks, restarts and so on are judged by the rest.
+        attempts: Attempts of one run; rules that need absent ones (noise, black-box attacks, restarts) are
+            skipped.
 
     Returns:
         Verdict, with faults in the order of the rules.
     """
     by_detector: dict[str, list[Attempt]] = {}
-    for one in attempts:
-        by_detector.setdefault(", ".join(filter(None, [one.detector, one.group])), []).append(one)
+    for attempt in attempts:
+        by_detector.setdefault(", ".join(filter(None, [attempt.detector, attempt.group])), []).append(attempt)
     compared, faults = dict.fromkeys(RULES, 0), []
-    for name, (_, rule) in RULES.items():
-        for detector, own in by_detector.items():
-            for text in rule(own):
-                compared[name] += 1
-                if text is not None:
-                    faults.append(Fault(name, detector, text))
+    for rule_name, (_, rule) in RULES.items():
+        for detector, detector_attempts in by_detector.items():
+            for finding in rule(detector_attempts):
+                compared[rule_name] += 1
+                if finding is not None:
+                    faults.append(Fault(rule_name, detector, finding))
     return Verdict(compared, tuple(faults))
 
 
@@ -160,14 +169,14 @@ def weaker(one: Attempt, other: Attempt) -> bool:
     Returns:
         True if `one` is the weaker attack.
     """
-    slack = NOISE * max(one.clean, 0.0)
+    margin = NOISE * max(one.clean, 0.0)
     if len(one.draws) == len(other.draws) > 1:
-        pairs = zip(one.draws, other.draws, strict=True)
-        differences = [a - b for a, b in pairs]
+        score_pairs = zip(one.draws, other.draws, strict=True)
+        differences = [first_score - second_score for first_score, second_score in score_pairs]
         mean = math.fsum(differences) / len(differences)
-        spread = math.fsum((value - mean) ** 2 for value in differences) / (len(differences) - 1)
-        slack = max(slack, 2.0 * math.sqrt(spread))
-    return one.score > other.score + slack
+        variance = math.fsum((difference - mean) ** 2 for difference in differences) / (len(differences) - 1)
+        margin = max(margin, 2.0 * math.sqrt(variance))
+    return one.score > other.score + margin
 
 
 def _pair(one: Attempt, other: Attempt, why: str) -> Finding:
@@ -182,19 +191,25 @@ def _percent(score: float) -> str:
 
 
 def _own(attempts: Sequence[Attempt]) -> list[Attempt]:
-    """Attacks on what is shown the pictures, without the noise."""
-    return [one for one in attempts if one.attack != "noise" and not one.source]
+    """Return the attacks that were made against the evaluated detector, without noise."""
+    return [attempt for attempt in attempts if attempt.attack != "noise" and not attempt.source]
 
 
 def _along(attempts: Sequence[Attempt], what: str) -> Iterator[tuple[Attempt, Attempt]]:
     """Neighbours, smaller and larger, that differ in one attribute only."""
-    names = [n for n in ("attack", "loss", "norm", "radius", "steps", "options") if n != what]
+    names = [
+        setting_name
+        for setting_name in ("attack", "loss", "norm", "radius", "steps", "options")
+        if setting_name != what
+    ]
     groups: dict[tuple[object, ...], list[Attempt]] = {}
-    for one in _own(attempts):
-        groups.setdefault(tuple(getattr(one, name) for name in names), []).append(one)
+    for attempt in _own(attempts):
+        groups.setdefault(tuple(getattr(attempt, key_name) for key_name in names), []).append(attempt)
     for group in groups.values():
-        ordered = sorted(group, key=lambda one: float(getattr(one, what)))
-        yield from ((a, b) for a, b in pairwise(ordered) if getattr(a, what) < getattr(b, what))
+        ordered = sorted(group, key=lambda attempt: float(getattr(attempt, what)))
+        yield from (
+            (smaller, larger) for smaller, larger in pairwise(ordered) if getattr(smaller, what) < getattr(larger, what)
+        )
 
 
 def _method(one: Attempt) -> tuple[object, ...]:
@@ -213,173 +228,211 @@ def _radius(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _iterated(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    own = [one for one in _own(attempts) if one.access == "white-box"]
-    for single in own:
-        for many in own:
-            alike = (single.loss, single.norm, single.radius) == (many.loss, many.norm, many.radius)
-            if alike and single.steps == 1 and many.steps > 1 and single.attack != many.attack:
-                yield _pair(many, single, "an iterated attack weaker than a single step is mis-tuned")
+    white_box = [attempt for attempt in _own(attempts) if attempt.access == "white-box"]
+    for single_step in white_box:
+        for iterated in white_box:
+            is_comparable = (single_step.loss, single_step.norm, single_step.radius) == (
+                iterated.loss,
+                iterated.norm,
+                iterated.radius,
+            )
+            if (
+                is_comparable
+                and single_step.steps == 1
+                and iterated.steps > 1
+                and single_step.attack != iterated.attack
+            ):
+                yield _pair(iterated, single_step, "an iterated attack weaker than a single step is mis-tuned")
 
 
 def _losses(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    """A loss about one thing only, such as depth, may do less than a single step on the whole training loss.
+    """Compare iterated attacks with single steps on other losses.
 
-    Losses need more or fewer steps to get going, so each attack is judged by the most steps that it ran with: where a
-    curve over steps begins says nothing against where it ends.
+    A loss about one aspect only, such as depth, may do less than a single step on the whole training loss. Losses
+    need more or fewer steps to take effect, so each attack is judged by its largest number of steps: the start of
+    a curve over steps says nothing about its end.
     """
-    own = [one for one in _own(attempts) if one.access == "white-box"]
-    last = [one for one in own if not any(one.steps < more.steps and _method(one) == _method(more) for more in own)]
-    for single in own:
-        for many in last:
-            alike = (single.norm, single.radius) == (many.norm, many.radius) and single.loss != many.loss
-            if alike and single.steps == 1 and many.steps >= MANY and many.loss in WHOLE:
-                yield _pair(many, single, "many steps weaker than one, even on another loss, are mis-tuned")
+    white_box = [attempt for attempt in _own(attempts) if attempt.access == "white-box"]
+    longest = [
+        attempt
+        for attempt in white_box
+        if not any(attempt.steps < longer.steps and _method(attempt) == _method(longer) for longer in white_box)
+    ]
+    for single_step in white_box:
+        for iterated in longest:
+            is_comparable = (single_step.norm, single_step.radius) == (
+                iterated.norm,
+                iterated.radius,
+            ) and single_step.loss != iterated.loss
+            if is_comparable and single_step.steps == 1 and iterated.steps >= MANY and iterated.loss in WHOLE:
+                yield _pair(iterated, single_step, "many steps weaker than one, even on another loss, are mis-tuned")
 
 
 def _access(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     for _, group in _sizes(attempts):
-        sides = [[one for one in group if one.access == access] for access in ("white-box", "black-box")]
-        if all(sides):
-            white, black = (min(side, key=lambda one: one.score) for side in sides)
+        attempts_by_access = [
+            [attempt for attempt in group if attempt.access == access] for access in ("white-box", "black-box")
+        ]
+        if all(attempts_by_access):
+            white, black = (min(candidates, key=lambda attempt: attempt.score) for candidates in attempts_by_access)
             yield _pair(white, black, "a black-box attack beats the best white-box one, so the gradient is masked")
 
 
 def _transfer(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     def method(one: Attempt) -> tuple[object, ...]:
-        words = [word for word in one.options.split() if not word.startswith("draws=")]
-        return one.attack, one.loss, one.norm, one.radius, one.steps, words
+        settings = [setting for setting in one.options.split() if not setting.startswith("draws=")]
+        return one.attack, one.loss, one.norm, one.radius, one.steps, settings
 
-    for other in (one for one in attempts if one.source):
-        for own in _own(attempts):
-            if method(own) == method(other):
-                yield _pair(own, other, "what was made against something else hurts more, so the gradient is masked")
+    for transferred in (attempt for attempt in attempts if attempt.source):
+        for direct in _own(attempts):
+            if method(direct) == method(transferred):
+                yield _pair(
+                    direct, transferred, "what was made against something else hurts more, so the gradient is masked"
+                )
 
 
 def _restarts(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for one, other in combinations(_own(attempts), 2):
-        few, many = sorted((one, other), key=lambda attempt: attempt.restarts)
-        alike = all(getattr(few, name) == getattr(many, name) for name in ("attack", "loss", "norm", "radius", "steps"))
-        if not alike or few.restarts == many.restarts:
+    for first, second in combinations(_own(attempts), 2):
+        fewer, more = sorted((first, second), key=lambda attempt: attempt.restarts)
+        is_comparable = all(
+            getattr(fewer, name) == getattr(more, name) for name in ("attack", "loss", "norm", "radius", "steps")
+        )
+        if not is_comparable or fewer.restarts == more.restarts:
             continue
-        wrong = _pair(many, few, "restarts made it weaker, so the best start is not kept")
-        if wrong is None and few.score - many.score > RESTARTS * few.clean and weaker(few, many):
-            wrong = (
-                f"{few.title} leaves {_percent(few.score)}, {many.title} {_percent(many.score)}: restarts gain much, "
+        finding = _pair(more, fewer, "restarts made it weaker, so the best start is not kept")
+        if finding is None and fewer.score - more.score > RESTARTS * fewer.clean and weaker(fewer, more):
+            finding = (
+                f"{fewer.title} leaves {_percent(fewer.score)}, {more.title} "
+                f"{_percent(more.score)}: restarts gain much, "
                 "so one start ends far from the best"
             )
-        yield wrong
+        yield finding
 
 
 def _above_noise(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    """Attacks that do no better than random noise of the same size.
+    """Find attacks that do no better than random noise of the same size.
 
-    A small budget may be too small to change anything, so an attack must beat noise only at its largest budget; at no
-    budget may noise beat the attack.
+    A small budget may be too small to change anything, so an attack must beat noise only at its largest budget;
+    at no budget may noise beat the attack.
     """
     pairs = [
-        (noise, one)
+        (noise, attempt)
         for noise, group in _sizes(attempts)
-        for one in group
+        for attempt in group
         if noise is not None and noise.score > LEFT * noise.clean
     ]
     largest: dict[tuple[object, ...], float] = {}
-    for _, one in pairs:
-        kind = one.attack, one.loss, one.norm, one.steps, one.options
-        largest[kind] = max(one.radius, largest.get(kind, 0.0))
-    for noise, one in pairs:
-        last = one.radius == largest[one.attack, one.loss, one.norm, one.steps, one.options]
-        beaten = weaker(one, noise) or (last and one.score >= noise.score)
+    for _, attempt in pairs:
+        settings = attempt.attack, attempt.loss, attempt.norm, attempt.steps, attempt.options
+        largest[settings] = max(attempt.radius, largest.get(settings, 0.0))
+    for noise, attempt in pairs:
+        is_largest = (
+            attempt.radius == largest[attempt.attack, attempt.loss, attempt.norm, attempt.steps, attempt.options]
+        )
+        is_beaten = weaker(attempt, noise) or (is_largest and attempt.score >= noise.score)
         yield (
             None
-            if not beaten
+            if not is_beaten
             else (
-                f"{one.title} leaves {_percent(one.score)}, random noise of the same size {_percent(noise.score)}: "
+                f"{attempt.title} leaves {_percent(attempt.score)}, random noise of the same "
+                f"size {_percent(noise.score)}: "
                 "it attacks nothing"
             )
         )
 
 
 def _sizes(attempts: Sequence[Attempt]) -> Iterator[tuple[Attempt | None, list[Attempt]]]:
-    """For each size of the budget the noise, if there is some, and the attacks."""
+    """Yield the noise, if any, and the attacks for each budget."""
     groups: dict[tuple[str, float], list[Attempt]] = {}
-    for one in attempts:
-        groups.setdefault((one.norm, one.radius), []).append(one)
+    for attempt in attempts:
+        groups.setdefault((attempt.norm, attempt.radius), []).append(attempt)
     for group in groups.values():
-        yield next((one for one in group if one.attack == "noise"), None), _own(group)
+        yield next((attempt for attempt in group if attempt.attack == "noise"), None), _own(group)
 
 
 def _unbounded(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for one in _own(attempts):
-        if one.norm == "linf" and one.radius >= UNBOUNDED and one.steps > 1:
+    for attempt in _own(attempts):
+        if attempt.norm == "linf" and attempt.radius >= UNBOUNDED and attempt.steps > 1:
             yield (
                 None
-                if one.score <= LEFT * one.clean
+                if attempt.score <= LEFT * attempt.clean
                 else (
-                    f"{one.title} leaves {_percent(one.score)} of {_percent(one.clean)}: a budget that hides the "
+                    f"{attempt.title} leaves {_percent(attempt.score)} of "
+                    f"{_percent(attempt.clean)}: a budget that hides the "
                     "picture must leave nothing, so the loss stops before the detections do"
                 )
             )
 
 
 def _rises(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for one in _own(attempts):
-        if one.before is not None and one.after is not None:
-            rise = one.after - one.before
-            if rise > 0 or (rise == 0 and one.score <= LEFT * one.clean):
+    for attempt in _own(attempts):
+        if attempt.before is not None and attempt.after is not None:
+            rise = attempt.after - attempt.before
+            if rise > 0 or (rise == 0 and attempt.score <= LEFT * attempt.clean):
                 yield None
             elif rise < 0:
-                yield f"{one.title}: the loss it ascends fell from {one.before:.4g} to {one.after:.4g}: a wrong sign"
+                yield (
+                    f"{attempt.title}: the loss it ascends fell from {attempt.before:.4g} to "
+                    f"{attempt.after:.4g}: a wrong sign"
+                )
             else:
-                yield f"{one.title}: the loss it ascends did not move from {one.before:.4g}: the gradient is cut off"
+                yield (
+                    f"{attempt.title}: the loss it ascends did not move from {attempt.before:.4g}: "
+                    f"the gradient is cut off"
+                )
 
 
 def _gradient(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for one in _own(attempts):
-        if one.gradient_error is not None:
+    for attempt in _own(attempts):
+        if attempt.gradient_error is not None:
             yield (
                 None
-                if one.gradient_error <= GRADIENT
+                if attempt.gradient_error <= GRADIENT
                 else (
-                    f"{one.title}: its gradient differs from finite differences by {one.gradient_error:.0%}: it is "
+                    f"{attempt.title}: its gradient differs from finite differences by "
+                    f"{attempt.gradient_error:.0%}: it is "
                     "detached, or masked"
                 )
             )
 
 
 def _coupling(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for one in _own(attempts):
-        if one.coupling is not None:
+    for attempt in _own(attempts):
+        if attempt.coupling is not None:
             yield (
                 None
-                if one.coupling <= COUPLED
+                if attempt.coupling <= COUPLED
                 else (
-                    f"{one.title}: an image's loss changes by {one.coupling:.0%} with what else is in its batch: "
+                    f"{attempt.title}: an image's loss changes by {attempt.coupling:.0%} with "
+                    "what else is in its batch: "
                     "images are not attacked each by itself"
                 )
             )
 
 
 def _budget(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for one in attempts:
-        if one.change is not None:
+    for attempt in attempts:
+        if attempt.change is not None:
             yield (
                 None
-                if one.change <= one.radius * (1 + 1e-5) + 1e-6
+                if attempt.change <= attempt.radius * (1 + 1e-5) + 1e-6
                 else (
-                    f"{one.title}: a stored picture is {one.change:g} px from the clean one: the budget does not hold "
+                    f"{attempt.title}: a stored picture is {attempt.change:g} px from the clean "
+                    "one: the budget does not hold "
                     "after rounding"
                 )
             )
 
 
 def _used(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for one in _own(attempts):
-        if one.used is not None and one.score > LEFT * one.clean:
+    for attempt in _own(attempts):
+        if attempt.used is not None and attempt.score > LEFT * attempt.clean:
             yield (
                 None
-                if one.used >= USED
+                if attempt.used >= USED
                 else (
-                    f"{one.title} uses {one.used:.0%} of its budget and leaves {_percent(one.score)}: its steps are "
+                    f"{attempt.title} uses {attempt.used:.0%} of its budget and leaves "
+                    f"{_percent(attempt.score)}: its steps are "
                     "too small"
                 )
             )

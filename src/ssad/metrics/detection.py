@@ -1,4 +1,4 @@
-"""Scores of 3D detections as the official nuScenes evaluation gives them, and their intervals over scenes.
+"""Scores of 3D detections as in the official nuScenes evaluation, and their intervals over scenes.
 
     matches = match(filter_boxes(truth, ...), filter_boxes(predictions, ...), samples=len(tokens))
     matches.scores().nd_score
@@ -76,15 +76,19 @@ class DetectionScores:
     @property
     def label_aps(self) -> dict[str, dict[str, float]]:
         """AP by class and threshold: class -> threshold as text -> AP."""
-        names = [str(t) for t in self.config.dist_ths]
+        names = [str(threshold) for threshold in self.config.dist_ths]
         return {
-            c: dict(zip(names, row, strict=True)) for c, row in zip(self.config.classes, self.ap.tolist(), strict=True)
+            class_name: dict(zip(names, class_aps, strict=True))
+            for class_name, class_aps in zip(self.config.classes, self.ap.tolist(), strict=True)
         }
 
     @property
     def mean_dist_aps(self) -> dict[str, float]:
         """Mean AP over the thresholds, by class."""
-        return {c: float(np.mean(row)) for c, row in zip(self.config.classes, self.ap, strict=True)}
+        return {
+            class_name: float(np.mean(class_aps))
+            for class_name, class_aps in zip(self.config.classes, self.ap, strict=True)
+        }
 
     @property
     def mean_ap(self) -> float:
@@ -95,7 +99,10 @@ class DetectionScores:
     def label_tp_errors(self) -> dict[str, dict[str, float]]:
         """TP errors by class: class -> error -> value, NaN where it has no meaning."""
         rows = self.errors.tolist()
-        return {c: dict(zip(TP_METRICS, row, strict=True)) for c, row in zip(self.config.classes, rows, strict=True)}
+        return {
+            class_name: dict(zip(TP_METRICS, class_errors, strict=True))
+            for class_name, class_errors in zip(self.config.classes, rows, strict=True)
+        }
 
     @property
     def tp_errors(self) -> dict[str, float]:
@@ -115,11 +122,13 @@ class DetectionScores:
         return total / float(weight + len(TP_METRICS))
 
     def summary(self, *, eval_time: float | None = None, meta: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """What the devkit writes into metrics_summary.json, with the same keys; eval_time and meta where given.
+        """Return the content of the devkit's metrics_summary.json, with the same keys; undefined values are NaN.
 
-        Values that have no meaning are NaN, as there.
+        Args:
+            eval_time: Duration of the evaluation, s; None to leave it out.
+            meta: Metadata; None to leave it out.
         """
-        result: dict[str, Any] = {
+        entries: dict[str, Any] = {
             "label_aps": self.label_aps,
             "mean_dist_aps": self.mean_dist_aps,
             "mean_ap": self.mean_ap,
@@ -129,16 +138,16 @@ class DetectionScores:
             "nd_score": self.nd_score,
         }
         if eval_time is not None:
-            result["eval_time"] = eval_time
-        result["cfg"] = self.config.serialize()
+            entries["eval_time"] = eval_time
+        entries["cfg"] = self.config.serialize()
         if meta is not None:
-            result["meta"] = dict(meta)
-        return result
+            entries["meta"] = dict(meta)
+        return entries
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Which predictions match which boxes, by class; enough for the scores under any weights of the samples.
+    """Matches of predictions and true boxes by class; enough for the scores under any weights of the samples.
 
     Attributes:
         config: Settings of the task.
@@ -153,25 +162,28 @@ class Matches:
     truth_counts: I32
 
     def scores(self, weights: npt.NDArray[np.integer[Any]] | None = None) -> DetectionScores:
-        """The scores.
+        """Return the scores.
 
         Args:
-            weights: How often each sample counts, as if it occurred that many times in a row [S]; None: once.
+            weights: Multiplicity of each sample, as if it occurred that many times in a row [S]; None for 1.
         """
-        times = np.ones(self.samples, np.int64) if weights is None else np.asarray(weights, np.int64)
-        if times.shape != (self.samples,) or (times < 0).any():
+        multiplicity = np.ones(self.samples, np.int64) if weights is None else np.asarray(weights, np.int64)
+        if multiplicity.shape != (self.samples,) or (multiplicity < 0).any():
             raise ValueError(f"weights: expected {self.samples} numbers that are not negative")
         ap = np.zeros((len(self.classes), len(self.config.dist_ths)))
         errors = np.ones((len(self.classes), len(TP_METRICS)))
         truth, predictions = np.zeros((2, len(self.classes)), np.int64)
-        for c, name in enumerate(self.config.classes):
-            truth[c] = self.truth_counts[c] @ times
-            ranking = _Ranking.of(self.classes[c], times)
-            predictions[c] = ranking.total
-            if truth[c]:
-                ap[c], errors[c] = _class_scores(self.classes[c], ranking, int(truth[c]), self.config, name)
-            for error in UNDEFINED.get(name, ()):
-                errors[c, TP_METRICS.index(error)] = np.nan
+        for class_index, class_name in enumerate(self.config.classes):
+            truth[class_index] = self.truth_counts[class_index] @ multiplicity
+            ranking = _Ranking.of(self.classes[class_index], multiplicity)
+            predictions[class_index] = ranking.total
+            if truth[class_index]:
+                ap[class_index], errors[class_index] = _class_scores(
+                    self.classes[class_index], ranking, int(truth[class_index]), self.config, class_name
+                )
+            for error in UNDEFINED.get(class_name, ()):
+                # The devkit averages with nanmean, which leaves these out.
+                errors[class_index, TP_METRICS.index(error)] = np.nan
         return DetectionScores(self.config, ap, errors, truth, predictions)
 
 
@@ -198,8 +210,8 @@ def match(
     check_counts(predictions, config=config, names=names)
     counts = np.bincount(truth.label.astype(np.int64) * samples + truth.sample, minlength=len(config.classes) * samples)
     classes = tuple(
-        match_class(truth, predictions, label=c, samples=samples, config=config, names=names)
-        for c in range(len(config.classes))
+        match_class(truth, predictions, label=class_index, samples=samples, config=config, names=names)
+        for class_index in range(len(config.classes))
     )
     return Matches(config, samples, classes, counts.reshape(-1, samples).astype(np.int32))
 
@@ -211,7 +223,7 @@ def scene_intervals(
     generator: np.random.Generator,
     replicates: int = 200,
 ) -> dict[str, tuple[float, float]]:
-    """Limits of mean_ap and nd_score by the bootstrap over scenes, since key frames of a scene are alike.
+    """Return limits of mean_ap and nd_score by a bootstrap over scenes, since key frames of a scene are dependent.
 
     Args:
         matches: From `match`.
@@ -220,24 +232,28 @@ def scene_intervals(
         replicates: Number of replicates.
 
     Returns:
-        Name -> lower and upper limit; with fewer than five scenes there is no interval, and both are NaN.
+        Name -> lower and upper limit; both NaN with fewer than five scenes.
     """
     scenes, scene = np.unique(scene_of_sample, return_inverse=True)
-    draws = generator.multinomial(len(scenes), np.full(len(scenes), 1.0 / len(scenes)), size=replicates)
-    own, found = matches.scores(), [matches.scores(draw[scene]) for draw in draws]
+    # Counts of scenes drawn with replacement; their key frames come with them.
+    scene_counts = generator.multinomial(len(scenes), np.full(len(scenes), 1.0 / len(scenes)), size=replicates)
+    full_scores, replicate_scores = matches.scores(), [matches.scores(counts[scene]) for counts in scene_counts]
     limits = {}
     for name in ("mean_ap", "nd_score"):
-        values = [float(getattr(s, name)) for s in found]
-        e = replicate_estimate(float(getattr(own, name)), values, n=len(scene), clusters=len(scenes))
-        limits[name] = (e.low, e.high)
+        values = [float(getattr(replicate, name)) for replicate in replicate_scores]
+        interval = replicate_estimate(float(getattr(full_scores, name)), values, n=len(scene), clusters=len(scenes))
+        limits[name] = (interval.low, interval.high)
     return limits
 
 
 @dataclass(frozen=True)
 class _Ranking:
-    """The predictions of a class from best to worst, each as often as its sample counts.
+    """The predictions of a class from best to worst, repeated by the multiplicity of their samples.
 
-    weight, end [n]: how often, and cumulated; runs: as `ClassMatches` has them.
+    Attributes:
+        weight: Multiplicity of each prediction [n].
+        end: Cumulated multiplicity [n].
+        runs: As in `ClassMatches`.
     """
 
     score: F64
@@ -247,53 +263,55 @@ class _Ranking:
 
     @staticmethod
     def of(matches: ClassMatches, weights: I64) -> _Ranking:
-        """The ranking of a class."""
+        """Return the ranking of a class."""
         weight = weights[matches.sample]
         return _Ranking(matches.score, weight, np.cumsum(weight), matches.runs)
 
     @property
     def total(self) -> int:
-        """How many predictions there are."""
+        """Number of predictions, with repetitions."""
         return int(self.weight.sum())
 
     def places(self, hits: I64) -> tuple[I64, I64]:
-        """Places [T'] of the matched predictions among all, ascending, and which of the hits [T] each one is."""
+        """Return the ascending ranks [T'] of the matched predictions among all, and the hit [T] behind each."""
         weight = self.weight[hits]
         source = np.repeat(np.arange(len(hits)), weight)
-        copy = np.arange(len(source)) - np.repeat(np.cumsum(weight) - weight, weight)
+        copy_index = np.arange(len(source)) - np.repeat(np.cumsum(weight) - weight, weight)
         if self.runs is None:
-            return (self.end[hits] - weight)[source] + copy, source
+            return (self.end[hits] - weight)[source] + copy_index, source
         # copies of a sample follow each other, so a run of equal scores comes whole, once for each copy
-        first, length = (values[hits] for values in self.runs)
-        start = self.end[first] - self.weight[first] + hits - first
-        place = start[source] + copy * length[source]
-        order = np.argsort(place)
-        return place[order], source[order]
+        run_start, run_length = (values[hits] for values in self.runs)
+        run_place = self.end[run_start] - self.weight[run_start] + hits - run_start
+        place = run_place[source] + copy_index * run_length[source]
+        ranking = np.argsort(place)
+        return place[ranking], source[ranking]
 
     def scores_at(self, places: I64) -> F64:
-        """Scores at these places."""
+        """Return the scores at these ranks."""
         return self.score[np.searchsorted(self.end, places, side="right")]
 
 
 def _class_scores(
     matches: ClassMatches, ranking: _Ranking, truth: int, config: DetectionConfig, name: str
 ) -> tuple[F64, F64]:
-    """AP [D] and TP errors [5] of a class that has ground truth."""
+    """Return AP [D] and TP errors [5] of a class that has ground truth."""
     ap = np.zeros(len(config.dist_ths))
     errors = np.ones(len(TP_METRICS))
-    negative = bool(len(ranking.score)) and ranking.score[-1] < 0.0
-    for i, threshold in enumerate(config.dist_ths):
-        hits = matches.hits[i]
-        place, source = ranking.places(hits)
-        if not len(place):
+    has_negative = bool(len(ranking.score)) and ranking.score[-1] < 0.0
+    for threshold_index, threshold in enumerate(config.dist_ths):
+        hits = matches.hits[threshold_index]
+        ranks, source = ranking.places(hits)
+        if not len(ranks):
             continue
-        at, true = _turning_points(place, ranking.total)
-        recall = true / float(truth)
-        ap[i] = _average_precision(np.interp(RECALL, recall, true / (at + 1.0), right=0), config)
-        if threshold != config.dist_th_tp and not negative:
+        corner_ranks, hit_counts = _turning_points(ranks, ranking.total)
+        recall = hit_counts / float(truth)
+        ap[threshold_index] = _average_precision(
+            np.interp(RECALL, recall, hit_counts / (corner_ranks + 1.0), right=0), config
+        )
+        if threshold != config.dist_th_tp and not has_negative:
             continue
-        confidence = np.interp(RECALL, recall, ranking.scores_at(at), right=0)
-        if negative and (np.diff(confidence) > 0.0).any():
+        confidence = np.interp(RECALL, recall, ranking.scores_at(corner_ranks), right=0)
+        if has_negative and (np.diff(confidence) > 0.0).any():
             raise FormatError(f"class {name}: scores below 0 cannot be evaluated; scale them to 0 .. 1")
         if threshold == config.dist_th_tp:
             errors = _tp_errors(matches.errors[:, source], matches.score[hits][source], confidence, config)
@@ -301,21 +319,21 @@ def _class_scores(
 
 
 def _turning_points(place: I64, total: int) -> tuple[I64, F64]:
-    """Places where the curve over all predictions has its corners, and the number of hits up to each.
+    """Return the ranks of the corners of the curve over all predictions, and the number of hits up to each.
 
-    np.interp over recall looks only at hits, at the prediction before each, and at both ends.
+    np.interp over recall depends only on hits, on the prediction before each, and on both ends.
     """
-    hit = np.zeros(total, np.bool_)
-    hit[place] = True
-    keep = hit.copy()
-    keep[:-1] |= hit[1:]
-    keep[0] = keep[-1] = True
-    at = np.flatnonzero(keep)
-    return at, np.cumsum(hit[at]).astype(np.float64)
+    is_hit = np.zeros(total, np.bool_)
+    is_hit[place] = True
+    is_corner = is_hit.copy()
+    is_corner[:-1] |= is_hit[1:]
+    is_corner[0] = is_corner[-1] = True
+    corner_ranks = np.flatnonzero(is_corner)
+    return corner_ranks, np.cumsum(is_hit[corner_ranks]).astype(np.float64)
 
 
 def _average_precision(precision: F64, config: DetectionConfig) -> float:
-    """Mean over the recalls above the least one, of the precision above the least one."""
+    """Return the mean over recalls above the minimum of the precision above the minimum."""
     above = precision[round(100 * config.min_recall) + 1 :] - config.min_precision
     return float(np.mean(np.maximum(above, 0.0))) / (1.0 - config.min_precision)
 
@@ -323,14 +341,19 @@ def _average_precision(precision: F64, config: DetectionConfig) -> float:
 def _tp_errors(errors: F64, score: F64, confidence: F64, config: DetectionConfig) -> F64:
     """Mean of each error [5] up to the highest recall reached; errors [5, T] and score [T] of the matches."""
     first = round(100 * config.min_recall) + 1
-    reached = np.flatnonzero(confidence)
-    last = int(reached[-1]) if len(reached) else 0
+    reached_recalls = np.flatnonzero(confidence)
+    last = int(reached_recalls[-1]) if len(reached_recalls) else 0
     if last < first:
         return np.ones(len(errors))
-    known = ~np.isnan(errors)
-    count = np.cumsum(known, axis=-1)
-    total = np.cumsum(np.where(known, errors, 0.0), axis=-1)
+    is_known = ~np.isnan(errors)
+    count = np.cumsum(is_known, axis=-1)
+    total = np.cumsum(np.where(is_known, errors, 0.0), axis=-1)
     mean = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
     mean[count[:, -1] == 0] = 1.0
-    x, xp = confidence[::-1], np.ascontiguousarray(score[::-1])
-    return np.array([float(np.mean(np.interp(x, xp, row[::-1])[::-1][first : last + 1])) for row in mean])
+    descending_confidence, ascending_score = confidence[::-1], np.ascontiguousarray(score[::-1])
+    return np.array(
+        [
+            float(np.mean(np.interp(descending_confidence, ascending_score, error_mean[::-1])[::-1][first : last + 1]))
+            for error_mean in mean
+        ]
+    )

@@ -38,9 +38,14 @@ class Boxes2D:
 
 @dataclass(frozen=True)
 class Matched2D:
-    """Detections from best to worst: label, hit (took a box), ignored (lies in a crowd region); truth [L].
+    """Matched detections, from best to worst.
 
-    `row` is the place of each in the table that was matched; None where nobody asked.
+    Attributes:
+        label: Index of the class [N].
+        hit: Whether the detection took a true box [N].
+        ignored: Whether it lies in a crowd region [N].
+        truth: Number of true boxes of each label [L].
+        row: Row of each detection in the matched table [N]; None if not recorded.
     """
 
     label: I32
@@ -51,12 +56,12 @@ class Matched2D:
 
     def average_precision(self) -> F64:
         """AP [L] of each label, NaN for one without ground truth."""
-        result = np.full(len(self.truth), np.nan)
+        precisions = np.full(len(self.truth), np.nan)
         for label, count in enumerate(self.truth.tolist()):
             if count:
-                own = (self.label == label) & ~self.ignored
-                result[label] = _interpolated(self.hit[own], count)
-        return result
+                is_counted = (self.label == label) & ~self.ignored
+                precisions[label] = _interpolated(self.hit[is_counted], count)
+        return precisions
 
 
 def match_2d(
@@ -68,8 +73,8 @@ def match_2d(
         truth: True boxes.
         detections: Detected boxes, with scores.
         labels: Number of labels.
-        threshold: Least IoU of a match.
-        max_detections: How many detections of an image and label are considered, best first.
+        threshold: Minimum IoU of a match.
+        max_detections: Maximum number of detections of an image and label, best first.
 
     Raises:
         ValueError: The detections have no scores.
@@ -78,63 +83,68 @@ def match_2d(
         raise ValueError("detections need scores")
     crowd = np.zeros(len(truth.image), np.bool_) if truth.ignore is None else truth.ignore
     images = int(max(truth.image.max(initial=-1), detections.image.max(initial=-1))) + 1
-    real_group = truth.label.astype(np.int64) * images + truth.image
-    real = np.argsort(real_group, kind="stable")
+    truth_group = truth.label.astype(np.int64) * images + truth.image
+    truth_rows = np.argsort(truth_group, kind="stable")
     group = detections.label.astype(np.int64) * images + detections.image
-    rank = _best(group, detections.score, max_detections)
-    group, real_group, crowd = group[rank], real_group[real], crowd[real]
+    ranking = _best(group, detections.score, max_detections)
+    group, truth_group, crowd = group[ranking], truth_group[truth_rows], crowd[truth_rows]
 
-    start = np.searchsorted(real_group, group, side="left")
-    count = np.searchsorted(real_group, group, side="right") - start
-    found: list[tuple[I64, I64, F64]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
+    start = np.searchsorted(truth_group, group, side="left")
+    count = np.searchsorted(truth_group, group, side="right") - start
+    near_pairs: list[tuple[I64, I64, F64]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
     for pred, box in pairs_of(count, start):
-        overlap = _iou(detections.box[rank[pred]], truth.box[real[box]], crowd[box])
-        near = np.flatnonzero(overlap >= min(threshold, 1.0 - 1e-10))
-        found.append((pred[near], box[near], overlap[near]))
-    pred, box, overlap = (np.concatenate([part[k] for part in found]) for k in range(3))
-    ignored = np.bincount(pred[crowd[box]], minlength=len(rank)) > 0
+        overlap = _iou(detections.box[ranking[pred]], truth.box[truth_rows[box]], crowd[box])
+        near_index = np.flatnonzero(overlap >= min(threshold, 1.0 - 1e-10))
+        near_pairs.append((pred[near_index], box[near_index], overlap[near_index]))
+    pred, box, overlap = (np.concatenate([pair_columns[column] for pair_columns in near_pairs]) for column in range(3))
+    # A crowd region may take any number of detections, so it needs no matching.
+    ignored = np.bincount(pred[crowd[box]], minlength=len(ranking)) > 0
     pred, box, overlap = pred[~crowd[box]], box[~crowd[box]], overlap[~crowd[box]]
-    # of equal overlaps COCO takes the last
-    order = np.lexsort((-box, -overlap, pred))
-    ((took, _),) = assign(pred[order], box[order], -overlap[order], boxes=len(real), thresholds=(np.inf,))
-    hit = np.zeros(len(rank), np.bool_)
-    hit[took] = True
-    counts = np.bincount(truth.label[real[~crowd]], minlength=labels)
-    return Matched2D(detections.label[rank], hit, ignored & ~hit, counts, rank)
+    # COCO resolves equal overlaps in favour of the last box
+    pair_order = np.lexsort((-box, -overlap, pred))
+    # Negative overlap as distance: the nearest box is the one of largest overlap.
+    ((matched, _),) = assign(
+        pred[pair_order], box[pair_order], -overlap[pair_order], boxes=len(truth_rows), thresholds=(np.inf,)
+    )
+    hit = np.zeros(len(ranking), np.bool_)
+    hit[matched] = True
+    counts = np.bincount(truth.label[truth_rows[~crowd]], minlength=labels)
+    return Matched2D(detections.label[ranking], hit, ignored & ~hit, counts, ranking)
 
 
 def average_precision(
     truth: Boxes2D, detections: Boxes2D, *, labels: int, threshold: float = 0.5, max_detections: int = 100
 ) -> F64:
-    """AP [labels], NaN for a label without ground truth; their mean (np.nanmean) is COCO's AP at the threshold."""
+    """Return AP [labels], NaN for a label without ground truth; np.nanmean of it is COCO's AP at the threshold."""
     matched = match_2d(truth, detections, labels=labels, threshold=threshold, max_detections=max_detections)
     return matched.average_precision()
 
 
 def _best(group: I64, score: F64, most: int) -> I64:
     """Rows from best to worst score (equal: by group, then as they stand), at most so many of a group."""
-    order = np.lexsort((-score, group))
-    ordered = group[order]
-    place = np.arange(len(order)) - np.searchsorted(ordered, ordered, side="left")
-    order = order[place < most]
-    return order[np.argsort(-score[order], kind="stable")]
+    by_group = np.lexsort((-score, group))
+    ordered = group[by_group]
+    place_in_group = np.arange(len(by_group)) - np.searchsorted(ordered, ordered, side="left")
+    by_group = by_group[place_in_group < most]
+    return by_group[np.argsort(-score[by_group], kind="stable")]
 
 
 def _iou(box: F64, real: F64, crowd: Bool) -> F64:
     """IoU [K] of pairs, with COCO's arithmetic on x, y, width, height; over the detection's area for a crowd."""
     size, real_size = box[:, 2:] - box[:, :2], real[:, 2:] - real[:, :2]
-    side = np.minimum(box[:, :2] + size, real[:, :2] + real_size) - np.maximum(box[:, :2], real[:, :2])
+    sides = np.minimum(box[:, :2] + size, real[:, :2] + real_size) - np.maximum(box[:, :2], real[:, :2])
     area = size[:, 0] * size[:, 1]
-    both = np.where((side > 0.0).all(axis=1), side[:, 0] * side[:, 1], 0.0)
-    union = np.where(crowd, area, area + real_size[:, 0] * real_size[:, 1] - both)
-    return np.divide(both, union, out=np.zeros_like(both), where=both > 0.0)
+    intersection = np.where((sides > 0.0).all(axis=1), sides[:, 0] * sides[:, 1], 0.0)
+    union = np.where(crowd, area, area + real_size[:, 0] * real_size[:, 1] - intersection)
+    return np.divide(intersection, union, out=np.zeros_like(intersection), where=intersection > 0.0)
 
 
 def _interpolated(hit: Bool, count: int) -> float:
     """AP of detections from best to worst, with `count` boxes to be found."""
-    right = np.cumsum(hit, dtype=np.float64)
-    recall = right / count
-    precision = right / (np.arange(1, len(hit) + 1) + np.spacing(1))
+    hit_count = np.cumsum(hit, dtype=np.float64)
+    recall = hit_count / count
+    precision = hit_count / (np.arange(1, len(hit) + 1) + np.spacing(1))
+    # Precision is made monotonic: the best at this recall or above.
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    at = np.searchsorted(recall, RECALL, side="left")
-    return float(np.mean(np.append(envelope, 0.0)[np.minimum(at, len(hit))]))
+    envelope_index = np.searchsorted(recall, RECALL, side="left")
+    return float(np.mean(np.append(envelope, 0.0)[np.minimum(envelope_index, len(hit))]))

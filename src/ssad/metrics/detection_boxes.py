@@ -1,4 +1,4 @@
-"""3D boxes as columns, the official settings of the nuScenes detection task, and which boxes it counts.
+"""3D boxes as columns, the official settings of the nuScenes detection task, and its filter of boxes.
 
 Source: nuscenes-devkit 1.2.0, eval/common/loaders.py (`filter_eval_boxes`) and configs/detection_cvpr_2019.json.
 """
@@ -98,9 +98,12 @@ class DetectionConfig:
         return tuple(self.class_range)
 
     def serialize(self) -> dict[str, Any]:
-        """The devkit's `cfg` entry."""
+        """Return the devkit's `cfg` entry."""
         return {
-            "class_range": {name: int(r) if r == int(r) else r for name, r in self.class_range.items()},
+            "class_range": {
+                name: int(distance) if distance == int(distance) else distance
+                for name, distance in self.class_range.items()
+            },
             "dist_fcn": "center_distance",
             "dist_ths": list(self.dist_ths),
             "dist_th_tp": self.dist_th_tp,
@@ -115,12 +118,13 @@ CVPR_2019: Final = DetectionConfig()
 
 
 def check_counts(boxes: BoxTable, *, config: DetectionConfig = CVPR_2019, names: Sequence[str] | None = None) -> None:
-    """Refuse more predictions in a sample than the task allows. FormatError names the sample (token, else index)."""
+    """Raise FormatError if a sample has more predictions than the task allows; names it by token, else index."""
     counts = np.bincount(boxes.sample)
     if counts.size and counts.max() > config.max_boxes_per_sample:
-        worst = int(counts.argmax())
+        largest_sample = int(counts.argmax())
         raise FormatError(
-            f"sample {worst if names is None else names[worst]}: {counts[worst]} boxes, but at most "
+            f"sample {largest_sample if names is None else names[largest_sample]}: "
+            f"{counts[largest_sample]} boxes, but at most "
             f"{config.max_boxes_per_sample} are allowed; keep the best of them"
         )
 
@@ -132,7 +136,7 @@ def keep_boxes(
     points: npt.NDArray[Any] | None = None,
     racks: BikeRacks | None = None,
 ) -> Bool:
-    """Which boxes the task counts: nearer than the range of their class, not empty, not parked in a rack.
+    """Return which boxes the task counts: within the range of their class, not empty, not parked in a rack.
 
     Args:
         boxes: The boxes.
@@ -144,14 +148,14 @@ def keep_boxes(
         Mask [N].
     """
     ranges = np.array(list(config.class_range.values()), np.float64)
-    keep: Bool = boxes.ego_distance < ranges[boxes.label]
+    is_counted: Bool = boxes.ego_distance < ranges[boxes.label]
     if points is not None:
-        keep &= points != 0
+        is_counted &= points != 0
     if racks is not None and len(racks.sample):
-        racked = np.array([name in RACKED for name in config.classes])
-        rows = np.flatnonzero(keep & racked[boxes.label])
-        keep[rows[_in_racks(boxes.sample[rows], boxes.centre[rows], racks)]] = False
-    return keep
+        is_rack_class = np.array([name in RACKED for name in config.classes])
+        rows = np.flatnonzero(is_counted & is_rack_class[boxes.label])
+        is_counted[rows[_in_racks(boxes.sample[rows], boxes.centre[rows], racks)]] = False
+    return is_counted
 
 
 def filter_boxes(
@@ -161,27 +165,27 @@ def filter_boxes(
     points: npt.NDArray[Any] | None = None,
     racks: BikeRacks | None = None,
 ) -> BoxTable:
-    """The boxes that the task counts, in their order (see `keep_boxes`)."""
+    """Return the boxes that the task counts, in their order (see `keep_boxes`)."""
     return boxes.take(np.flatnonzero(keep_boxes(boxes, config=config, points=points, racks=racks)))
 
 
 def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
-    """Which points [N] lie in a rack of their sample, bounds included, with the devkit's arithmetic."""
+    """Return which points [N] lie in a rack of their sample, bounds included, in the devkit's arithmetic."""
     order = np.argsort(racks.sample, kind="stable")
-    low = np.searchsorted(racks.sample[order], sample, side="left")
-    count = np.searchsorted(racks.sample[order], sample, side="right") - low
+    first_rack = np.searchsorted(racks.sample[order], sample, side="left")
+    count = np.searchsorted(racks.sample[order], sample, side="right") - first_rack
     point = np.repeat(np.arange(len(sample)), count)
-    rack = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - low, count)]
+    rack = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - first_rack, count)]
 
-    near = racks.take(rack)
-    half, turn = 0.5 * near.size_lwh, near.axes()
+    candidate_racks = racks.take(rack)
+    half_size, rack_axes = 0.5 * candidate_racks.size_lwh, candidate_racks.axes()
     corner = np.empty((4, len(rack), 3))
-    for i, (a, b, c) in enumerate(((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))):
-        local = [a, b, c] * half
-        corner[i] = np.einsum("nij,nj->ni", turn, local) + near.centre
+    for corner_index, (x_sign, y_sign, z_sign) in enumerate(((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))):
+        local = [x_sign, y_sign, z_sign] * half_size
+        corner[corner_index] = np.einsum("nij,nj->ni", rack_axes, local) + candidate_racks.centre
     offset = centre[point] - corner[0]
-    inside = np.ones(len(rack), np.bool_)
+    is_inside = np.ones(len(rack), np.bool_)
     for edge in corner[1:] - corner[0]:
-        along = (edge * offset).sum(axis=1)
-        inside &= (along >= 0.0) & (along <= (edge * edge).sum(axis=1))
-    return np.bincount(point[inside], minlength=len(sample)) > 0
+        projection = (edge * offset).sum(axis=1)
+        is_inside &= (projection >= 0.0) & (projection <= (edge * edge).sum(axis=1))
+    return np.bincount(point[is_inside], minlength=len(sample)) > 0

@@ -20,20 +20,20 @@ from ssad.core.rotations import quaternion_to_yaw
 from ssad.core.types import F64, I32, Bool
 from ssad.metrics.detection_boxes import I64, BoxTable, DetectionConfig
 
-PAIRS = 1 << 16  # pairs looked at together: bounds the memory
+PAIRS = 1 << 16  # pairs compared at once; bounds the memory
 
 
 @dataclass(frozen=True)
 class ClassMatches:
-    """The predictions of a class from best to worst, and which of them are matched.
+    """The predictions of a class from best to worst, and their matches.
 
     Attributes:
         sample: Sample of each [n].
         score: Score of each [n].
         hits: For each threshold, the ranks [T] of the matched ones, ascending.
         errors: Errors of the matches at the TP threshold [5, T], in the order of TP_METRICS (NaN: unknown).
-        runs: For each prediction, where the run of equal scores of one sample that it belongs to begins [n], and the
-            length of the run [n]; None if there are no ties.
+        runs: For each prediction, the start [n] of its run of equal scores in one sample, and the length [n] of
+            the run; None if there are no ties.
     """
 
     sample: I32
@@ -65,42 +65,46 @@ def match_class(
     Raises:
         FormatError: A matched box has no size.
     """
-    own = np.flatnonzero(predictions.label == label)
-    rank = own[np.argsort(predictions.score[own], kind="stable")[::-1]]
-    real = np.flatnonzero(truth.label == label)
-    real = real[np.argsort(truth.sample[real], kind="stable")]
-    sample, score = predictions.sample[rank], predictions.score[rank]
+    class_rows = np.flatnonzero(predictions.label == label)
+    ranking = class_rows[np.argsort(predictions.score[class_rows], kind="stable")[::-1]]
+    truth_rows = np.flatnonzero(truth.label == label)
+    truth_rows = truth_rows[np.argsort(truth.sample[truth_rows], kind="stable")]
+    sample, score = predictions.sample[ranking], predictions.score[ranking]
 
     pred, box, distance = _near_pairs(
         sample,
-        predictions.centre[rank, :2],
-        truth.sample[real],
-        truth.centre[real, :2],
+        predictions.centre[ranking, :2],
+        truth.sample[truth_rows],
+        truth.centre[truth_rows, :2],
         samples=samples,
         limit=max(config.dist_ths),
     )
-    pairs = assign(pred, box, distance, boxes=len(real), thresholds=config.dist_ths)
-    for hit, taken in pairs:
-        _check_sizes(truth, real[taken], predictions, rank[hit], names)
-    hit, taken = pairs[config.dist_ths.index(config.dist_th_tp)]
+    pairs = assign(pred, box, distance, boxes=len(truth_rows), thresholds=config.dist_ths)
+    for matched_ranks, matched_boxes in pairs:
+        _check_sizes(truth, truth_rows[matched_boxes], predictions, ranking[matched_ranks], names)
+    matched_ranks, matched_boxes = pairs[config.dist_ths.index(config.dist_th_tp)]
     name = config.classes[label]
     return ClassMatches(
         sample=sample,
         score=score,
-        hits=tuple(hit for hit, _ in pairs),
-        errors=_errors(truth.take(real[taken]), predictions.take(rank[hit]), np.pi if name == "barrier" else 2 * np.pi),
+        hits=tuple(matched_ranks for matched_ranks, _ in pairs),
+        errors=_errors(
+            truth.take(truth_rows[matched_boxes]),
+            predictions.take(ranking[matched_ranks]),
+            np.pi if name == "barrier" else 2 * np.pi,
+        ),
         runs=_runs(sample, score),
     )
 
 
 def _runs(sample: I32, score: F64) -> tuple[I64, I64] | None:
-    """Begin and length [n] of the runs of equal sample and score."""
-    same = (sample[1:] == sample[:-1]) & (score[1:] == score[:-1])
-    if not same.any():
+    """Return start and length [n] of the runs of equal sample and score."""
+    is_tie = (sample[1:] == sample[:-1]) & (score[1:] == score[:-1])
+    if not is_tie.any():
         return None
-    head = np.flatnonzero(np.r_[True, ~same])
-    length = np.diff(np.r_[head, len(score)])
-    return np.repeat(head, length), np.repeat(length, length)
+    run_start = np.flatnonzero(np.r_[True, ~is_tie])
+    length = np.diff(np.r_[run_start, len(score)])
+    return np.repeat(run_start, length), np.repeat(length, length)
 
 
 def _near_pairs(
@@ -115,79 +119,92 @@ def _near_pairs(
     count, start = counts[sample], starts[sample]
     x, y = np.ascontiguousarray(centre[:, 0]), np.ascontiguousarray(centre[:, 1])
     box_x, box_y = np.ascontiguousarray(box_centre[:, 0]), np.ascontiguousarray(box_centre[:, 1])
-    found: list[tuple[I64, I64, F64]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
+    near_pairs: list[tuple[I64, I64, F64]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
     for pred, box in pairs_of(count, start):
         dx, dy = x[pred] - box_x[box], y[pred] - box_y[box]
         distance = np.sqrt(dx * dx + dy * dy)
-        near = np.flatnonzero(distance < limit)
-        found.append((pred[near], box[near], distance[near]))
-    pred, box, distance = (np.concatenate([part[k] for part in found]) for k in range(3))
-    order = np.lexsort((distance, pred))
-    return pred[order], box[order], distance[order]
+        near_index = np.flatnonzero(distance < limit)
+        near_pairs.append((pred[near_index], box[near_index], distance[near_index]))
+    pred, box, distance = (np.concatenate([pair_columns[column] for pair_columns in near_pairs]) for column in range(3))
+    pair_order = np.lexsort((distance, pred))
+    return pred[pair_order], box[pair_order], distance[pair_order]
 
 
 def pairs_of(count: I64, start: I64) -> Iterator[tuple[I64, I64]]:
     """All pairs of prediction i with the boxes start[i] ... start[i] + count[i] - 1, about PAIRS of them at a time."""
     total = np.cumsum(count)
-    low, done = 0, 0
-    while low < len(count):
-        high = max(int(np.searchsorted(total, done + PAIRS, side="right")), low + 1)
-        n = count[low:high]
-        pred = np.repeat(np.arange(low, high), n)
-        yield pred, np.arange(len(pred)) + np.repeat(start[low:high] - (np.cumsum(n) - n), n)
-        low, done = high, int(total[high - 1])
+    chunk_start, pairs_done = 0, 0
+    while chunk_start < len(count):
+        chunk_end = max(int(np.searchsorted(total, pairs_done + PAIRS, side="right")), chunk_start + 1)
+        chunk_counts = count[chunk_start:chunk_end]
+        pred = np.repeat(np.arange(chunk_start, chunk_end), chunk_counts)
+        yield (
+            pred,
+            np.arange(len(pred))
+            + np.repeat(start[chunk_start:chunk_end] - (np.cumsum(chunk_counts) - chunk_counts), chunk_counts),
+        )
+        chunk_start, pairs_done = chunk_end, int(total[chunk_end - 1])
 
 
 def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequence[float]) -> list[tuple[I64, I64]]:
-    """For each threshold the matched predictions, ascending, and the boxes that they take.
+    """Return for each threshold the matched predictions, ascending, and their boxes.
 
     A proposer is a prediction at a threshold; its choices are the first ones of its pairs, up to the threshold.
 
     Args:
-        pred: Prediction of each near pair [K], sorted as `_near_pairs` gives them.
+        pred: Prediction of each near pair [K], sorted as by `_near_pairs`.
         box: True box of each pair [K].
         distance: Distance of each pair [K], m.
         boxes: Number of true boxes.
         thresholds: Thresholds of a match, m.
     """
-    n = len(thresholds)
-    head = np.flatnonzero(np.r_[True, pred[1:] != pred[:-1]]) if len(pred) else np.zeros(0, np.int64)
-    who = pred[head]
-    end = np.stack([np.add.reduceat(distance < t, head) if len(head) else head for t in thresholds], axis=1)
-    end = (end + head[:, None]).ravel()  # proposer i * n + t
-    choice = np.repeat(head, n)
-    nobody = len(end)
-    holder = np.full(boxes * n, nobody, np.int64)
-    free = np.flatnonzero(choice < end)
+    threshold_count = len(thresholds)
+    first_pair = np.flatnonzero(np.r_[True, pred[1:] != pred[:-1]]) if len(pred) else np.zeros(0, np.int64)
+    proposing_prediction = pred[first_pair]
+    choice_end = np.stack(
+        [
+            np.add.reduceat(distance < threshold_index, first_pair) if len(first_pair) else first_pair
+            for threshold_index in thresholds
+        ],
+        axis=1,
+    )
+    choice_end = (choice_end + first_pair[:, None]).ravel()  # proposer i * n + t
+    choice = np.repeat(first_pair, threshold_count)
+    no_proposer = len(choice_end)
+    holder = np.full(boxes * threshold_count, no_proposer, np.int64)
+    free = np.flatnonzero(choice < choice_end)
     while len(free):
-        target = box[choice[free]] * n + free % n
-        before = holder[target]
+        target = box[choice[free]] * threshold_count + free % threshold_count
+        previous_holder = holder[target]
         # proposers are numbered by rank, so the least of them is the best
         np.minimum.at(holder, target, free)
-        after = holder[target]
-        won = after == free
-        lost = np.concatenate([free[~won], before[won]])
-        lost = lost[lost < nobody]
-        choice[lost] += 1
-        free = lost[choice[lost] < end[lost]]
-    result = []
-    for t in range(n):
-        taken = np.flatnonzero(holder[t::n] < nobody)
-        hit = who[holder[t::n][taken] // n]
-        order = np.argsort(hit)
-        result.append((hit[order], taken[order]))
-    return result
+        new_holder = holder[target]
+        is_accepted = new_holder == free
+        rejected = np.concatenate([free[~is_accepted], previous_holder[is_accepted]])
+        rejected = rejected[rejected < no_proposer]
+        choice[rejected] += 1
+        free = rejected[choice[rejected] < choice_end[rejected]]
+    matches = []
+    for threshold_index in range(threshold_count):
+        taken_boxes = np.flatnonzero(holder[threshold_index::threshold_count] < no_proposer)
+        matched_predictions = proposing_prediction[
+            holder[threshold_index::threshold_count][taken_boxes] // threshold_count
+        ]
+        by_prediction = np.argsort(matched_predictions)
+        matches.append((matched_predictions[by_prediction], taken_boxes[by_prediction]))
+    return matches
 
 
 def _check_sizes(truth: BoxTable, real: I64, predictions: BoxTable, rank: I64, names: Sequence[str] | None) -> None:
     """The devkit refuses a matched box one of whose sides is not positive."""
-    for what, boxes, rows in (("prediction", predictions, rank), ("ground truth", truth, real)):
-        flat: Bool = np.asarray(~(boxes.size_lwh[rows] > 0.0).all(axis=1))
-        if flat.any():
-            row = int(rows[flat.argmax()])
+    for role, boxes, rows in (("prediction", predictions, rank), ("ground truth", truth, real)):
+        # Negated, so that NaN counts as invalid too.
+        is_flat: Bool = np.asarray(~(boxes.size_lwh[rows] > 0.0).all(axis=1))
+        if is_flat.any():
+            row = int(rows[is_flat.argmax()])
             sample = int(boxes.sample[row])
             raise FormatError(
-                f"sample {sample if names is None else names[sample]}: a {what} box has the size "
+                f"sample {sample if names is None else names[sample]}: a {role} box has the size "
                 f"{boxes.size_wlh[row].tolist()}; all sides must be positive"
             )
 
@@ -195,10 +212,13 @@ def _check_sizes(truth: BoxTable, real: I64, predictions: BoxTable, rank: I64, n
 def _errors(truth: BoxTable, found: BoxTable, period: float) -> F64:
     """Errors [5, T] of matched pairs: translation m, 1 - IoU of the sizes, yaw rad, velocity m/s, attribute 0 or 1."""
     dx, dy = (found.centre[:, :2] - truth.centre[:, :2]).T
-    shared = np.prod(np.minimum(truth.size_lwh, found.size_lwh), axis=1)
-    union = np.prod(truth.size_lwh, axis=1) + np.prod(found.size_lwh, axis=1) - shared
-    off = quaternion_to_yaw(truth.rotation) - quaternion_to_yaw(found.rotation)
-    turn = np.abs((off + period / 2) % period - period / 2)
+    intersection = np.prod(np.minimum(truth.size_lwh, found.size_lwh), axis=1)
+    union = np.prod(truth.size_lwh, axis=1) + np.prod(found.size_lwh, axis=1) - intersection
+    yaw_difference = quaternion_to_yaw(truth.rotation) - quaternion_to_yaw(found.rotation)
+    # The period is pi for barriers, whose front and rear look alike.
+    yaw_error = np.abs((yaw_difference + period / 2) % period - period / 2)
     vx, vy = (found.velocity - truth.velocity).T
-    wrong = np.where(truth.attribute < 0, np.nan, truth.attribute != found.attribute)
-    return np.stack([np.sqrt(dx * dx + dy * dy), 1.0 - shared / union, turn, np.sqrt(vx * vx + vy * vy), wrong])
+    attribute_error = np.where(truth.attribute < 0, np.nan, truth.attribute != found.attribute)
+    return np.stack(
+        [np.sqrt(dx * dx + dy * dy), 1.0 - intersection / union, yaw_error, np.sqrt(vx * vx + vy * vy), attribute_error]
+    )

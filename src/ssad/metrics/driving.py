@@ -1,7 +1,7 @@
-"""How well one episode was driven: SafeBench's ten metrics, CARLA's driving score and what lies under them.
+"""Driving metrics of one episode: SafeBench's ten metrics, CARLA's driving score and their components.
 
-Definitions, units and sources of all metrics: docs/metrics.md. Everything is a function of an `EpisodeTrace`. Row 0 of
-a trace is the start, before anything was driven, so means over steps leave it out.
+Definitions, units and sources of all metrics: docs/metrics.md. All metrics are functions of an `EpisodeTrace`. Row 0
+of a trace is the start, before anything was driven, so means over steps leave it out.
 """
 
 from __future__ import annotations
@@ -50,36 +50,37 @@ PLACE_FORGOTTEN = 5.0
 
 @dataclass(frozen=True)
 class EpisodeMetrics:
-    """Raw metrics of one episode; NaN where the trace has nothing to measure, None where the world has not.
+    """Raw metrics of one episode; NaN where the trace has nothing to measure, None where the world lacks it.
 
     Attributes:
-        collision: Whether there was one.
-        collision_events: Number of them.
+        collision: Whether the ego hit anything.
+        collision_events: Number of collision events.
         collisions_vehicle: Events with vehicles.
         collisions_walker: Events with pedestrians.
         collisions_cyclist: Events with cyclists.
         collisions_static: Events with anything else.
         off_road: Distance driven off the road, m.
         off_road_fraction: Share of the distance driven.
-        distance_to_route: m.
+        distance_to_route: Mean distance to the route, m.
         route_completion: 0 to 1.
         route_following: 0 to 1.
-        time: s.
+        time: Duration, s.
         driven: Distance, m.
         red_lights: Number of red lights run.
-        stop_signs: Number of stop signs run; None in a world without, whose driving score then leaves them out.
-        acceleration: m/s^2.
-        yaw_velocity: rad/s.
-        lane_invasions: Number of them.
-        in_route_failure: Whether the ego left its route too far or for too long (see the function of this name).
+        stop_signs: Number of stop signs run; None in a world without stop signs, whose driving score leaves them
+            out.
+        acceleration: Mean acceleration, m/s^2.
+        yaw_velocity: Mean yaw rate, rad/s.
+        lane_invasions: Number of lane invasions.
+        in_route_failure: Whether the ego left its route too far or for too long (see `in_route_failure`).
         driving_score: 0 to 100.
-        min_ttc: Least time to collision, s (10: none).
+        min_ttc: Minimum time to collision, s (10: none).
         pet: Post-encroachment time, s (10: none).
-        min_distance: Least distance to another agent, m (NaN: there is none).
-        impact_speed: Speed of the ego against what it hit first, m/s (NaN: it hit nothing).
-        lane_crossings: Times that the simulator's own sensor saw lane markings crossed (NaN: it has none).
-        avoided_by_cc: 1 if the careful and competent human driver of UN R157 avoids the collision that was, else 0
-            (NaN: there was none, or it was not graded); likewise the others.
+        min_distance: Minimum distance to another agent, m (NaN: there is none).
+        impact_speed: Relative speed at the ego's first contact, m/s (NaN: no contact).
+        lane_crossings: Lane markings crossed by the simulator's own sensor (NaN: it has none).
+        avoided_by_cc: 1 if the careful and competent human driver of UN R157 avoids the collision, else 0 (NaN:
+            no collision, or not graded); likewise the others.
         avoided_by_reg157: Of UN R157, 5.2.5.2.
         avoided_by_rss: Of RSS.
         avoided_by_fsm: Of the FSM.
@@ -118,48 +119,51 @@ class EpisodeMetrics:
     avoided_by_limit: float = math.nan
 
     def as_dict(self) -> dict[str, Any]:
-        """Field name -> value."""
+        """Return the values by field name."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> EpisodeMetrics:
-        """From `as_dict` or its JSON form: None or absent is NaN (stop_signs: None); other keys are ignored."""
-        read: dict[str, Any] = {"bool": bool, "int": int, "int | None": int, "float": float}
+        """Build metrics from `as_dict` or its JSON form.
+
+        None or a missing value becomes NaN (stop_signs: None); other keys are ignored.
+        """
+        converters: dict[str, Any] = {"bool": bool, "int": int, "int | None": int, "float": float}
         values: dict[str, Any] = {}
-        for f in fields(cls):
-            value = data.get(f.name)
-            missing = None if f.type == "int | None" else math.nan
-            values[f.name] = missing if value is None else read[str(f.type)](value)
+        for metric_field in fields(cls):
+            value = data.get(metric_field.name)
+            missing = None if metric_field.type == "int | None" else math.nan
+            values[metric_field.name] = missing if value is None else converters[str(metric_field.type)](value)
         return cls(**values)
 
 
 def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> EpisodeMetrics:
-    """All metrics of one episode.
+    """Compute all metrics of one episode.
 
     Args:
-        trace: what happened.
-        stop_signs: whether the town that the trace is from has stop signs.
+        trace: The trace of the episode.
+        stop_signs: Whether the town of the trace has stop signs.
 
     Raises:
-        ValueError: the trace has no row.
+        ValueError: The trace has no row.
     """
     if len(trace.contact) == 0:
         raise ValueError(f"trace {trace.key}: no rows")
     events = collision_events(trace)
-    kinds = {name: int(((trace.contact[events] & kind) != 0).sum()) for name, kind in COLLISIONS.items()}
-    off, driven = off_road_distance(trace), float(trace.driven[-1])
-    fraction = min(off / driven, 1.0) if driven > 0.0 else 0.0
+    counts = {name: int(((trace.contact[events] & kind) != 0).sum()) for name, kind in COLLISIONS.items()}
+    off_road_metres, driven = off_road_distance(trace), float(trace.driven[-1])
+    off_road_fraction = min(off_road_metres / driven, 1.0) if driven > 0.0 else 0.0
     completion = min(max(float(trace.route_complete[-1]) / 100.0, 0.0), 1.0)
     deviation = _mean(trace.route_distance[1:])
     # bodies may touch between two rows
-    touched = bool((trace.contact_agent >= 0).any())
-    infractions = kinds | {"red_lights": int(trace.red_light.sum())}
-    signs = int(trace.stop_sign.sum()) if stop_signs else None
+    has_contact = bool((trace.contact_agent >= 0).any())
+    infractions = counts | {"red_lights": int(trace.red_light.sum())}
+    stop_sign_count = int(trace.stop_sign.sum()) if stop_signs else None
     return EpisodeMetrics(
         collision=collided(trace),
         collision_events=int(events.sum()),
-        off_road=off,
-        off_road_fraction=fraction,
+        off_road=off_road_metres,
+        off_road_fraction=off_road_fraction,
         distance_to_route=deviation,
         route_completion=completion,
         route_following=1.0 - min(deviation / DIVISORS["DR"], 1.0) if math.isfinite(deviation) else math.nan,
@@ -169,32 +173,35 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
         yaw_velocity=mean_yaw_velocity(trace),
         lane_invasions=int(trace.lane_invasion.sum()),
         in_route_failure=in_route_failure(trace),
-        driving_score=driving_score(completion, infractions | {"stop_signs": signs or 0}, fraction),
-        min_ttc=0.0 if touched else min_ttc(trace),
-        pet=0.0 if touched else post_encroachment_time(trace),
-        min_distance=0.0 if touched else min_distance(trace),
-        stop_signs=signs,
+        driving_score=driving_score(completion, infractions | {"stop_signs": stop_sign_count or 0}, off_road_fraction),
+        min_ttc=0.0 if has_contact else min_ttc(trace),
+        pet=0.0 if has_contact else post_encroachment_time(trace),
+        min_distance=0.0 if has_contact else min_distance(trace),
+        stop_signs=stop_sign_count,
         impact_speed=impact_speed(trace),
         **infractions,
     )
 
 
 def collided(trace: EpisodeTrace) -> bool:
-    """Whether the ego hit anything. SafeBench reads its last record, whose collision flag stays set once raised."""
+    """Return whether the ego hit anything.
+
+    SafeBench reads its last record, whose collision flag stays set once raised.
+    """
     return bool((trace.contact != 0).any()) or trace.end == "collision"
 
 
 def first_contact(trace: EpisodeTrace) -> tuple[int, int]:
-    """The first contact of a drive.
+    """Return the first contact of an episode.
 
     Args:
-        trace: The drive.
+        trace: The trace of the episode.
 
     Returns:
-        Its step, and the agent that was hit; -1: something that is no agent.
+        Its step, and the agent that was hit; -1 for an object that is no agent.
 
     Raises:
-        ValueError: There is none.
+        ValueError: There is no contact.
     """
     steps = np.flatnonzero(trace.contact)
     if len(steps) == 0:
@@ -203,24 +210,24 @@ def first_contact(trace: EpisodeTrace) -> tuple[int, int]:
 
 
 def impact_speed(trace: EpisodeTrace) -> float:
-    """Speed of the ego against what it hit first, m/s: the length of the difference of their velocities; NaN: nothing.
+    """Return the relative speed of the ego and the first body it hit, m/s; NaN without contact.
 
-    It is the severity that NeuroNCAP weighs collisions by.
+    It is the length of the difference of their velocities, the severity by which NeuroNCAP weighs collisions.
     """
     if not (trace.contact != 0).any():
         return math.nan
     step, agent = first_contact(trace)
-    who = [0] if agent < 1 else [0, agent]
-    speed, yaw = trace.speed[step, who].astype(np.float64), trace.yaw[step, who].astype(np.float64)
-    sides = np.array([1.0, -1.0])[: len(who)]
-    return float(np.hypot((sides * speed * np.cos(yaw)).sum(), (sides * speed * np.sin(yaw)).sum()))
+    bodies = [0] if agent < 1 else [0, agent]
+    speed, yaw = trace.speed[step, bodies].astype(np.float64), trace.yaw[step, bodies].astype(np.float64)
+    signs = np.array([1.0, -1.0])[: len(bodies)]
+    return float(np.hypot((signs * speed * np.cos(yaw)).sum(), (signs * speed * np.sin(yaw)).sum()))
 
 
 def collision_events(trace: EpisodeTrace) -> Bool:
-    """[T] steps that begin a collision event, as CARLA's leaderboard and FREA count them.
+    """Return the steps [T] that begin a collision event, as CARLA's leaderboard and FREA count them.
 
-    A contact is no new event within 5 s of the last event with the same agent, or while the ego is within 3 m of the
-    place of an event (a place is forgotten once the ego is more than 5 m from it).
+    A contact is no new event within 5 s of the last event with the same agent, or while the ego is within 3 m of
+    the place of an event (a place is dropped once the ego is more than 5 m from it).
     """
     events = np.zeros(len(trace.contact), np.bool_)
     steps = np.flatnonzero(trace.contact)
@@ -228,35 +235,37 @@ def collision_events(trace: EpisodeTrace) -> Bool:
         return events
     ego = np.stack([trace.x[:, 0], trace.y[:, 0]], axis=-1).astype(np.float64)
     accepted: list[int] = []
-    for i in steps:
-        distance = [np.hypot(*(ego[event : i + 1] - ego[event]).T) for event in accepted]
-        known_place = any(d[-1] <= SAME_PLACE and d.max() <= PLACE_FORGOTTEN for d in distance)
-        agent = trace.contact_agent[i]
+    for step in steps:
+        event_distances = [np.hypot(*(ego[event : step + 1] - ego[event]).T) for event in accepted]
+        known_place = any(
+            distances[-1] <= SAME_PLACE and distances.max() <= PLACE_FORGOTTEN for distances in event_distances
+        )
+        agent = trace.contact_agent[step]
         known_agent = agent >= 0 and any(
-            trace.contact_agent[event] == agent and (i - event) * trace.dt <= SAME_AGENT_TIME for event in accepted
+            trace.contact_agent[event] == agent and (step - event) * trace.dt <= SAME_AGENT_TIME for event in accepted
         )
         if not (known_place or known_agent):
-            accepted.append(int(i))
+            accepted.append(int(step))
     events[accepted] = True
     return events
 
 
 def off_road_distance(trace: EpisodeTrace) -> float:
-    """Metres driven in steps that begin or end off the road (SafeBench `cal_out_of_road_length`)."""
-    gone = np.diff(trace.driven.astype(np.float64))
-    return float(gone[trace.off_road[1:] | trace.off_road[:-1]].sum())
+    """Return the metres driven in steps that begin or end off the road (SafeBench `cal_out_of_road_length`)."""
+    step_distance = np.diff(trace.driven.astype(np.float64))
+    return float(step_distance[trace.off_road[1:] | trace.off_road[:-1]].sum())
 
 
 def mean_acceleration(trace: EpisodeTrace) -> float:
     """Mean size of the ego's acceleration, m/s^2: along the heading as recorded, across it speed x yaw rate."""
     if len(trace.accel) < 2:
         return math.nan
-    across = trace.speed[1:, 0].astype(np.float64) * _turns(trace, wrap=True) / trace.dt
-    return _mean(np.hypot(trace.accel[1:].astype(np.float64), across))
+    lateral = trace.speed[1:, 0].astype(np.float64) * _turns(trace, wrap=True) / trace.dt
+    return _mean(np.hypot(trace.accel[1:].astype(np.float64), lateral))
 
 
 def mean_yaw_velocity(trace: EpisodeTrace, *, wrap: bool = True) -> float:
-    """Mean |yaw rate|, rad/s. `wrap=False` repeats SafeBench, which counts a step from pi to -pi as a full turn."""
+    """Return the mean |yaw rate|, rad/s; `wrap=False` repeats SafeBench, which counts pi to -pi as a full turn."""
     turns = np.abs(_turns(trace, wrap=wrap))
     return float(turns.sum() / (len(turns) * trace.dt)) if len(turns) else math.nan
 
@@ -268,8 +277,8 @@ def in_route_failure(trace: EpisodeTrace) -> bool:
     """
     distance = trace.route_distance[1:]
     length = float(np.hypot(*np.diff(trace.route.astype(np.float64), axis=0).T).sum())
-    away = float(np.diff(trace.driven.astype(np.float64))[distance > OFF_ROUTE_DISTANCE].sum())
-    return bool((distance > MAX_ROUTE_DISTANCE).any()) or away > OFF_ROUTE_SHARE * length
+    off_route_metres = float(np.diff(trace.driven.astype(np.float64))[distance > OFF_ROUTE_DISTANCE].sum())
+    return bool((distance > MAX_ROUTE_DISTANCE).any()) or off_route_metres > OFF_ROUTE_SHARE * length
 
 
 def driving_score(completion: float, infractions: Mapping[str, int], off_road_fraction: float) -> float:
@@ -285,27 +294,28 @@ def driving_score(completion: float, infractions: Mapping[str, int], off_road_fr
 
 
 def normalised(name: str, value: float) -> float:
-    """A metric of `DIVISORS` brought into [0, 1], 1 the worst."""
+    """Return a metric of `DIVISORS` scaled to [0, 1], 1 the worst."""
     return min(value / DIVISORS[name], 1.0)
 
 
 def overall_score(means: Mapping[str, float], *, time_out: float = DIVISORS["TS"]) -> float:
-    """SafeBench's overall score, LOWER is better, from means over episodes of CR, OR, DR, RC and TS.
+    """Return SafeBench's overall score, LOWER is better, from means over episodes of CR, OR, DR, RC and TS.
 
-    As its code has it: a term is divided by its divisor, rounded to two decimals, not clipped, and weighted.
+    As in its code, each term is divided by its divisor, rounded to two decimals, not clipped, and weighted.
     """
     terms = {**means, "IR": 1.0 - means["RC"]}
     divisors = {**DIVISORS, "TS": time_out}
+    # Rounding each term repeats SafeBench's code, so that published scores are comparable.
     return sum(weight * round(terms[name] / divisors[name], 2) for name, weight in WEIGHTS.items())
 
 
 def frea_score(means: Mapping[str, float], *, time_out: float = DIVISORS["TS"]) -> float:
-    """FREA's overall score, HIGHER is better: 1 - SafeBench's. FREA puts collision events an episode in place of CR."""
+    """Return FREA's overall score, 1 - SafeBench's, HIGHER is better; FREA uses collision events an episode as CR."""
     return 1.0 - overall_score(means, time_out=time_out)
 
 
 def _turns(trace: EpisodeTrace, *, wrap: bool) -> F64:
-    """[T - 1] change of the ego's yaw in each step, rad."""
+    """Return the change of the ego's yaw in each step [T - 1], rad."""
     turns = np.diff(trace.yaw[:, 0].astype(np.float64))
     return np.asarray(wrap_angle(turns) if wrap else turns, np.float64)
 

@@ -1,4 +1,4 @@
-"""Do two kinds of damage order perturbations alike? Spearman's rank correlation with its interval over families."""
+"""Spearman's rank correlation between two kinds of damage, with its interval over families of perturbations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LEAST = 5
 
 
 def rank_correlation(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
-    """Spearman's rank correlation, ties by their mean rank.
+    """Return Spearman's rank correlation; ties get their mean rank.
 
     Args:
         first: [N].
@@ -27,41 +27,42 @@ def rank_correlation(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
     """
     from scipy.stats import rankdata
 
-    one, other = (rankdata(np.asarray(v, np.float64)) for v in (first, second))
-    one, other = one - one.mean(), other - other.mean()
-    size = float(np.sqrt((one**2).sum() * (other**2).sum()))
-    return float((one * other).sum() / size) if size > 0 else float("nan")
+    first_ranks, second_ranks = (rankdata(np.asarray(values, np.float64)) for values in (first, second))
+    first_ranks, second_ranks = first_ranks - first_ranks.mean(), second_ranks - second_ranks.mean()
+    norm_product = float(np.sqrt((first_ranks**2).sum() * (second_ranks**2).sum()))
+    return float((first_ranks * second_ranks).sum() / norm_product) if norm_product > 0 else float("nan")
 
 
 def family_correlation(first: Sequence[float], second: Sequence[float], families: Sequence[str]) -> Estimate:
-    """Rank correlation over perturbations, its 95 % interval by drawing families, not points, with replacement.
+    """Return the rank correlation over perturbations, with a 95 % interval by resampling families, not points.
 
-    Severities of one perturbation are alike, so they never count as independent. Percentiles of the replicates in which
-    the correlation is defined.
+    Severities of one perturbation are dependent, so they never count as independent. The limits are percentiles
+    of the replicates in which the correlation is defined.
 
     Args:
         first: Damage of one kind, one number a perturbation.
         second: Damage of the other kind.
-        families: Which family each belongs to.
+        families: Family of each perturbation.
 
     Returns:
-        The estimate: n the points, clusters the families; method "bootstrap", or "none" with fewer than five families.
+        The estimate: n the points, clusters the families; method "bootstrap", or "none" with fewer than five
+            families.
     """
-    one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    known = np.isfinite(one) & np.isfinite(other)
-    one, other = one[known], other[known]
-    names = [name for name, good in zip(families, known, strict=True) if good]
+    first_values, second_values = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    is_known = np.isfinite(first_values) & np.isfinite(second_values)
+    first_values, second_values = first_values[is_known], second_values[is_known]
+    names = [family_name for family_name, is_valid in zip(families, is_known, strict=True) if is_valid]
     unique = sorted(set(names))
-    value = rank_correlation(one, other) if len(one) >= 3 else float("nan")
+    value = rank_correlation(first_values, second_values) if len(first_values) >= 3 else float("nan")
     if np.isnan(value):
         return NOTHING
     if len(unique) < LEAST:
-        return Estimate(value, float("nan"), float("nan"), len(one), 0, "none", len(unique))
-    rows = [np.array([k for k, name in enumerate(names) if name == family]) for family in unique]
-    draws = generator("family correlation", len(one), len(unique))
-    found = []
+        return Estimate(value, float("nan"), float("nan"), len(first_values), 0, "none", len(unique))
+    rows = [np.array([row for row, family_name in enumerate(names) if family_name == family]) for family in unique]
+    random_source = generator("family correlation", len(first_values), len(unique))
+    replicates = []
     for _ in range(REPLICATES):
-        index = np.concatenate([rows[k] for k in draws.integers(0, len(rows), len(rows))])
-        found.append(rank_correlation(one[index], other[index]))
-    low, high = np.nanpercentile(found, [2.5, 97.5])
-    return Estimate(value, float(low), float(high), len(one), 0, "bootstrap", len(unique))
+        index = np.concatenate([rows[row] for row in random_source.integers(0, len(rows), len(rows))])
+        replicates.append(rank_correlation(first_values[index], second_values[index]))
+    low, high = np.nanpercentile(replicates, [2.5, 97.5])
+    return Estimate(value, float(low), float(high), len(first_values), 0, "bootstrap", len(unique))

@@ -1,4 +1,4 @@
-"""Intervals of small probabilities: few events, and events of unlike weight."""
+"""Intervals of small probabilities: few events, and events of unequal weight."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _TAIL = 0.5 - 0.5 * LEVEL
 
 @dataclass(frozen=True)
 class RareEstimate:
-    """A small probability and how sure it is.
+    """A small probability with its interval.
 
     Attributes:
-        probability: Of failure in an episode.
+        probability: Probability of failure in an episode.
         low: Lower 95 % limit.
         high: Upper 95 % limit.
-        method: How it was estimated.
-        episodes: Simulated for the estimate itself.
+        method: Name of the estimation method.
+        episodes: Episodes simulated for the estimate itself.
         events: Failures among them.
-        effective: Effective number of failures: as many of equal weight would say as much.
+        effective: Effective number of failures: equally weighted failures of the same precision.
         work: Agent-steps simulated in all.
         training: Agent-steps of it that went into learning how to simulate.
     """
@@ -48,7 +48,7 @@ class RareEstimate:
         return 0.5 * (self.high - self.low) / self.probability if self.probability > 0.0 else math.nan
 
     def as_dict(self) -> dict[str, Any]:
-        """Field name -> value."""
+        """Return the values by field name."""
         return asdict(self)
 
 
@@ -78,28 +78,36 @@ def weighted_limits(
     """
     from scipy.special import gammainc
 
-    total, square, most, n = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (total, square, most, n)))
-    # events that are not rare at all leave less to chance than a Poisson number of them would
+    total, square, most, n = np.broadcast_arrays(
+        *(np.asarray(argument, np.float64) for argument in (total, square, most, n))
+    )
+    # Events that are not rare vary less than a Poisson number of them.
     variance = np.maximum(square - total**2 / n, 1e-9 * square)
-    some = total > 0.0
-    safe, spread = np.where(some, total, 1.0), np.where(some, variance, 1.0)
-    more, wider = total + most, variance + most**2
+    has_events = total > 0.0
+    positive_total, positive_variance = np.where(has_events, total, 1.0), np.where(has_events, variance, 1.0)
+    total_plus_one, variance_plus_one = total + most, variance + most**2
 
-    def beyond(x: F64, room: float) -> F64:
-        """Chance that the gamma variable is at most x: without one event more, or for the share `room` with it."""
-        lower = np.where(some, gammainc(safe**2 / spread, x * safe / spread), 1.0)
-        return np.asarray((1.0 - room) * lower + room * gammainc(more**2 / wider, x * more / wider))
+    def probability_below(x: F64, room: float) -> F64:
+        """Return the probability that the gamma variable is at most x, with one event more for the share `room`."""
+        lower = np.where(
+            has_events, gammainc(positive_total**2 / positive_variance, x * positive_total / positive_variance), 1.0
+        )
+        return np.asarray(
+            (1.0 - room) * lower
+            + room * gammainc(total_plus_one**2 / variance_plus_one, x * total_plus_one / variance_plus_one)
+        )
 
     def quantile(share: float, room: float) -> F64:
-        low, high = np.zeros(total.shape), more + 20.0 * np.sqrt(wider) + 20.0 * most
+        low, high = np.zeros(total.shape), total_plus_one + 20.0 * np.sqrt(variance_plus_one) + 20.0 * most
+        # Bisection works elementwise on arrays; 80 halvings exhaust float64.
         for _ in range(80):
-            middle = 0.5 * (low + high)
-            less = beyond(middle, room) < share
-            low, high = np.where(less, middle, low), np.where(less, high, middle)
+            midpoint = 0.5 * (low + high)
+            is_below = probability_below(midpoint, room) < share
+            low, high = np.where(is_below, midpoint, low), np.where(is_below, high, midpoint)
         return np.asarray(0.5 * (low + high))
 
-    below, above = (0.0, 1.0) if unlike else (0.5, 0.5)
-    return np.where(some, quantile(_TAIL, below), 0.0) / n, quantile(1.0 - _TAIL, above) / n
+    low_room, high_room = (0.0, 1.0) if unlike else (0.5, 0.5)
+    return np.where(has_events, quantile(_TAIL, low_room), 0.0) / n, quantile(1.0 - _TAIL, high_room) / n
 
 
 def weighted_estimate(values: F64, method: str, *, most: float, work: float, training: float = 0.0) -> RareEstimate:
@@ -113,8 +121,9 @@ def weighted_estimate(values: F64, method: str, *, most: float, work: float, tra
         training: Of those, for learning.
     """
     total, square = float(values.sum()), float((values**2).sum())
-    largest = float(values.max()) if total > 0.0 else most
-    low, high = weighted_limits(total, square, largest, len(values), unlike=True)
+    # Without an event there is no observed weight, so the largest possible one bounds the interval.
+    largest_weight = float(values.max()) if total > 0.0 else most
+    low, high = weighted_limits(total, square, largest_weight, len(values), unlike=True)
     events = int((values > 0.0).sum())
     effective = total**2 / square if square > 0.0 else 0.0
     return RareEstimate(
@@ -123,11 +132,11 @@ def weighted_estimate(values: F64, method: str, *, most: float, work: float, tra
 
 
 def repeated_estimate(values: Sequence[float], method: str, *, episodes: int, events: int, work: float) -> RareEstimate:
-    """The mean of independent unbiased estimates, with Student limits that leave room for skew; at least 0."""
-    found = np.asarray(values, np.float64)
-    limits = mean_limits(found, Clusters(np.ones(len(found)), np.zeros(len(found), np.intp)))
-    mean = float(found.mean())
-    variance = float(found.var(ddof=1)) / len(found) if len(found) > 1 else math.nan
+    """Estimate the mean of independent unbiased estimates, with Student limits that allow for skew, at least 0."""
+    estimates = np.asarray(values, np.float64)
+    limits = mean_limits(estimates, Clusters(np.ones(len(estimates)), np.zeros(len(estimates), np.intp)))
+    mean = float(estimates.mean())
+    variance = float(estimates.var(ddof=1)) / len(estimates) if len(estimates) > 1 else math.nan
     effective = mean**2 / variance if variance > 0.0 else math.nan
     low, high = max(float(limits.low), 0.0), float(limits.high)
     return RareEstimate(mean, low, high, method, episodes, events, effective, work)

@@ -1,8 +1,8 @@
-"""How much motion looks like ordinary traffic: the histogram score of the sim-agents challenge, Wasserstein distances.
+"""Realism of motion: the histogram score of the sim-agents challenge, and Wasserstein distances.
 
-The challenge scores simulated agents against what the same agents did in a log. Generated scenarios have no such log,
-so here a motion is scored under histograms of a named reference, pooled over its agents and steps. Bins, weights and
-pseudo-count are the challenge's.
+The challenge scores simulated agents against the log of the same agents. Generated scenarios have no log, so a motion
+is scored under histograms of a named reference, pooled over its agents and steps. Bins, weights and pseudo-count are
+the challenge's.
 
 Source: Montali et al., The Waymo Open Sim Agents Challenge, 2023, with the configuration of 2025.
 """
@@ -26,7 +26,7 @@ PSEUDO_COUNT: Final = 0.1
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature of motion: its bins (two of them, 0 and 1, for what either happens or not), weight and unit."""
+    """A feature of motion: range and number of its bins (two for a yes-or-no feature), weight and unit."""
 
     low: float
     high: float
@@ -51,70 +51,78 @@ those with others than the ego, since a collision with the ego is what a generat
 
 
 def motion_features(trace: EpisodeTrace, agent: int, edge: F64) -> dict[str, F64]:
-    """The features of one agent's motion.
+    """Return the features of one agent's motion.
 
     Args:
-        trace: What happened.
+        trace: The trace of the episode.
         agent: The agent.
-        edge: [T] signed distance of its centre from the edge of the road, m, more than 0 off it.
+        edge: [T] signed distance of its centre from the edge of the road, m, positive off the road.
 
     Returns:
-        Feature -> values, one a step in which it is there and the feature is defined; collision and off_road have one.
+        Feature -> values, one for each step with the agent present and the feature defined; collision and
+        off_road have one.
     """
-    there = np.flatnonzero(trace.active[:, agent])
-    dt, box = float(trace.dt), boxes(trace)
-    speed = trace.speed[there, agent].astype(np.float64)
-    rate = np.asarray(wrap_angle(np.diff(trace.yaw[there, agent].astype(np.float64)))) / dt
-    others = [a for a in range(len(trace.kind)) if a != agent]
-    apart = np.full((len(there), len(others)), np.inf)
-    until = np.full((len(there), len(others)), np.inf)
+    active_steps = np.flatnonzero(trace.active[:, agent])
+    dt, body_boxes = float(trace.dt), boxes(trace)
+    speed = trace.speed[active_steps, agent].astype(np.float64)
+    yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[active_steps, agent].astype(np.float64)))) / dt
+    others = [other_agent for other_agent in range(len(trace.kind)) if other_agent != agent]
+    distances = np.full((len(active_steps), len(others)), np.inf)
+    collision_times = np.full((len(active_steps), len(others)), np.inf)
     velocity = trace.speed[..., None] * np.stack([np.cos(trace.yaw), np.sin(trace.yaw)], -1)
-    for column, other in enumerate(others):
-        both = trace.active[there, other]
-        rows = there[both]
-        apart[both, column] = obb_distance(box[rows, agent], box[rows, other])
+    for other_column, other in enumerate(others):
+        both_active = trace.active[active_steps, other]
+        rows = active_steps[both_active]
+        distances[both_active, other_column] = obb_distance(body_boxes[rows, agent], body_boxes[rows, other])
         closing = (velocity[rows, agent] - velocity[rows, other]).astype(np.float64)
-        until[both, column] = time_to_collision(box[rows, agent], box[rows, other], closing)
-    nearest = apart.min(axis=1, initial=np.inf)
-    touched = [a for column, a in enumerate(others) if a != 0 and (apart[:, column] <= 0.0).any()]
+        collision_times[both_active, other_column] = time_to_collision(
+            body_boxes[rows, agent], body_boxes[rows, other], closing
+        )
+    nearest = distances.min(axis=1, initial=np.inf)
+    # Agent 0 is left out: a collision with the ego is the goal of a generator.
+    touched_agents = [
+        other_agent
+        for other_column, other_agent in enumerate(others)
+        if other_agent != 0 and (distances[:, other_column] <= 0.0).any()
+    ]
     return {
         "speed": np.abs(speed),
         "acceleration": np.diff(speed) / dt,
-        "yaw_rate": rate,
-        "yaw_acceleration": np.diff(rate) / dt,
+        "yaw_rate": yaw_rate,
+        "yaw_acceleration": np.diff(yaw_rate) / dt,
         "nearest": nearest[np.isfinite(nearest)],
-        "ttc": np.minimum(until.min(axis=1, initial=np.inf), FEATURES["ttc"].high),
-        "road_edge": edge[there],
-        "collision": np.array([float(bool(touched))]),
-        "off_road": np.array([float((edge[there] > 0.0).any())]),
+        "ttc": np.minimum(collision_times.min(axis=1, initial=np.inf), FEATURES["ttc"].high),
+        "road_edge": edge[active_steps],
+        "collision": np.array([float(bool(touched_agents))]),
+        "off_road": np.array([float((edge[active_steps] > 0.0).any())]),
     }
 
 
 def pooled(motions: Sequence[Mapping[str, F64]]) -> dict[str, F64]:
-    """Feature -> the values of several motions together."""
-    return {name: np.concatenate([m[name] for m in motions] or [np.zeros(0)]) for name in FEATURES}
+    """Return the values of several motions together, by feature."""
+    return {name: np.concatenate([motion[name] for motion in motions] or [np.zeros(0)]) for name in FEATURES}
 
 
 def histogram(values: F64, feature: Feature) -> F64:
-    """Probabilities [bins] of the bins, with the pseudo-count; what lies outside counts in the first or last bin."""
+    """Return the probabilities [bins] with the pseudo-count; outliers count in the first or last bin."""
     counts = np.bincount(_bin(values, feature), minlength=feature.bins) + PSEUDO_COUNT
     return np.asarray(counts / counts.sum())
 
 
 def realism(motions: Mapping[str, F64], reference: Mapping[str, F64]) -> float:
-    """The weighted mean of the features' likelihoods under the reference, 0 to 1; NaN without values.
+    """Return the weighted mean of the features' likelihoods under the reference, 0 to 1; NaN without values.
 
-    The likelihood of a feature is the geometric mean of the probabilities of the bins that its values lie in.
+    The likelihood of a feature is the geometric mean of the probabilities of its values' bins.
 
     Args:
-        motions: Feature -> values, of what is judged.
-        reference: Likewise, of ordinary traffic.
+        motions: Feature -> values of the scored motion.
+        reference: Feature -> values of ordinary traffic.
     """
     total = weight = 0.0
     for name, feature in FEATURES.items():
         if len(motions[name]) and len(reference[name]):
-            chance = histogram(reference[name], feature)[_bin(motions[name], feature)]
-            total += feature.weight * math.exp(float(np.log(chance).mean()))
+            probabilities = histogram(reference[name], feature)[_bin(motions[name], feature)]
+            total += feature.weight * math.exp(float(np.log(probabilities).mean()))
             weight += feature.weight
     return total / weight if weight else math.nan
 

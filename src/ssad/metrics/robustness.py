@@ -1,7 +1,7 @@
-"""How much a score suffers from shifts, over their severities: one number a system.
+"""Robustness of a score to shifts, over their severities: one number a system.
 
-Scores are given as shift -> its scores at severities 1, 2, ... (such as NDS); every shift needs the same number of them
-and none may be missing, since a mean over what happens to be there says nothing. Sources: mCE and mRR as in RoboBEV
+Scores are given as shift -> its scores at severities 1, 2, ... (such as NDS); every shift needs the same number of
+them and none may be missing, since a mean over an arbitrary subset is meaningless. Sources: mCE and mRR as in RoboBEV
 (Xie et al. 2023), after Hendrycks and Dietterich 2019.
 """
 
@@ -15,11 +15,11 @@ import numpy as np
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64
 
-Scores = Mapping[str, Sequence[float | None]]  # None: not run, which is refused
+Scores = Mapping[str, Sequence[float | None]]  # None: not run, which raises ConfigError
 
 
 def corruption_error(scores: Scores, baseline: Scores) -> dict[str, float]:
-    """Corruption error (CE) of each shift.
+    """Return the corruption error (CE) of each shift.
 
     It is the sum over severities of 1 - score, relative to that of the baseline system (1: equally good).
 
@@ -34,20 +34,20 @@ def corruption_error(scores: Scores, baseline: Scores) -> dict[str, float]:
         ConfigError: A value is missing, the baseline has other shifts, or it is perfect under a shift.
     """
     names, values = _table(scores, "scores")
-    others, base = _table(baseline, "baseline")
-    if set(names) != set(others) or values.shape != base.shape:
-        different = ", ".join(sorted(set(names) ^ set(others))) or "the number of severities"
+    baseline_names, baseline_values = _table(baseline, "baseline")
+    if set(names) != set(baseline_names) or values.shape != baseline_values.shape:
+        different = ", ".join(sorted(set(names) ^ set(baseline_names))) or "the number of severities"
         raise ConfigError(f"scores and baseline differ in: {different}; run both under the same shifts")
-    base = base[[others.index(name) for name in names]]
-    error, least = (1.0 - values).sum(axis=1), (1.0 - base).sum(axis=1)
-    if (least == 0.0).any():
-        name = names[int((least == 0.0).argmax())]
+    baseline_values = baseline_values[[baseline_names.index(name) for name in names]]
+    error, baseline_error = (1.0 - values).sum(axis=1), (1.0 - baseline_values).sum(axis=1)
+    if (baseline_error == 0.0).any():
+        name = names[int((baseline_error == 0.0).argmax())]
         raise ConfigError(f"shift '{name}': the baseline makes no error there, so none can be relative to it")
-    return {name: float(error[k] / least[k]) for k, name in enumerate(names)}
+    return {name: float(error[row] / baseline_error[row]) for row, name in enumerate(names)}
 
 
 def resilience_rate(scores: Scores, clean: float) -> dict[str, float]:
-    """Resilience rate (RR) of each shift: mean over severities of score / clean score.
+    """Return the resilience rate (RR) of each shift: mean over severities of score / clean score.
 
     Args:
         scores: Scores by shift.
@@ -62,11 +62,11 @@ def resilience_rate(scores: Scores, clean: float) -> dict[str, float]:
     names, values = _table(scores, "scores")
     if not clean > 0.0 or math.isinf(clean):
         raise ConfigError(f"the clean score is {clean}; a resilience rate needs one above 0")
-    return {name: float(values[k].mean() / clean) for k, name in enumerate(names)}
+    return {name: float(values[row].mean() / clean) for row, name in enumerate(names)}
 
 
 def mean_resilience_rate(scores: Scores, clean: float) -> float:
-    """mRR: mean of RR over the shifts. Higher is better; 1 is no loss."""
+    """Return mRR, the mean of RR over the shifts; higher is better, 1 is no loss."""
     return math.fsum(resilience_rate(scores, clean).values()) / len(scores)
 
 
@@ -79,7 +79,7 @@ def _table(scores: Scores, what: str) -> tuple[list[str], F64]:
     if counts == {0} or len(counts) > 1:
         listed = ", ".join(f"{name}: {len(scores[name])}" for name in names)
         raise ConfigError(f"{what}: every shift needs the same severities, but there are {listed}")
-    values = np.array([[math.nan if v is None else v for v in scores[name]] for name in names], np.float64)
+    values = np.array([[math.nan if score is None else score for score in scores[name]] for name in names], np.float64)
     if np.isnan(values).any():
         row, column = np.argwhere(np.isnan(values))[0].tolist()
         raise ConfigError(f"{what}: shift '{names[row]}' has no value at severity {column + 1}; run that cell first")

@@ -1,4 +1,4 @@
-"""How well a detector finds the target of a physical attack: AP50, and the share of pictures in which it is found."""
+"""Detection of the target of a physical attack: AP50, and the share of images in which it is found."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ CONFIDENCES = (0.25, 0.5)  # from which score on a box counts as a detection
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """What a detector found in one picture of the target, as plain arrays.
+    """Detections in one image of the target, as plain arrays.
 
     Attributes:
-        drive: The drive that the picture is of; pictures of one drive are alike.
-        box: Found boxes of the target's class [N, 4], best first.
+        drive: The drive of the image; images of one drive are similar.
+        box: Detected boxes of the target's class [N, 4], best first.
         score: Their scores [N].
         real: True boxes of that class [Q, 4], the target first.
         crowd: Which of these count neither as found nor as missed [Q].
-        any_class: The best score of a box of any class that covers a quarter of the target or more, and finds no other
-            object; 0: there is none.
+        any_class: The best score of a box of any class that covers a quarter of the target or more, and finds no
+            other object; 0 without one.
     """
 
     drive: str
@@ -49,52 +49,55 @@ class Sighting:
     any_class: float = 0.0
 
     def confidences(self) -> F64:
-        """The score with which each true box is found [Q], 0 without.
+        """Return the score with which each true box is found [Q], 0 if it is not.
 
-        From the best box to the worst, each takes the true box that it covers most of those not yet taken, with an IoU
-        of one half at least; so none is counted twice, and it is found at every confidence below its score.
+        From the best box to the worst, each takes the free true box that it covers most, with an IoU of at least
+        one half. Hence none is counted twice, and it is found at every confidence below its score.
         """
-        found = np.zeros(len(self.real))
-        for row, score in zip(_overlaps(self.box, self.real)[0], self.score.tolist(), strict=True):
-            free = np.where(found > 0.0, 0.0, row)
-            best = int(free.argmax())
-            if free[best] >= IOU:
-                found[best] = score
-        return found
+        confidence_by_truth = np.zeros(len(self.real))
+        for overlap, score in zip(_overlaps(self.box, self.real)[0], self.score.tolist(), strict=True):
+            free_overlap = np.where(confidence_by_truth > 0.0, 0.0, overlap)
+            best = int(free_overlap.argmax())
+            if free_overlap[best] >= IOU:
+                confidence_by_truth[best] = score
+        return confidence_by_truth
 
 
 def _overlaps(box: F64, real: F64) -> tuple[F64, F64]:
-    """IoU [N, Q] of boxes [N, 4] and [Q, 4], and the share of the latter that the former cover [N, Q]."""
-    low, high = box[:, None], real[None]
-    side = np.minimum(low[..., 2:], high[..., 2:]) - np.maximum(low[..., :2], high[..., :2])
-    both = np.where((side > 0.0).all(-1), side.prod(-1), 0.0)
-    whole = (high[..., 2:] - high[..., :2]).prod(-1)
-    area = (low[..., 2:] - low[..., :2]).prod(-1) + whole - both
-    return both / np.maximum(area, 1e-9), both / np.maximum(whole, 1e-9)
+    """Return IoU [N, Q] of boxes [N, 4] and [Q, 4], and the share of the latter that the former cover [N, Q]."""
+    boxes, truth = box[:, None], real[None]
+    overlap_sides = np.minimum(boxes[..., 2:], truth[..., 2:]) - np.maximum(boxes[..., :2], truth[..., :2])
+    intersection = np.where((overlap_sides > 0.0).all(-1), overlap_sides.prod(-1), 0.0)
+    truth_area = (truth[..., 2:] - truth[..., :2]).prod(-1)
+    union_area = (boxes[..., 2:] - boxes[..., :2]).prod(-1) + truth_area - intersection
+    # The bounds avoid 0 / 0 for boxes without an area.
+    return intersection / np.maximum(union_area, 1e-9), intersection / np.maximum(truth_area, 1e-9)
 
 
 def _on_target(box: F64, score: F64, real: F64) -> float:
-    """The best score of boxes [N, 4] that cover enough of the first true box [Q, 4] and do not find another."""
+    """Return the best score of boxes [N, 4] that cover enough of the first true box [Q, 4] and find no other."""
     overlap, covered = _overlaps(box, real)
-    another = overlap[:, 1:].max(1, initial=0.0)
-    on_it = (covered[:, 0] >= COVERED) & ((another < IOU) | (another < overlap[:, 0]))
-    return float(score[on_it].max(initial=0.0))
+    other_overlap = overlap[:, 1:].max(1, initial=0.0)
+    is_on_target = (covered[:, 0] >= COVERED) & ((other_overlap < IOU) | (other_overlap < overlap[:, 0]))
+    return float(score[is_on_target].max(initial=0.0))
 
 
 def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
     """What was found of the class of the target, the first object of the truth, and on it of any class."""
-    label = int(truth.label[0])
-    own, same = (found.label == label).cpu(), (truth.label == label).cpu()
+    target_label = int(truth.label[0])
+    is_own_class, is_same_class = (found.label == target_label).cpu(), (truth.label == target_label).cpu()
     box, score = found.box.cpu().double().numpy(), found.score.cpu().double().numpy()
-    real = truth.box.cpu().double().numpy()
-    crowd = np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
+    truth_boxes = truth.box.cpu().double().numpy()
+    crowd_flags = (
+        np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
+    )
     return Sighting(
         drive,
-        box[own.numpy()],
-        score[own.numpy()],
-        real[same.numpy()],
-        crowd[same.numpy()],
-        _on_target(box, score, real),
+        box[is_own_class.numpy()],
+        score[is_own_class.numpy()],
+        truth_boxes[is_same_class.numpy()],
+        crowd_flags[is_same_class.numpy()],
+        _on_target(box, score, truth_boxes),
     )
 
 
@@ -106,18 +109,18 @@ def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]])
         pictures: Drive, picture [1, 3, H, W] in 0 to 1, and truth in the classes of the detector, the target first; for
             a 3D detector with the camera matrix.
     """
-    left = iter(pictures)
-    while shown := list(islice(left, 1)):
-        if shown[0][1].is_cuda:
-            shown += islice(left, TOGETHER - 1)
-        drives, images, truths = zip(*shown, strict=True)
-        batch = torch.cat(images)
+    remaining = iter(pictures)
+    while views_batch := list(islice(remaining, 1)):
+        if views_batch[0][1].is_cuda:
+            views_batch += islice(remaining, TOGETHER - 1)
+        drives, image_batch, truths = zip(*views_batch, strict=True)
+        batch = torch.cat(image_batch)
         cameras = [truth.intrinsic for truth in truths if truth.intrinsic is not None and detector.task == "3d"]
         intrinsic = torch.stack(cameras).to(batch) if cameras else None
-        for drive, found, truth in zip(
+        for drive, detections, truth in zip(
             drives, detector.predict(batch, intrinsic, threshold=THRESHOLD), truths, strict=True
         ):
-            yield sighting(drive, found, truth)
+            yield sighting(drive, detections, truth)
 
 
 def target_scores(
@@ -141,46 +144,56 @@ def target_scores(
         metrics; intervals (95 %; of drives, absent where there are too few); replicates of each AP (of the bootstrap,
         the same draws for all attacks on the same pictures); n, the number of pictures; drives.
     """
-    drives = sorted({one.drive for one in sightings})
-    of = np.array([drives.index(one.drive) for one in sightings], np.int32)
+    drives = sorted({entry.drive for entry in sightings})
+    drive_indices = np.array([drives.index(entry.drive) for entry in sightings], np.int32)
     metrics: dict[str, float | None] = {}
     intervals: dict[str, list[float] | None] = {}
-    drawn: dict[str, list[float]] = {}
-    for name, (target_only, least) in PRECISIONS.items():
-        value = metrics[name] = precision(sightings, target_only=target_only, least=least)
-        if len(drives) >= MIN_CLUSTERS and replicates and value is not None:
-            draws = generator("target scores", seed, name)
-            picked = [draws.integers(len(drives), size=len(drives)) for _ in range(replicates)]
-            values = _precisions(sightings, of, picked, target_only=target_only, least=least)
-            spread = np.asarray(np.var(values, ddof=1))
-            low, high = replicate_limits(np.asarray(value), spread, len(drives), bounded=True)
-            intervals[name] = [float(low), float(high)]
-            drawn[name] = [round(one, 5) for one in values]
-    scores = [one.confidences() for one in sightings]
-    scores_before = scores if clean is None else [one.confidences() for one in clean]
-    best, before = np.array([one[0] for one in scores]), np.array([one[0] for one in scores_before])
-    for level in CONFIDENCES:
-        percent = round(100 * level)
-        found = best > level
-        metrics[f"found_{percent}"], intervals[f"found_{percent}"] = _share(found, np.ones(len(best), bool), of)
+    ap_replicates: dict[str, list[float]] = {}
+    for name, (target_only, min_score) in PRECISIONS.items():
+        ap = metrics[name] = precision(sightings, target_only=target_only, least=min_score)
+        if len(drives) >= MIN_CLUSTERS and replicates and ap is not None:
+            rng = generator("target scores", seed, name)
+            # Whole drives are drawn: images of one drive are too similar to count as independent.
+            drive_draws = [rng.integers(len(drives), size=len(drives)) for _ in range(replicates)]
+            values = _precisions(sightings, drive_indices, drive_draws, target_only=target_only, least=min_score)
+            variance = np.asarray(np.var(values, ddof=1))
+            lower_limit, upper_limit = replicate_limits(np.asarray(ap), variance, len(drives), bounded=True)
+            intervals[name] = [float(lower_limit), float(upper_limit)]
+            ap_replicates[name] = [round(entry, 5) for entry in values]
+    scores = [entry.confidences() for entry in sightings]
+    scores_before = scores if clean is None else [entry.confidences() for entry in clean]
+    target_scores_now, target_scores_before = (
+        np.array([entry[0] for entry in scores]),
+        np.array([entry[0] for entry in scores_before]),
+    )
+    for confidence in CONFIDENCES:
+        percent = round(100 * confidence)
+        is_found = target_scores_now > confidence
+        metrics[f"found_{percent}"], intervals[f"found_{percent}"] = _share(
+            is_found, np.ones(len(target_scores_now), bool), drive_indices
+        )
         if clean is not None:
-            metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(~found, before > level, of)
+            metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(
+                ~is_found, target_scores_before > confidence, drive_indices
+            )
     if clean is not None:
-        least = CONFIDENCES[0]
-        unseen = np.maximum(best, [one.any_class for one in sightings]) <= least
-        metrics["ASR_any_25"], intervals["ASR_any_25"] = _share(unseen, before > least, of)
-        real = np.concatenate([~one.crowd for one in sightings])
-        every, every_before = np.concatenate(scores)[real], np.concatenate(scores_before)[real]
-        drive = np.repeat(of, [len(one.real) for one in sightings])[real]
-        lost = every <= least, every_before > least
-        metrics["ASR_all_25"], intervals["ASR_all_25"] = _share(*lost, drive)
-    metrics["confidence"] = float(best.mean())
-    kept = {name: limits for name, limits in intervals.items() if limits is not None}
-    rounded = {name: None if value is None else round(value, 6) for name, value in metrics.items()}
+        min_score = CONFIDENCES[0]
+        is_undetected = np.maximum(target_scores_now, [entry.any_class for entry in sightings]) <= min_score
+        metrics["ASR_any_25"], intervals["ASR_any_25"] = _share(
+            is_undetected, target_scores_before > min_score, drive_indices
+        )
+        is_counted = np.concatenate([~entry.crowd for entry in sightings])
+        all_scores, all_scores_before = np.concatenate(scores)[is_counted], np.concatenate(scores_before)[is_counted]
+        drive_per_object = np.repeat(drive_indices, [len(entry.real) for entry in sightings])[is_counted]
+        lost_and_counted = all_scores <= min_score, all_scores_before > min_score
+        metrics["ASR_all_25"], intervals["ASR_all_25"] = _share(*lost_and_counted, drive_per_object)
+    metrics["confidence"] = float(target_scores_now.mean())
+    defined_intervals = {name: interval for name, interval in intervals.items() if interval is not None}
+    rounded = {name: None if ap is None else round(ap, 6) for name, ap in metrics.items()}
     return {
         "metrics": rounded,
-        "intervals": kept,
-        "replicates": drawn,
+        "intervals": defined_intervals,
+        "replicates": ap_replicates,
         "n": len(sightings),
         "drives": len(drives),
     }
@@ -188,9 +201,9 @@ def target_scores(
 
 def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least: float = 0.0) -> float | None:
     """AP50 of boxes above a score: of the target alone (others count neither way), or of all vehicles of its class."""
-    real, found = _tables(sightings, target_only=target_only, least=least)
-    value = average_precision(real, found, labels=1, threshold=IOU)[0]
-    return None if np.isnan(value) else float(value)
+    truth, boxes = _tables(sightings, target_only=target_only, least=least)
+    ap = average_precision(truth, boxes, labels=1, threshold=IOU)[0]
+    return None if np.isnan(ap) else float(ap)
 
 
 def _precisions(
@@ -205,39 +218,42 @@ def _precisions(
         target_only: See `precision`.
         least: See `precision`.
     """
-    real, found = _tables(sightings, target_only=target_only, least=least)
-    matched = match_2d(real, found, labels=1, threshold=IOU)
+    truth, detected = _tables(sightings, target_only=target_only, least=least)
+    matched = match_2d(truth, detected, labels=1, threshold=IOU)
     assert matched.row is not None
-    assert found.score is not None
-    assert real.ignore is not None
-    row, hit = matched.row[~matched.ignored], matched.hit[~matched.ignored]
-    order = np.argsort(found.image[row], kind="stable")  # picture after picture, in each the best box first
-    row, hit = row[order], hit[order]
-    drive = of[found.image[row]]
-    count = np.bincount(of[real.image[~real.ignore]], minlength=int(of.max()) + 1)
-    own = [np.flatnonzero(drive == one) for one in range(len(count))]
+    assert detected.score is not None
+    assert truth.ignore is not None
+    rows, hits = matched.row[~matched.ignored], matched.hit[~matched.ignored]
+    order = np.argsort(detected.image[rows], kind="stable")  # picture after picture, in each the best box first
+    rows, hits = rows[order], hits[order]
+    drive_of_row = of[detected.image[rows]]
+    truth_counts = np.bincount(of[truth.image[~truth.ignore]], minlength=int(of.max()) + 1)
+    rows_by_drive = [np.flatnonzero(drive_of_row == drive_index) for drive_index in range(len(truth_counts))]
     values = []
     for drives in drawn:
-        boxes = np.concatenate([own[one] for one in drives])
-        boxes = boxes[np.argsort(-found.score[row[boxes]], kind="stable")]
-        none = np.zeros(len(boxes), np.bool_)
-        ranked = Matched2D(none.astype(np.int32), hit[boxes], none, np.array([count[drives].sum()]))
+        drawn_rows = np.concatenate([rows_by_drive[drive_index] for drive_index in drives])
+        drawn_rows = drawn_rows[np.argsort(-detected.score[rows[drawn_rows]], kind="stable")]
+        no_flags = np.zeros(len(drawn_rows), np.bool_)
+        ranked = Matched2D(
+            no_flags.astype(np.int32), hits[drawn_rows], no_flags, np.array([truth_counts[drives].sum()])
+        )
         values.append(float(ranked.average_precision()[0]))
     return [value for value in values if not np.isnan(value)]
 
 
 def _tables(sightings: Sequence[Sighting], *, target_only: bool, least: float) -> tuple[Boxes2D, Boxes2D]:
     """True and found boxes of pictures, for their AP."""
-    crowd = []
-    own_boxes = [(one.box[one.score > least], one.score[one.score > least]) for one in sightings]
-    for one in sightings:
-        own = one.crowd.copy()
-        own[0] = False
+    ignored = []
+    own_boxes = [(entry.box[entry.score > least], entry.score[entry.score > least]) for entry in sightings]
+    for entry in sightings:
+        ignore_flags = entry.crowd.copy()
+        # The target always counts, even if the recording marks it as crowd.
+        ignore_flags[0] = False
         if target_only:
-            own[1:] = True
-        crowd.append(own)
+            ignore_flags[1:] = True
+        ignored.append(ignore_flags)
     return (
-        _boxes([s.real for s in sightings], ignore=crowd),
+        _boxes([image_entry.real for image_entry in sightings], ignore=ignored),
         _boxes([box for box, _ in own_boxes], score=[score for _, score in own_boxes]),
     )
 
@@ -245,7 +261,7 @@ def _tables(sightings: Sequence[Sighting], *, target_only: bool, least: float) -
 def _boxes(
     boxes: Sequence[F64], *, score: Sequence[F64] | None = None, ignore: Sequence[Bool] | None = None
 ) -> Boxes2D:
-    image: I32 = np.repeat(np.arange(len(boxes), dtype=np.int32), [len(b) for b in boxes])
+    image: I32 = np.repeat(np.arange(len(boxes), dtype=np.int32), [len(image_boxes) for image_boxes in boxes])
     return Boxes2D(
         image,
         np.zeros(len(image), np.int32),
@@ -259,11 +275,13 @@ def _share(event: Bool, counted: Bool, drive: I32) -> tuple[float | None, list[f
     """Share of the counted pictures with an event, and its interval from drives; None where nothing is counted."""
     if not counted.any():
         return None, None
-    drives, own = np.unique(drive[counted], return_inverse=True)
-    size = np.bincount(own).astype(np.float64)
-    sums: F64 = np.bincount(own, weights=event[counted].astype(np.float64)).astype(np.float64)
-    share = float(sums.sum() / size.sum())
+    drives, drive_of_counted = np.unique(drive[counted], return_inverse=True)
+    drive_sizes = np.bincount(drive_of_counted).astype(np.float64)
+    event_sums: F64 = np.bincount(drive_of_counted, weights=event[counted].astype(np.float64)).astype(np.float64)
+    share = float(event_sums.sum() / drive_sizes.sum())
     if len(drives) < MIN_CLUSTERS:
         return share, None
-    limits = bounded_limits(sums, Clusters(size, np.zeros(len(size), np.intp)), cap=2.0 * float(size.sum()))
+    limits = bounded_limits(
+        event_sums, Clusters(drive_sizes, np.zeros(len(drive_sizes), np.intp)), cap=2.0 * float(drive_sizes.sum())
+    )
     return share, [float(limits.low), float(limits.high)]

@@ -13,42 +13,48 @@ AXES = ("distance", "azimuth", "elevation", "weather")
 def grid_scores(
     rows: Sequence[Mapping[str, Any]], clean: Sequence[Sighting], attacked: Sequence[Sighting] | None, *, floor: float
 ) -> dict[str, Any]:
-    """What is left of AP50 in each cell of distance and azimuth, over all elevations and weathers.
+    """Return the remaining AP50 in each cell of distance and azimuth, over all elevations and weathers.
 
     Args:
-        rows: Of each picture the keys of `AXES`.
-        clean: What was found in the pictures without the attack.
-        attacked: With it; None for the clean pictures alone.
-        floor: Least AP50 of the clean pictures of a cell; where it is less, the attack has no score there.
+        rows: The keys of `AXES` for each image.
+        clean: Detections in the images without the attack.
+        attacked: Detections with it; None for the clean images alone.
+        floor: Minimum AP50 of the clean images of a cell; below it, the attack has no score there.
 
     Returns:
-        views: a row for each picture: the four axes, the score with which the target is found clean, and attacked (None
-        without an attack); cells: a row for each: distance, azimuth, pictures, AP50 clean, AP50 attacked (None below
-        the floor, or without an attack); worst: distance, azimuth and AP50 of the cell in which the attack does least
-        (without an attack: the detector), None if there is none.
+        views: a row for each image: the four axes, the score of the target clean, and attacked (None without an
+            attack);
+        cells: a row for each: distance, azimuth, images, AP50 clean, AP50 attacked (None below the floor, or
+            without an
+        attack); worst: distance, azimuth and AP50 of the cell with the weakest attack (without an attack: the
+        weakest detector), None without one.
     """
-    names = [tuple(row[axis] for axis in AXES) for row in rows]
-    before = [float(one.confidences()[0]) for one in clean]
-    after = [None] * len(before) if attacked is None else [float(one.confidences()[0]) for one in attacked]
+    view_keys = [tuple(row[axis] for axis in AXES) for row in rows]
+    clean_confidences = [float(entry.confidences()[0]) for entry in clean]
+    attacked_confidences = (
+        [None] * len(clean_confidences) if attacked is None else [float(entry.confidences()[0]) for entry in attacked]
+    )
     views = [
-        [*name, round(b, 4), None if a is None else round(a, 4)]
-        for name, b, a in zip(names, before, after, strict=True)
+        [*view_key, round(clean_value, 4), None if attacked_value is None else round(attacked_value, 4)]
+        for view_key, clean_value, attacked_value in zip(
+            view_keys, clean_confidences, attacked_confidences, strict=True
+        )
     ]
     cells: list[list[Any]] = []
-    for place in sorted({name[:2] for name in names}):
-        own = [k for k, name in enumerate(names) if name[:2] == place]
-        have = precision([clean[k] for k in own])
-        left = None
-        if attacked is not None and have is not None and have >= floor:
-            left = precision([attacked[k] for k in own])
-        cells.append([*place, len(own), _rounded(have), _rounded(left)])
-    scored = [(cell[3 if attacked is None else 4], cell) for cell in cells]
-    counted = [(value, cell) for value, cell in scored if value is not None]
-    worst = None
-    if counted:
-        value, cell = (min if attacked is None else max)(counted, key=lambda one: one[0])
-        worst = [*cell[:2], value]
-    return {"views": views, "cells": cells, "worst": worst}
+    for cell_key in sorted({view_key[:2] for view_key in view_keys}):
+        indices = [index for index, view_key in enumerate(view_keys) if view_key[:2] == cell_key]
+        clean_ap = precision([clean[index] for index in indices])
+        attacked_ap = None
+        if attacked is not None and clean_ap is not None and clean_ap >= floor:
+            attacked_ap = precision([attacked[index] for index in indices])
+        cells.append([*cell_key, len(indices), _rounded(clean_ap), _rounded(attacked_ap)])
+    scored_cells = [(cell[3 if attacked is None else 4], cell) for cell in cells]
+    valid_cells = [(cell_ap, cell) for cell_ap, cell in scored_cells if cell_ap is not None]
+    worst_cell = None
+    if valid_cells:
+        cell_ap, cell = (min if attacked is None else max)(valid_cells, key=lambda entry: entry[0])
+        worst_cell = [*cell[:2], cell_ap]
+    return {"views": views, "cells": cells, "worst": worst_cell}
 
 
 def _rounded(value: float | None) -> float | None:

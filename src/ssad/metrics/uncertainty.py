@@ -1,8 +1,8 @@
-"""How sure a number is: means, scores and paired differences with their 95 % intervals.
+"""Uncertainty of results: means, scores and paired differences with their 95 % intervals.
 
-Every estimate takes values with their case and cluster. Copies of one case count once, cases of one cluster are alike,
-and the interval comes from how the clusters vary. Nothing is drawn at random, so the same data give the same interval,
-whatever their order. The methods in plain words: docs/metrics.md.
+Every estimate takes values with their case and cluster. Copies of one case count once, cases of one cluster are
+dependent, and the interval follows from the variation of the clusters. Nothing is drawn at random, so the same data
+give the same interval in any order. The methods in plain words: docs/metrics.md.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ Kind = Literal["share", "bounded", "mean"]
 
 @dataclass(frozen=True)
 class CaseValue:
-    """What one case gave.
+    """Value of one case.
 
     Attributes:
-        value: the number; NaN where it was not measured, or is unknown because the case failed.
-        cluster: what cases share (scenario, route, drive).
-        case: names the case; values of the same case and stratum are copies.
-        stratum: the group it belongs to where several are averaged; groups weigh the same.
-        failed: the case failed.
+        value: The number; NaN where it was not measured, or is unknown because the case failed.
+        cluster: Key that dependent cases share (scenario, route, drive).
+        case: Key of the case; values of the same case and stratum are copies.
+        stratum: Group of the case where several are averaged; groups weigh the same.
+        failed: Whether the case failed.
     """
 
     value: float
@@ -50,17 +50,17 @@ class CaseValue:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and how sure it is; NaN where the data do not give it.
+    """A mean with its interval; NaN where the data do not give it.
 
     Attributes:
-        mean: the mean over the distinct cases, or over the strata's means.
-        low: lower limit, or the least cluster mean where method is "range".
-        high: upper limit, or the greatest cluster mean where method is "range".
-        n: distinct cases behind the mean (copies count once).
-        failed: cases that gave no value because they failed.
-        method: what low and high are: "beta", "t" (95 % intervals), "range" (over the clusters, which are too few or
-            too alike for an interval), "none".
-        clusters: distinct clusters behind the mean.
+        mean: The mean over the distinct cases, or over the strata's means.
+        low: Lower limit, or the smallest cluster mean where method is "range".
+        high: Upper limit, or the largest cluster mean where method is "range".
+        n: Distinct cases behind the mean (copies count once).
+        failed: Cases without a value because they failed.
+        method: Meaning of low and high: "beta", "t" (95 % intervals), "range" (over the clusters, which are too
+            few or too similar for an interval), "none".
+        clusters: Distinct clusters behind the mean.
     """
 
     mean: float
@@ -72,11 +72,11 @@ class Estimate:
     clusters: int = 0
 
     def as_dict(self) -> dict[str, Any]:
-        """Field name -> value."""
+        """Return the values by field name."""
         return asdict(self)
 
     def scaled(self, factor: float, offset: float = 0.0) -> Estimate:
-        """The estimate of factor x value + offset."""
+        """Return the estimate of factor x value + offset."""
         ends = sorted((factor * self.low + offset, factor * self.high + offset))
         return replace(self, mean=factor * self.mean + offset, low=ends[0], high=ends[1])
 
@@ -99,38 +99,45 @@ def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, lea
         The estimate. Fewer than five clusters, or clusters too alike for an interval: low and high are the range.
     """
     distinct = _distinct(values)
-    failed = sum(v.failed for v in distinct)
-    used = [v for v in distinct if not math.isnan(v.value) or (v.failed and kind == "share")]
-    if not used:
+    failed = sum(case_value.failed for case_value in distinct)
+    counted = [
+        case_value
+        for case_value in distinct
+        if not math.isnan(case_value.value) or (case_value.failed and kind == "share")
+    ]
+    if not counted:
         return replace(NOTHING, failed=failed)
-    clusters, index = _clusters(used)
-    found = []
-    unknown = any(math.isnan(v.value) for v in used)
-    for outcome in (0.0, 1.0) if unknown else (0.0,):
-        numbers = np.array([outcome if math.isnan(v.value) else v.value for v in used]) / scale
-        sums = np.bincount(index, numbers, len(clusters.size)).astype(np.float64)
-        found.append(_ends(sums, clusters, kind, least / scale))
-    mean, low, method = float(found[0].mean), float(found[0].low), found[0].method
-    high = float(found[-1].high)
+    clusters, cluster_index = _clusters(counted)
+    limits = []
+    has_unknown = any(math.isnan(case_value.value) for case_value in counted)
+    # Unknown outcomes: once all 0 for the mean and lower limit, once all 1 for the upper one.
+    for assumed in (0.0, 1.0) if has_unknown else (0.0,):
+        numbers = (
+            np.array([assumed if math.isnan(case_value.value) else case_value.value for case_value in counted]) / scale
+        )
+        sums = np.bincount(cluster_index, numbers, len(clusters.size)).astype(np.float64)
+        limits.append(_ends(sums, clusters, kind, least / scale))
+    mean, low, method = float(limits[0].mean), float(limits[0].low), limits[0].method
+    high = float(limits[-1].high)
     return Estimate(
-        scale * mean, scale * min(low, mean), scale * max(high, mean), len(used), failed, method, len(clusters.size)
+        scale * mean, scale * min(low, mean), scale * max(high, mean), len(counted), failed, method, len(clusters.size)
     )
 
 
 def replicate_estimate(
     value: float, replicates: Sequence[float], *, n: int, clusters: int, bounded: bool = True
 ) -> Estimate:
-    """A score that is no mean (mAP, NDS and what is made of them), its interval from bootstrap replicates.
+    """Estimate a score that is no mean (mAP, NDS and derived scores), with an interval from bootstrap replicates.
 
     Args:
-        value: the score.
-        replicates: the score of resamples of whole clusters (scenes).
-        n: cases behind the score.
-        clusters: how many clusters were resampled; fewer than five give no interval.
-        bounded: whether the score lies in [0, 1]; else it is at least 0.
+        value: The score.
+        replicates: The score of resamples of whole clusters (scenes).
+        n: Cases behind the score.
+        clusters: Number of resampled clusters; fewer than five give no interval.
+        bounded: Whether the score lies in [0, 1]; else it is at least 0.
     """
-    known = np.array([r for r in replicates if not math.isnan(r)])
-    variance = float(known.var(ddof=1)) if len(known) > 1 else math.nan
+    defined = np.array([replicate for replicate in replicates if not math.isnan(replicate)])
+    variance = float(defined.var(ddof=1)) if len(defined) > 1 else math.nan
     if clusters < MIN_CLUSTERS or math.isnan(value + variance) or not (bounded or min(value, variance) > 0.0):
         return Estimate(value, math.nan, math.nan, n, clusters=clusters)
     low, high = replicate_limits(np.asarray(value), np.asarray(variance), clusters, bounded=bounded)
@@ -138,33 +145,33 @@ def replicate_estimate(
 
 
 def replicate_difference(value: float, differences: Sequence[float], *, n: int, clusters: int) -> Estimate:
-    """A difference of two scores in [0, 1], its interval from paired bootstrap replicates.
+    """Estimate a difference of two scores in [0, 1], with an interval from paired bootstrap replicates.
 
     Args:
-        value: the difference, in [-1, 1].
-        differences: the same of resamples of clusters, in each of which both scores have the same clusters.
+        value: The difference, in [-1, 1].
+        differences: The same of resamples of clusters, in each of which both scores have the same clusters.
         n: As for `replicate_estimate`.
         clusters: As for `replicate_estimate`.
 
     Returns:
         The estimate; its limits are those of (1 + difference) / 2, a score in [0, 1].
     """
-    half = [0.5 * (1.0 + one) for one in differences]
-    return replicate_estimate(0.5 * (1.0 + value), half, n=n, clusters=clusters).scaled(2.0, -1.0)
+    scores = [0.5 * (1.0 + difference) for difference in differences]
+    return replicate_estimate(0.5 * (1.0 + value), scores, n=n, clusters=clusters).scaled(2.0, -1.0)
 
 
 def paired_difference(
     first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, kind: Literal["share", "mean"] = "mean"
 ) -> Estimate:
-    """Mean of first - second over the cells that both have, by the rules of `estimate`.
+    """Return the mean of first - second over the cells that both have, by the rules of `estimate`.
 
-    A mean has Student limits of the differences. A share has limits also where hardly any cell differs: the difference
-    is that of two shares, the cells where only the first is 1 and those where only the second is, whose limits are
-    joined (MOVER, with the correlation that two shares of one multinomial have).
+    A mean has Student limits of the differences. A share has limits even where hardly any cell differs: the
+    difference is that of two shares, the cells where only the first is 1 and those where only the second is,
+    whose limits are combined (MOVER, with the correlation that two shares of one multinomial have).
 
     Args:
-        first: values of one system by what was put to it (scenario and repetition); the clusters count, strata do not.
-        second: those of the other system. Two pairs are copies if both halves are.
+        first: Values of one system by cell (scenario and repetition); clusters count, strata do not.
+        second: Values of the other system. Two pairs are copies if both halves are.
         kind: "share": values are 0 or 1. "mean": any values.
 
     Returns:
@@ -186,11 +193,11 @@ def paired_difference(
         return replace(estimate(pairs, "mean"), failed=missing)
     correlation = 0.0 if p * q == 0.0 else -math.sqrt(p * q / ((1.0 - p) * (1.0 - q)))
 
-    def room(a: float, b: float) -> float:
+    def margin(a: float, b: float) -> float:
         return math.sqrt(max(a * a + b * b - 2.0 * correlation * a * b, 0.0))
 
-    low = p - q - room(p - only_first.low, only_second.high - q)
-    high = p - q + room(only_first.high - p, q - only_second.low)
+    low = p - q - margin(p - only_first.low, only_second.high - q)
+    high = p - q + margin(only_first.high - p, q - only_second.low)
     return replace(only_first, mean=p - q, low=max(low, -1.0), high=min(high, 1.0), failed=missing)
 
 
@@ -215,57 +222,78 @@ def sign_flip_test(first: Mapping[str, CaseValue], second: Mapping[str, CaseValu
     if not pairs:
         return math.nan
     distinct = _distinct(pairs)
-    _, index = _clusters(distinct)
-    sums = np.bincount(index, np.array([v.value for v in distinct]))
+    _, cluster_index = _clusters(distinct)
+    sums = np.bincount(cluster_index, np.array([pair.value for pair in distinct]))
     sums = sums[sums != 0.0]
     if not len(sums):
         return 1.0
-    exact = len(sums) <= 14
-    if exact:
+    is_exact = len(sums) <= 14
+    if is_exact:
         signs = 1.0 - 2.0 * ((np.arange(2 ** len(sums))[:, None] >> np.arange(len(sums))) & 1)
     else:
         signs = generator("sign flip test", len(sums), draws).choice([-1.0, 1.0], size=(draws, len(sums)))
-    reached = int((np.abs(signs @ sums) >= np.abs(sums.sum()) * (1.0 - 1e-9)).sum())
-    return reached / len(signs) if exact else (reached + 1) / (draws + 1)
+    # The slack keeps ties that rounding would break.
+    as_large = int((np.abs(signs @ sums) >= np.abs(sums.sum()) * (1.0 - 1e-9)).sum())
+    # Random draws leave out the observed signs, hence the 1.
+    return as_large / len(signs) if is_exact else (as_large + 1) / (draws + 1)
 
 
 def _pairs(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -> tuple[list[CaseValue], int]:
-    """Differences of the cells that both have, and how many cells give none."""
+    """Return the differences of the cells that both have, and the number of cells without one."""
     pairs = [
-        CaseValue(a.value - b.value, a.cluster, f"{a.case}\n{b.case}")
+        CaseValue(
+            first_value.value - second_value.value, first_value.cluster, f"{first_value.case}\n{second_value.case}"
+        )
         for key in sorted(set(first) & set(second))
-        if not ((a := first[key]).failed or (b := second[key]).failed or math.isnan(a.value - b.value))
+        if not (
+            (first_value := first[key]).failed
+            or (second_value := second[key]).failed
+            or math.isnan(first_value.value - second_value.value)
+        )
     ]
     return pairs, len(set(first) | set(second)) - len(pairs)
 
 
 def _distinct(values: Iterable[CaseValue]) -> list[CaseValue]:
-    """One value a case and stratum, in an order that does not depend on theirs."""
-    found: dict[tuple[str, str], CaseValue] = {}
-    # should copies disagree, one that ran counts before one that failed or was not measured
-    for v in sorted(values, key=lambda v: (v.stratum, v.case, math.isnan(v.value), v.failed, v.cluster, str(v.value))):
-        found.setdefault((v.stratum, v.case), v)
-    return list(found.values())
+    """Return one value a case and stratum, in an order that does not depend on the input's."""
+    distinct: dict[tuple[str, str], CaseValue] = {}
+    # If copies disagree, one that ran takes precedence over one that failed or was not measured.
+    for case_value in sorted(
+        values,
+        key=lambda case_value: (
+            case_value.stratum,
+            case_value.case,
+            math.isnan(case_value.value),
+            case_value.failed,
+            case_value.cluster,
+            str(case_value.value),
+        ),
+    ):
+        distinct.setdefault((case_value.stratum, case_value.case), case_value)
+    return list(distinct.values())
 
 
 def _clusters(values: Sequence[CaseValue]) -> tuple[Clusters, npt.NDArray[np.intp]]:
-    """The clusters of the values, and the cluster of each value."""
-    strata = {name: k for k, name in enumerate(dict.fromkeys(v.stratum for v in values))}
-    names = {name: k for k, name in enumerate(dict.fromkeys((v.stratum, v.cluster) for v in values))}
-    index = np.array([names[v.stratum, v.cluster] for v in values])
-    size = np.bincount(index).astype(np.float64)
-    return Clusters(size, np.array([strata[stratum] for stratum, _ in names])), index
+    """Return the clusters of the values, and the cluster of each value."""
+    strata = {name: k for k, name in enumerate(dict.fromkeys(case_value.stratum for case_value in values))}
+    names = {
+        name: k
+        for k, name in enumerate(dict.fromkeys((case_value.stratum, case_value.cluster) for case_value in values))
+    }
+    cluster_index = np.array([names[case_value.stratum, case_value.cluster] for case_value in values])
+    size = np.bincount(cluster_index).astype(np.float64)
+    return Clusters(size, np.array([strata[stratum] for stratum, _ in names])), cluster_index
 
 
 def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> Limits:
     """The interval, or the range of the clusters' means where there is none; one cluster has neither."""
     if len(sums) >= MIN_CLUSTERS:
         if kind == "mean":
-            found = mean_limits(sums, clusters)
+            limits = mean_limits(sums, clusters)
         else:
-            found = bounded_limits(sums, clusters, cap=2.0 * clusters.size.sum() if kind == "share" else math.inf)
-        if not math.isnan(float(found.low)):
-            return replace(found, low=np.maximum(found.low, least))
+            limits = bounded_limits(sums, clusters, cap=2.0 * clusters.size.sum() if kind == "share" else math.inf)
+        if not math.isnan(float(limits.low)):
+            return replace(limits, low=np.maximum(limits.low, least))
     means = sums / clusters.size
     mean = np.asarray(means @ clusters.weight)
     if len(means) == 1:

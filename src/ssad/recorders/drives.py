@@ -1,4 +1,4 @@
-"""Drives worth recording: a long random way of the ego through a town, with traffic all around it."""
+"""Drives worth recording: a long random route of the ego through a town, with traffic all around it."""
 
 from __future__ import annotations
 
@@ -40,22 +40,28 @@ STREETS = ("town", "any")
 
 
 def check_streets(streets: str) -> None:
-    """ConfigError: no such kind of streets."""
+    """Raise ConfigError for an unknown kind of streets."""
     if streets not in STREETS:
         raise ConfigError(f"streets '{streets}'; choose from: {', '.join(STREETS)}")
 
 
 def drive_street(graph: LaneGraph, streets: str, *, key: tuple[object, ...]) -> Street:
-    """What stands along the roads in a drive.
+    """Return the buildings and objects along the roads in a drive.
 
-    "town": what always stands there; "any": built for this key alone, in any style, so that a detector cannot learn a
-    town by heart. ConfigError: neither.
+    Args:
+        graph: Lane graph of the town.
+        streets: "town": the town's permanent street. "any": a street in any style, built for this key alone, so
+            that a detector cannot learn a town by heart.
+        key: Key of the random draws.
+
+    Raises:
+        ConfigError: Unknown kind of streets.
     """
     check_streets(streets)
     if streets == "town":
         return cached_street(graph)
-    draws = generator("drive street", graph.name, *key)
-    return build_street(graph, seed=int(draws.integers(1, 2**31)), style=str(draws.choice(sorted(STYLES))))
+    rng = generator("drive street", graph.name, *key)
+    return build_street(graph, seed=int(rng.integers(1, 2**31)), style=str(rng.choice(sorted(STYLES))))
 
 
 def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, streets: str = "town") -> Episode:
@@ -63,43 +69,48 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
 
     MapError: the town has no road to drive on.
     """
-    mix = thinned(MIX, streets)
-    draws = generator("drive", graph.name, *key)
+    body_shares = thinned(MIX, streets)
+    rng = generator("drive", graph.name, *key)
     lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0) & (graph.length > 25.0))
     if not len(lanes):
         raise MapError(f"town '{graph.name}' has no driving lane of 25 m or more; nothing can be recorded there")
-    route = _way(graph, lanes, draws)
-    wish = float(draws.uniform(7, 10)) * _haste(route)
-    ego = EpisodeAgent("ego", "car", Controller.EXTERNAL, _pose(route), target_speed=wish, route=route)
+    route = _way(graph, lanes, rng)
+    ego_speed = float(rng.uniform(7, 10)) * _haste(route)
+    ego = EpisodeAgent("ego", "car", Controller.EXTERNAL, _pose(route), target_speed=ego_speed, route=route)
     agents = [ego]
-    way = route.xy[: int(WAY) : 5]
-    density = float(draws.uniform(0.25, 0.8))
-    spots = [
-        (int(lane), float(s))
+    # Route points are 1 m apart; every fifth is enough to measure distances of 120 m.
+    route_points = route.xy[: int(WAY) : 5]
+    density = float(rng.uniform(0.25, 0.8))
+    start_places = [
+        (int(lane), float(distance))
         for lane in lanes
-        for s in np.arange(6.0 + draws.uniform(0, 8), float(graph.length[lane]) - 6.0, 15.0)
+        for distance in np.arange(6.0 + rng.uniform(0, 8), float(graph.length[lane]) - 6.0, 15.0)
     ]
-    for k in draws.permutation(len(spots)).tolist():
+    for place_index in rng.permutation(len(start_places)).tolist():
         if len(agents) > MOST:
             break
-        lane, s = spots[k]
-        x, y, yaw, _ = graph.at(lane, s)
-        if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > NEAR or draws.random() > density:
+        lane, distance = start_places[place_index]
+        x, y, yaw, _ = graph.at(lane, distance)
+        # Free places are drawn in random order with a density per drive, so that traffic varies.
+        if np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() > NEAR or rng.random() > density:
             continue
-        body = str(draws.choice(list(mix), p=list(mix.values())))
-        path = random_route(graph, lane, s, 400.0, draws)
+        body = str(rng.choice(list(body_shares), p=list(body_shares.values())))
+        agent_route = random_route(graph, lane, distance, 400.0, rng)
         for _ in range(TRIES):
-            if fits(body, path):
+            if fits(body, agent_route):
                 break
-            path = random_route(graph, lane, s, 400.0, draws)
+            agent_route = random_route(graph, lane, distance, 400.0, rng)
         else:
             body = "compact"
-        if body == "bicycle" and _haste(path) > 1.0:
+        if body == "bicycle" and _haste(agent_route) > 1.0:
             body = "motorcycle"  # nobody cycles on a motorway
-        room = 0.5 * model(body).length + 4.0
-        if any(math.hypot(a.pose.x - x, a.pose.y - y) < room + 0.5 * model(a.model).length for a in agents):
+        clearance = 0.5 * model(body).length + 4.0
+        if any(
+            math.hypot(other.pose.x - x, other.pose.y - y) < clearance + 0.5 * model(other.model).length
+            for other in agents
+        ):
             continue
-        wanted = 5.0 if body == "bicycle" else float(draws.uniform(5.5, 11.0)) * _haste(path)
+        desired_speed = 5.0 if body == "bicycle" else float(rng.uniform(5.5, 11.0)) * _haste(agent_route)
         limit = float(graph.speed_limit[lane])
         pose = Pose(x, y, yaw)
         agents.append(
@@ -108,38 +119,38 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
                 body,
                 Controller.AUTOPILOT,
                 pose,
-                min(wanted, limit) * 0.6,
-                min(wanted, limit),
-                route=path,
+                min(desired_speed, limit) * 0.6,
+                min(desired_speed, limit),
+                route=agent_route,
             )
         )
-    name = "/".join(str(part) for part in key)
-    ends = (agents[0].pose, Pose(float(route.xy[-1, 0]), float(route.xy[-1, 1]), float(route.yaw[-1])))
+    drive_name = "/".join(str(piece) for piece in key)
+    end_poses = (agents[0].pose, Pose(float(route.xy[-1, 0]), float(route.xy[-1, 1]), float(route.yaw[-1])))
     steps = math.ceil(seconds / 0.1) + 2
     limits = Limits(max_steps=steps, max_time=2 * seconds + 60)
-    scenario = Scenario(f"drive/{name}", "Custom", graph.name, ends, limits=limits)
+    scenario = Scenario(f"drive/{drive_name}", "Custom", graph.name, end_poses, limits=limits)
     signals = forced_signals(graph, route, SignalPlan(ego="green", others="green", until=1e6), whole_town=True)
-    return Episode(f"drive/{graph.name}/{name}", scenario, graph.name, tuple(agents), signals, 1e6, limits)
+    return Episode(f"drive/{graph.name}/{drive_name}", scenario, graph.name, tuple(agents), signals, 1e6, limits)
 
 
 def _way(graph: LaneGraph, lanes: np.ndarray, draws: np.random.Generator) -> Route:
     """The longest of a few random ways."""
-    found: Route | None = None
+    longest: Route | None = None
     for _ in range(8):
         lane = int(draws.choice(lanes))
-        way = random_route(graph, lane, float(draws.uniform(4.0, 20.0)), 400.0, draws)
-        if found is None or way.length > found.length:
-            found = way
-        if found.length > 395.0:
+        candidate = random_route(graph, lane, float(draws.uniform(4.0, 20.0)), 400.0, draws)
+        if longest is None or candidate.length > longest.length:
+            longest = candidate
+        if longest.length > 395.0:
             break
-    assert found is not None
-    return found
+    assert longest is not None
+    return longest
 
 
 def _haste(route: Route) -> float:
-    """Times as fast as in town that somebody on this way wants to drive, where its roads and bends let them."""
-    fastest = float(route.speed_limit.max())
-    return fastest / TOWN_SPEED if fastest > FAST else 1.0
+    """Return the factor on town speeds that agents want to drive on this route, where roads and bends allow it."""
+    max_limit = float(route.speed_limit.max())
+    return max_limit / TOWN_SPEED if max_limit > FAST else 1.0
 
 
 def _pose(route: Route) -> Pose:

@@ -1,8 +1,8 @@
 """`ssad record`: drives in the world, seen by the nuScenes rig, as a data set in the nuScenes schema.
 
-One scene is one unit of work: its files and a page of what is in it are written to OUT/.parts; when all scenes are
-there, the tables are made of the pages in a fixed order and the files move to their places. So a run can be stopped
-at any moment and gone on with, and the bytes do not depend on the number of processes.
+One scene is one unit of work: its files and a page of its content are written to OUT/.parts. When all scenes are
+complete, the tables are built from the pages in a fixed order and the files move to their places. A run can be
+stopped at any moment and resumed, and the bytes do not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -70,11 +70,24 @@ GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What to record.
+    """Settings of a recording.
 
-    scenes: of each town; seconds: of each scene; width: of the pictures (16:9); sweeps: frames between key frames that
-    are written too (0 to 4); quality: of JPEG files; device: where pictures are rendered (it decides bits, though few:
-    see docs/camera.md); streets: see `drive_street`. ConfigError for what cannot be.
+    Attributes:
+        out: Root of the data set.
+        towns: Towns to record.
+        held_out: Towns of the split val.
+        scenes: Number of scenes in each town.
+        seconds: Length of each scene, s.
+        width: Width of the images (16:9), px.
+        sweeps: Frames between key frames that are written too (0 to 4).
+        seed: Root of the random numbers.
+        quality: Quality of JPEG files.
+        version: Version of the data set.
+        device: Device that renders (it decides bits, though few: see docs/camera.md).
+        streets: See `drive_street`.
+
+    Raises:
+        ConfigError: A value is out of range.
     """
 
     out: Path
@@ -101,46 +114,51 @@ class Recording:
             raise ConfigError("width: a multiple of 16 from 64; sweeps: 0 to 4; seconds: 0.5 to 3600")
 
     def identity(self) -> dict[str, Any]:
-        """What decides the bytes."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items() if k != "out"}
+        """Return the settings that decide the bytes of the recording, as plain data."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in asdict(self).items()
+            if name != "out"
+        }
 
 
 def draw_weather(key: tuple[object, ...], kind: str = "") -> Weather:
     """Weather and hour of a scene: mostly day, some dusk and night, some fog and wet roads; or all of one kind."""
-    draws = generator("record weather", *key)
-    drawn = draws.choice(WEATHERS, p=[0.36, 0.2, 0.16, 0.08, 0.1, 0.1])
-    heading, turn = float(draws.uniform(-np.pi, np.pi)), float(draws.uniform(0, 50))
-    high = float(draws.uniform(0.4, 1.2))
-    found = {
-        "day": Weather(high, heading, float(draws.uniform(0.05, 0.6)), turn=turn),
-        "overcast": Weather(high, heading, float(draws.uniform(0.85, 1.0)), turn=turn),
-        "low": Weather(float(draws.uniform(0.1, 0.3)), heading, float(draws.uniform(0.0, 0.5)), turn=turn),
-        "fog": Weather(high, heading, 0.9, fog=float(draws.uniform(0.006, 0.025)), turn=turn),
-        "wet": Weather(high, heading, 0.95, wet=float(draws.uniform(0.4, 1.0)), turn=turn),
-        "night": Weather(float(draws.uniform(-0.3, -0.05)), heading, float(draws.uniform(0, 0.9)), turn=turn),
+    rng = generator("record weather", *key)
+    drawn_kind = rng.choice(WEATHERS, p=[0.36, 0.2, 0.16, 0.08, 0.1, 0.1])
+    heading, turn = float(rng.uniform(-np.pi, np.pi)), float(rng.uniform(0, 50))
+    sun_height = float(rng.uniform(0.4, 1.2))
+    # All kinds draw their numbers, so that fixing the kind does not change the draws.
+    by_kind = {
+        "day": Weather(sun_height, heading, float(rng.uniform(0.05, 0.6)), turn=turn),
+        "overcast": Weather(sun_height, heading, float(rng.uniform(0.85, 1.0)), turn=turn),
+        "low": Weather(float(rng.uniform(0.1, 0.3)), heading, float(rng.uniform(0.0, 0.5)), turn=turn),
+        "fog": Weather(sun_height, heading, 0.9, fog=float(rng.uniform(0.006, 0.025)), turn=turn),
+        "wet": Weather(sun_height, heading, 0.95, wet=float(rng.uniform(0.4, 1.0)), turn=turn),
+        "night": Weather(float(rng.uniform(-0.3, -0.05)), heading, float(rng.uniform(0, 0.9)), turn=turn),
     }
-    return found[kind or str(drawn)]
+    return by_kind[kind or str(drawn_kind)]
 
 
 def weather_words(weather: Weather) -> str:
-    """A weather as the description of a scene tells it, such as "sun 40 degrees above the horizon, clouds 35 %"."""
-    height = round(np.degrees(weather.sun_height))
-    told = [
-        f"sun {abs(height)} degrees {'below' if height < 0 else 'above'} the horizon",
+    """Describe a weather in words, such as "sun 40 degrees above the horizon, clouds 35 %"."""
+    sun_degrees = round(np.degrees(weather.sun_height))
+    phrases = [
+        f"sun {abs(sun_degrees)} degrees {'below' if sun_degrees < 0 else 'above'} the horizon",
         f"clouds {weather.clouds:.0%}",
     ]
     if weather.fog:
-        told.append(f"fog of {weather.fog:.3f}/m")
+        phrases.append(f"fog of {weather.fog:.3f}/m")
     if weather.wet:
-        told.append(f"wet road {weather.wet:.0%}")
-    return ", ".join(told).replace("%", " %")
+        phrases.append(f"wet road {weather.wet:.0%}")
+    return ", ".join(phrases).replace("%", " %")
 
 
 def depth_bytes(depth: Any) -> bytes:
-    """A depth map [H, W] at a quarter of the resolution, 16-bit PNG: 64 a metre, 65535 for the sky."""
-    small = np.asarray(depth, np.float64)[2::4, 2::4]
-    values = np.where(np.isfinite(small), np.minimum(np.rint(small * 64), 65534), 65535).astype(np.uint16)
-    return bytes(cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+    """Encode a depth map [H, W] at a quarter of the resolution as 16-bit PNG: 64 per metre, 65535 for the sky."""
+    quarter = np.asarray(depth, np.float64)[2::4, 2::4]
+    codes = np.where(np.isfinite(quarter), np.minimum(np.rint(quarter * 64), 65534), 65535).astype(np.uint16)
+    return bytes(cv2.imencode(".png", codes, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
 
 
 def attributes_of(who: PlacedObject) -> tuple[str, ...]:
@@ -156,23 +174,26 @@ def attributes_of(who: PlacedObject) -> tuple[str, ...]:
 
 
 def ego_at(trace: EpisodeTrace, time: float) -> F64:
-    """Pose [4, 4] of the ego at a time, s, between steps in between."""
-    exact = min(max(time / trace.dt, 0.0), len(trace.x) - 1.0)
-    low = min(int(exact), max(len(trace.x) - 2, 0))
-    high, part = min(low + 1, len(trace.x) - 1), exact - low
-    turn = float(wrap_angle(float(trace.yaw[high, 0] - trace.yaw[low, 0])))
-    x, y = (float(v[low, 0]) + part * float(v[high, 0] - v[low, 0]) for v in (trace.x, trace.y))
-    return upright_pose(x, y, float(trace.yaw[low, 0]) + part * turn)
+    """Return the interpolated pose [4, 4] of the ego at a time, s."""
+    exact_step = min(max(time / trace.dt, 0.0), len(trace.x) - 1.0)
+    lower_step = min(int(exact_step), max(len(trace.x) - 2, 0))
+    upper_step, fraction = min(lower_step + 1, len(trace.x) - 1), exact_step - lower_step
+    yaw_change = float(wrap_angle(float(trace.yaw[upper_step, 0] - trace.yaw[lower_step, 0])))
+    x, y = (
+        float(coordinate[lower_step, 0]) + fraction * float(coordinate[upper_step, 0] - coordinate[lower_step, 0])
+        for coordinate in (trace.x, trace.y)
+    )
+    return upright_pose(x, y, float(trace.yaw[lower_step, 0]) + fraction * yaw_change)
 
 
 @lru_cache(maxsize=1)
 def _street(town: str, streets: str, key: tuple[object, ...]) -> Street:
-    """The street of a drive, kept for the next one along it."""
+    """Return the street of a drive, kept for the next one along it."""
     return drive_street(load_town(town), streets, key=key)
 
 
 def _scenes(task: tuple[Recording, str, Sequence[int]]) -> None:
-    """Records scenes of a town, which share a street."""
+    """Record scenes of a town, which share a street."""
     recording, town, numbers = task
     for number in numbers:
         _scene(recording, town, number)
@@ -183,45 +204,52 @@ def _name(town: str, number: int) -> str:
 
 
 def _scene(recording: Recording, town: str, number: int) -> None:
-    """Records one scene into its part. What is there already is left alone."""
+    """Record one scene into its part; a finished part is left alone."""
     name = _name(town, number)
     folder = recording.out / ".parts" / name
     if (folder / PART).is_file():
         return
+    # A part without its page was interrupted; its files are incomplete.
     shutil.rmtree(folder, ignore_errors=True)
     quiet_warp()
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
     graph = load_town(town)
     street = _street(town, recording.streets, (recording.seed, town, number // SHARED))
+    # The last sweep ends 0.1 s after the last step, and interpolation needs one more.
     seconds, streets = recording.seconds + 0.2, recording.streets
     episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
     trace = drive(episode, graph)
-    cast = place_objects(trace, graph, street, key=key, streets=streets, many_signs=streets == "any")
+    population = place_objects(trace, graph, street, key=key, streets=streets, many_signs=streets == "any")
     weather = draw_weather(key)
     cameras = [rig_camera(channel, recording.width) for channel in RIG]
     samples: list[dict[str, Any]] = []
     files = _Files(folder, recording.quality)
-    spacing = max(1, KEY // (recording.sweeps + 1))
+    sweep_spacing = max(1, KEY // (recording.sweeps + 1))
     steps = [
         step
         for step in range(min(int(recording.seconds / trace.dt), len(trace.x) - 2) + 1)
-        if step % KEY == 0 or (step % spacing == 0 and step % KEY <= spacing * recording.sweeps)
+        if step % KEY == 0 or (step % sweep_spacing == 0 and step % KEY <= sweep_spacing * recording.sweeps)
     ]
-    stage = Scene(street, cast.meshes.only(_meshes_near(cast, trace, steps)), device=recording.device)
-    at_once = GPU_STEPS if recording.device != "cpu" else 1
-    for start in range(0, len(steps), at_once):
-        moments = [_Moment.of(step, cast, trace, cameras, weather, key) for step in steps[start : start + at_once]]
-        for moment, shares in _look(stage, moments, files, number, together=recording.device != "cpu"):
-            now = moment.now
-            ego = ego_at(trace, now)
-            around = cast.at(now, ego[:2, 3], DRAWN)
-            points, _ = sweep(stage, HDL32E, ego, [s.thing for s in around], key=("lidar", *key, moment.step))
-            files.cloud(points, sweep=moment.step, moment=moment_of(number, now), on_key=moment.on_key, ego=ego)
+    # Most bodies of a town are never in view; building only the visible ones saves time and memory.
+    scene = Scene(street, population.meshes.only(_meshes_near(population, trace, steps)), device=recording.device)
+    steps_per_call = GPU_STEPS if recording.device != "cpu" else 1
+    for start in range(0, len(steps), steps_per_call):
+        moments = [
+            _Moment.of(step, population, trace, cameras, weather, key) for step in steps[start : start + steps_per_call]
+        ]
+        for moment, shares in _look(scene, moments, files, number, together=recording.device != "cpu"):
+            sweep_end = moment.now
+            ego = ego_at(trace, sweep_end)
+            surrounding = population.at(sweep_end, ego[:2, 3], DRAWN)
+            points, _ = sweep(
+                scene, HDL32E, ego, [placed.thing for placed in surrounding], key=("lidar", *key, moment.step)
+            )
+            files.cloud(points, sweep=moment.step, moment=moment_of(number, sweep_end), on_key=moment.on_key, ego=ego)
             if moment.on_key:
-                boxes = _annotate([s for s in around if s.body.kind], ego, points, shares)
-                samples.append({"time": moment_of(number, now), "sweep": moment.step, "boxes": boxes})
-    part = {
+                boxes = _annotate([placed for placed in surrounding if placed.body.kind], ego, points, shares)
+                samples.append({"time": moment_of(number, sweep_end), "sweep": moment.step, "boxes": boxes})
+    part_page = {
         "name": name,
         "town": town,
         "drive": episode.key,
@@ -230,22 +258,30 @@ def _scene(recording: Recording, town: str, number: int) -> None:
         "weather": weather_words(weather),
         "sensors": _sensors(cameras),
     }
-    safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
+    safeio.write_atomic(folder / PART, safeio.dump_json(part_page) + "\n")
 
 
 def _meshes_near(cast: SceneObjects, trace: EpisodeTrace, steps: Sequence[int]) -> set[int]:
     """The meshes of all that is drawn at these steps."""
-    found = set()
+    mesh_indices = set()
     for step in steps:
-        now = FIRST + step * trace.dt
-        for time in [now, *(now - ahead for ahead in AHEAD.values())]:
-            found |= {one.thing.mesh for one in cast.at(time, ego_at(trace, time)[:2, 3], DRAWN)}
-    return found
+        sweep_end = FIRST + step * trace.dt
+        for time in [sweep_end, *(sweep_end - lead for lead in AHEAD.values())]:
+            mesh_indices |= {placed.thing.mesh for placed in cast.at(time, ego_at(trace, time)[:2, 3], DRAWN)}
+    return mesh_indices
 
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """What the cameras look at in one step; now: when the sweep ends, s; times and egos: of each view."""
+    """Views of all cameras in one step.
+
+    Attributes:
+        step: Step of the world.
+        now: End of the LiDAR's sweep, s.
+        views: View of each camera.
+        times: Time of each view, s.
+        egos: Pose of the ego at each view.
+    """
 
     step: int
     now: float
@@ -255,7 +291,7 @@ class _Moment:
 
     @property
     def on_key(self) -> bool:
-        """Whether it is a key frame."""
+        """True for a key frame."""
         return self.step % KEY == 0
 
     @staticmethod
@@ -268,18 +304,19 @@ class _Moment:
         key: tuple[object, ...],
     ) -> _Moment:
         """Each camera at its own time; the first sweep ends when every camera has fired."""
-        now = FIRST + step * trace.dt
+        sweep_end = FIRST + step * trace.dt
         views, times, egos = [], [], []
-        for c, camera in enumerate(cameras):
-            fired = now - AHEAD[camera.channel]
-            ego = ego_at(trace, fired)
-            things = tuple(s.thing for s in cast.at(fired, ego[:2, 3], DRAWN))
-            noise = int(digest("noise", *key, step, c)[:7], 16)
+        for camera_index, camera in enumerate(cameras):
+            exposure_time = sweep_end - AHEAD[camera.channel]
+            # The ego moves between the exposures of two cameras, as in nuScenes.
+            ego = ego_at(trace, exposure_time)
+            scene_objects = tuple(placed.thing for placed in cast.at(exposure_time, ego[:2, 3], DRAWN))
+            noise_seed = int(digest("noise", *key, step, camera_index)[:7], 16)
             lamps = own_lamps(ego, weather)
-            views.append(View(camera, ego @ camera.to_ego, things, weather, SENSOR, noise, lamps))
-            times.append(fired)
+            views.append(View(camera, ego @ camera.to_ego, scene_objects, weather, SENSOR, noise_seed, lamps))
+            times.append(exposure_time)
             egos.append(ego)
-        return _Moment(step, now, views, times, egos)
+        return _Moment(step, sweep_end, views, times, egos)
 
 
 def _look(
@@ -290,37 +327,39 @@ def _look(
     Yields:
         Each moment with the largest share of each thing that a camera sees (of key frames).
     """
-    flat = [(moment, c) for moment in moments for c in range(len(moment.views))]
-    found: list[dict[int, float]] = [{} for _ in moments]
-    count = len(flat) if together else 1
-    for k in range(0, len(flat), count):
-        block = flat[k : k + count]
-        picture = render(stage, [moment.views[c] for moment, c in block], linear=False)
-        for n, (moment, c) in enumerate(block):
-            view = moment.views[c]
+    camera_moments = [(moment, camera_index) for moment in moments for camera_index in range(len(moment.views))]
+    largest_shares: list[dict[int, float]] = [{} for _ in moments]
+    views_per_call = len(camera_moments) if together else 1
+    for start in range(0, len(camera_moments), views_per_call):
+        batch = camera_moments[start : start + views_per_call]
+        rendering = render(stage, [moment.views[camera_index] for moment, camera_index in batch], linear=False)
+        for view_index, (moment, camera_index) in enumerate(batch):
+            view = moment.views[camera_index]
             if moment.on_key:
-                shares = found[next(i for i, one in enumerate(moments) if one is moment)]
-                for tag, share in visible_share(stage, view, picture, n).items():
+                shares = largest_shares[
+                    next(moment_index for moment_index, candidate in enumerate(moments) if candidate is moment)
+                ]
+                for tag, share in visible_share(stage, view, rendering, view_index).items():
                     shares[tag] = max(shares.get(tag, 0.0), share)
             files.picture(
                 view.camera,
-                picture.image[n],
-                picture.depth[n],
+                rendering.image[view_index],
+                rendering.depth[view_index],
                 sweep=moment.step,
-                moment=moment_of(number, moment.times[c]),
+                moment=moment_of(number, moment.times[camera_index]),
                 on_key=moment.on_key,
-                ego=moment.egos[c],
+                ego=moment.egos[camera_index],
             )
-    yield from zip(moments, found, strict=True)
+    yield from zip(moments, largest_shares, strict=True)
 
 
 def moment_of(number: int, time: float) -> int:
-    """Time stamp in us of a moment of scene `number`."""
+    """Return the time stamp in us of a moment of scene `number`."""
     return START + number * 100_000_000 + round(time * 1e6)
 
 
 def drive(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
-    """The Autopilot drives an episode."""
+    """Drive an episode with the Autopilot."""
     from ssad.drivers import make_system
     from ssad.world.rollout import rollout
     from ssad.world.world import World
@@ -330,7 +369,7 @@ def drive(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
 
 @dataclass(slots=True)
 class _Files:
-    """Files of a scene's part, and the rows that say what they are."""
+    """Files of a scene's part, and the rows that describe them."""
 
     folder: Path
     quality: int
@@ -339,7 +378,7 @@ class _Files:
     def picture(
         self, camera: Camera, image: U8, depth: Any, *, sweep: int, moment: int, on_key: bool, ego: F64
     ) -> None:
-        """One picture and its depth map."""
+        """Write one image and its depth map."""
         name = f"{camera.channel}_{moment}"
         safeio.write_atomic(self.folder / f"{name}.depth.png", depth_bytes(depth))
         self._write(
@@ -354,7 +393,7 @@ class _Files:
         )
 
     def cloud(self, points: Any, *, sweep: int, moment: int, on_key: bool, ego: F64) -> None:
-        """One sweep."""
+        """Write one sweep."""
         self._write(
             f"LIDAR_TOP_{moment}.pcd.bin",
             points_bytes(points),
@@ -373,39 +412,48 @@ class _Files:
 
 def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[int, float]) -> list[dict[str, Any]]:
     """Boxes of what nuScenes has a category for, within reach and seen by a camera or hit by the LiDAR."""
-    near = [s for s in around if s.body.kind in BODY_CATEGORIES and np.hypot(*(s.pose[:2, 3] - ego[:2, 3])) < REACH]
-    if not near:
+    nearby = [
+        placed
+        for placed in around
+        if placed.body.kind in BODY_CATEGORIES and np.hypot(*(placed.pose[:2, 3] - ego[:2, 3])) < REACH
+    ]
+    if not nearby:
         return []
-    centre = np.array([s.pose[:3, 3] + [0, 0, s.body.size[2] / 2] for s in near])
-    size_lwh = np.array([s.body.size for s in near])
-    rotation = matrix_to_quaternion([s.pose[:3, :3] for s in near])
+    centre = np.array([placed.pose[:3, 3] + [0, 0, placed.body.size[2] / 2] for placed in nearby])
+    size_lwh = np.array([placed.body.size for placed in nearby])
+    rotation = matrix_to_quaternion([placed.pose[:3, :3] for placed in nearby])
     boxes = WorldBoxes(centre, size_lwh, rotation, np.zeros_like(centre))
     pose = ego @ HDL32E.to_ego
-    world = np.asarray(points[:, :3], np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    counts, size = points_in_boxes(world, boxes), boxes.size_wlh
-    found = []
-    for n, who in enumerate(near):
-        share = shares.get(who.body.tag, 0.0)
-        if counts[n] or share > 0:
-            found.append(
+    world_points = np.asarray(points[:, :3], np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    point_counts, size = points_in_boxes(world_points, boxes), boxes.size_wlh
+    annotation_rows = []
+    for row, placed_object in enumerate(nearby):
+        share = shares.get(placed_object.body.tag, 0.0)
+        if point_counts[row] or share > 0:
+            annotation_rows.append(
                 {
-                    "tag": who.body.tag,
-                    "category": BODY_CATEGORIES[who.body.kind],
-                    "attributes": list(attributes_of(who)),
-                    "centre": centre[n].tolist(),
-                    "size": size[n].tolist(),
-                    "rotation": list(rotation[n]),
-                    "points": int(counts[n]),
+                    "tag": placed_object.body.tag,
+                    "category": BODY_CATEGORIES[placed_object.body.kind],
+                    "attributes": list(attributes_of(placed_object)),
+                    "centre": centre[row].tolist(),
+                    "size": size[row].tolist(),
+                    "rotation": list(rotation[row]),
+                    "points": int(point_counts[row]),
                     "visibility": visibility_token(share),
                 }
             )
-    return found
+    return annotation_rows
 
 
 def _sensors(cameras: list[Camera]) -> list[dict[str, Any]]:
     rows = [
-        {"channel": c.channel, "modality": "camera", "pose": c.to_ego.tolist(), "intrinsic": c.intrinsic.tolist()}
-        for c in cameras
+        {
+            "channel": camera.channel,
+            "modality": "camera",
+            "pose": camera.to_ego.tolist(),
+            "intrinsic": camera.intrinsic.tolist(),
+        }
+        for camera in cameras
     ]
     return [*rows, {"channel": "LIDAR_TOP", "modality": "lidar", "pose": HDL32E.to_ego.tolist(), "intrinsic": []}]
 
@@ -417,13 +465,20 @@ def record_nuscenes(
     ray: str | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Path:
-    """Records all scenes and writes the tables; the root of the data set. Run again to go on. StoreError."""
+    """Record all scenes and write the tables; an interrupted recording is resumed.
+
+    Returns:
+        The root of the data set.
+
+    Raises:
+        StoreError: The folder holds something else, or scenes failed.
+    """
     out = recording.out
-    together = SHARED if recording.streets == "any" else 1
+    scenes_per_task = SHARED if recording.streets == "any" else 1
     tasks = [
-        (recording, town, range(first, min(first + together, recording.scenes)))
+        (recording, town, range(first_scene, min(first_scene + scenes_per_task, recording.scenes)))
         for town in recording.towns
-        for first in range(0, recording.scenes, together)
+        for first_scene in range(0, recording.scenes, scenes_per_task)
     ]
     if (out / recording.version / "splits.json").is_file():  # written last
         if not (out / ".parts" / "recording.json").is_file():
@@ -438,7 +493,11 @@ def record_nuscenes(
 
 
 def check_parts(out: Path, identity: dict[str, Any]) -> None:
-    """Writes what is recorded here, or compares. StoreError: something else."""
+    """Write the settings of a recording, or compare them with those of the folder.
+
+    Raises:
+        StoreError: The folder holds another recording.
+    """
     safeio.make_folder(out / ".parts")
     page = out / ".parts" / "recording.json"
     if page.is_file():
@@ -457,24 +516,28 @@ def run_parts(
     pool: Pool,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Records every part that is not there yet. StoreError: another recording, or parts that failed (see `run_all`)."""
+    """Record every missing part.
+
+    Raises:
+        StoreError: Another recording, or parts that failed (see `run_all`).
+    """
     check_parts(out, identity)
     run_all(pool, record, tasks, timeout_s=PART_S, progress=progress)
 
 
 def _merge(recording: Recording, names: list[str]) -> None:
-    """Tables from the parts, files to their places."""
+    """Build the tables from the parts and move the files to their places."""
     out = recording.out
     splits: dict[str, list[str]] = {"train": [], "val": [], "all": []}
     with NuScenesWriter(out, recording.version) as writer:
         for name in names:
             folder = out / ".parts" / name
-            part = safeio.read_json(folder / PART)
-            description = f"{part['town']}, {part['weather']}"
-            scene = writer.add_scene(name, description=description, location=part["town"])
-            splits["val" if part["town"] in recording.held_out else "train"].append(name)
+            part_page = safeio.read_json(folder / PART)
+            description = f"{part_page['town']}, {part_page['weather']}"
+            scene = writer.add_scene(name, description=description, location=part_page["town"])
+            splits["val" if part_page["town"] in recording.held_out else "train"].append(name)
             splits["all"].append(name)
-            for sensor in part["sensors"]:
+            for sensor in part_page["sensors"]:
                 pose = np.array(sensor["pose"])
                 writer.add_sensor(
                     scene,
@@ -484,10 +547,10 @@ def _merge(recording: Recording, names: list[str]) -> None:
                     rotation=tuple(matrix_to_quaternion(pose[:3, :3])),
                     intrinsic=sensor["intrinsic"],
                 )
-            times = {}
-            for sample in part["samples"]:
-                times[sample["sweep"]] = writer.add_sample(scene, sample["time"])
-            for frame in part["frames"]:
+            sample_tokens = {}
+            for sample in part_page["samples"]:
+                sample_tokens[sample["sweep"]] = writer.add_sample(scene, sample["time"])
+            for frame in part_page["frames"]:
                 ego = np.array(frame["ego"])
                 token = writer.add_sensor_frame(
                     scene,
@@ -496,20 +559,22 @@ def _merge(recording: Recording, names: list[str]) -> None:
                     data=folder / frame["file"],
                     ego_translation=tuple(ego[:3, 3]),
                     ego_rotation=tuple(matrix_to_quaternion(ego[:3, :3])),
-                    sample=times[frame["sweep"]] if frame["key"] else None,
+                    sample=sample_tokens[frame["sweep"]] if frame["key"] else None,
                     size=tuple(frame["size"]),
                 )
                 depth = folder / f"{frame['file'].removesuffix('.jpg')}.depth.png"
                 if depth.is_file():
                     place_file(out / "depth" / frame["channel"] / f"{token}.png", depth)
-            known: dict[int, str] = {}
-            for sample in part["samples"]:
+            instance_tokens: dict[int, str] = {}
+            for sample in part_page["samples"]:
                 for box in sample["boxes"]:
-                    if box["tag"] not in known:
-                        known[box["tag"]] = writer.add_instance(scene, f"thing-{box['tag']}", category=box["category"])
+                    if box["tag"] not in instance_tokens:
+                        instance_tokens[box["tag"]] = writer.add_instance(
+                            scene, f"thing-{box['tag']}", category=box["category"]
+                        )
                     writer.add_annotation(
-                        times[sample["sweep"]],
-                        known[box["tag"]],
+                        sample_tokens[sample["sweep"]],
+                        instance_tokens[box["tag"]],
                         translation=box["centre"],
                         size=box["size"],
                         rotation=box["rotation"],
@@ -517,5 +582,5 @@ def _merge(recording: Recording, names: list[str]) -> None:
                         attributes=box["attributes"],
                         lidar_points=box["points"],
                     )
-        for split, members in splits.items():
-            writer.set_split(split, members)
+        for split, scene_names in splits.items():
+            writer.set_split(split, scene_names)

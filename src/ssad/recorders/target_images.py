@@ -1,9 +1,10 @@
-"""`ssad record --clips`: pictures of a target, a car or a stop sign, for 2D detection, with COCO annotations.
+"""Record images of a target for 2D detection, with COCO annotations (`ssad record --clips`).
 
-drive: a camera follows the driving target on its own way, 20 m behind, as in the paper; orbit: views of a target on the
-road, or of a stop sign beside it, over distance, azimuth, elevation and weather. Recorded in parts as drives are:
-pictures are written to their places, a page of each part to OUT/.parts, the annotations when all parts are there. So
-any number of processes gives the same bytes, and a run that was stopped goes on.
+drive: a camera follows the driving target on its route, 20 m behind, as in the paper; orbit: views of a target on
+the road, or of a stop sign beside it, over distance, azimuth, elevation and weather. A recording consists of
+parts, as that of drives does: images are written to their final places, a page of each part to OUT/.parts, and the
+annotations when all parts are complete. Any number of processes therefore gives the same bytes, and a stopped run
+can be resumed.
 """
 
 from __future__ import annotations
@@ -75,16 +76,16 @@ NEAR: Final = 0.2  # largest share of the picture that something right before th
 
 @dataclass(frozen=True, slots=True)
 class _Set:
-    """A drive to take pictures of.
+    """A drive to take images of.
 
     Attributes:
-        clips: What is recorded.
-        key: Of all draws.
+        clips: Settings of the recording.
+        key: Key of all random draws.
         trace: The drive.
-        cast: Who is there.
+        cast: Bodies of the drive.
         stage: Street and bodies, ready to be rendered.
-        targets: The bodies that play the target in turn.
-        places: Where a target that stands can be.
+        targets: Bodies that play the target in turn.
+        places: Possible places of a standing target.
     """
 
     clips: Clips
@@ -100,28 +101,29 @@ def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
     graph = load_town(town)
     street = drive_street(graph, clips.streets, key=("clips", *key))
     trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
-    cast = place_objects(trace, graph, street, key=key, many_signs=clips.streets == "any")
+    population = place_objects(trace, graph, street, key=key, many_signs=clips.streets == "any")
     places: tuple[Place, ...] = ()
     if isinstance(clips.target, TargetSign):
-        targets: tuple[ObjectBody, ...] = (_sign(cast, clips.target),)
-        way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
-        clear = Clear(street)
-        take_still(cast, clear)
-        found = free_places(graph, way, clear, key=("target", *key))
-        places = tuple((*place, plate_height(targets[0])) for place in found)
+        targets: tuple[ObjectBody, ...] = (_sign(population, clips.target),)
+        route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
+        free_ground = Clear(street)
+        take_still(population, free_ground)
+        free = free_places(graph, route_points, free_ground, key=("target", *key))
+        places = tuple((*place, plate_height(targets[0])) for place in free)
     elif clips.target is not None:
-        targets = (_named(cast, clips.target),)
+        targets = (_named(population, clips.target),)
     else:
-        count = TARGETS if clips.mode == "orbit" else 1
-        targets = tuple(_drawn(cast, generator("clips target", *key, n)) for n in range(count))
-    return _Set(clips, key, trace, cast, Scene(street, cast.meshes, device=clips.device), targets, places)
+        target_count = TARGETS if clips.mode == "orbit" else 1
+        targets = tuple(_drawn(population, generator("clips target", *key, index)) for index in range(target_count))
+    return _Set(clips, key, trace, population, Scene(street, population.meshes, device=clips.device), targets, places)
 
 
 def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
     """Some car in the place of the ego, with its mesh in the cast."""
     style = draw_style("car", generator=draws)
-    drawn = draw_size("car", style, generator=draws)
-    size = min(drawn[0], 4.9), min(drawn[1], 2.06), drawn[2]
+    full_size = draw_size("car", style, generator=draws)
+    # The car plays the ego of the drive, so its footprint is bounded.
+    size = min(full_size[0], 4.9), min(full_size[1], 2.06), full_size[2]
     mesh = cast.meshes.add(make_body("car", style=style, size=size, generator=draws))
     return _body(mesh, style, size, draw_paint(draws))
 
@@ -134,13 +136,13 @@ def _named(cast: SceneObjects, target: TargetCar | TargetWalker) -> ObjectBody:
 
 def _sign(cast: SceneObjects, target: TargetSign) -> ObjectBody:
     """The target sign: its plate, which is labelled, and its post."""
-    meshes = tuple(cast.meshes.add(part) for part in plate_and_post(target.mesh()))
-    size, still = target.full_size, (np.zeros((1, 4)), np.ones(1, bool), np.zeros(1))
-    return ObjectBody(TARGET, target.kind, target.style, size, (0.5, 0.5, 0.5), meshes, *still)
+    meshes = tuple(cast.meshes.add(piece) for piece in plate_and_post(target.mesh()))
+    size, static_track = target.full_size, (np.zeros((1, 4)), np.ones(1, bool), np.zeros(1))
+    return ObjectBody(TARGET, target.kind, target.style, size, (0.5, 0.5, 0.5), meshes, *static_track)
 
 
 def plate_height(sign: ObjectBody) -> float:
-    """Height of the middle of a sign's plate above its foot, m."""
+    """Return the height of the middle of a sign's plate above its foot, m."""
     return sign.size[2] - sign.size[1] / 2
 
 
@@ -149,7 +151,7 @@ def _body(mesh: int, style: str, size: Point, paint: tuple[float, float, float])
 
 
 def batch_size(device: str) -> int:
-    """Views rendered at once: on the CPU one is as fast as many."""
+    """Return the number of views rendered at once; on the CPU one is as fast as many."""
     return 1 if device == "cpu" else 32
 
 
@@ -157,44 +159,54 @@ def _rounds(
     made: _Set, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
 ) -> Iterator[list[tuple[int, Viewpoint]]]:
     """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
-    clips, key = made.clips, made.key
-    draws = generator("clips shots", *key)
-    if clips.mode == "drive":
+    recording, key = made.clips, made.key
+    rng = generator("clips shots", *key)
+    if recording.mode == "drive":
         weather = draw_weather(("clips", *key))
-        left = iter(
-            follow(made.trace, weather, behind=clips.behind, height=clips.height, count=len(slots), draws=draws)
+        remaining = iter(
+            follow(made.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), draws=rng)
         )
-        while todo := list(zip(missing(), left, strict=False)):
-            yield todo
+        while batch := list(zip(missing(), remaining, strict=False)):
+            yield batch
         return
-    if isinstance(clips.target, TargetSign) and not made.places:
+    if isinstance(recording.target, TargetSign) and not made.places:
         return
-    grid = list(product(clips.distances, clips.azimuths, clips.elevations, clips.weathers or ("",)))
-    wanted = turn_of(slots, len(grid), key=(clips.seed, town))
+    grid = list(product(recording.distances, recording.azimuths, recording.elevations, recording.weathers or ("",)))
+    cell_indices = turn_of(slots, len(grid), key=(recording.seed, town))
     if attempt >= 3:
-        wanted = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
+        # Some cells have no free view in a town; random cells keep the recording from stalling.
+        cell_indices = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
     # low things before a sign hide little of it
     height = made.places[0][4] if made.places else 2 * AIM
-    for turn, tries in enumerate(TRIES):
-        proposed: list[tuple[int, Viewpoint]] = []
-        for n in missing():
-            *cell, kind = grid[wanted[n]]
-            weather = draw_weather(("clips", *key, turn, n), kind)
-            if isinstance(clips.target, TargetSign):
+    for turn, attempts in enumerate(TRIES):
+        proposals: list[tuple[int, Viewpoint]] = []
+        for index in missing():
+            *cell, weather_kind = grid[cell_indices[index]]
+            weather = draw_weather(("clips", *key, turn, index), weather_kind)
+            if isinstance(recording.target, TargetSign):
                 seconds = (len(made.trace.x) - 1) * made.trace.dt
-                views = orbit_sign(made.places, seconds, weather, (cell[0], cell[1]), draws)
+                views = orbit_sign(made.places, seconds, weather, (cell[0], cell[1]), rng)
             else:
-                views = orbit(made.trace, weather, (cell[0], cell[1], cell[2]), draws)
-            proposed += [(n, s) for s in islice(views, tries)]
-        clear = free_sight(made.stage, [s for _, s in proposed], at_once=batch_size(clips.device), height=height)
-        first = dict(reversed([pair for pair, ok in zip(proposed, clear, strict=True) if ok]))
-        yield sorted(first.items())
+                views = orbit(made.trace, weather, (cell[0], cell[1], cell[2]), rng)
+            proposals += [(index, viewpoint) for viewpoint in islice(views, attempts)]
+        sight_free = free_sight(
+            made.stage, [viewpoint for _, viewpoint in proposals], at_once=batch_size(recording.device), height=height
+        )
+        # Reversed, so that the first free proposal of each image wins.
+        first_free = dict(reversed([pair for pair, is_free in zip(proposals, sight_free, strict=True) if is_free]))
+        yield sorted(first_free.items())
 
 
 def _part(task: tuple[Clips, str, int, int, str]) -> str:
-    """Takes `count` pictures, of one drive if it can be; the part's name. What is there is left alone. ConfigError."""
-    clips, town, number, count, name = task
-    page = clips.out / ".parts" / name / "part.json"
+    """Record `count` images, of one drive if possible, and return the name of the part.
+
+    A finished part is left alone.
+
+    Raises:
+        ConfigError: The drives show too few views of the target.
+    """
+    recording, town, number, count, name = task
+    page = recording.out / ".parts" / name / "part.json"
     if page.is_file():
         return name
     quiet_warp()
@@ -204,24 +216,36 @@ def _part(task: tuple[Clips, str, int, int, str]) -> str:
     slots = range(number * EACH, number * EACH + count)
 
     def missing() -> list[int]:
-        return [n for n in range(count) if n not in rows]
+        return [index for index in range(count) if index not in rows]
 
     for attempt in range(DRIVES):
-        made = _prepare(clips, town, (clips.seed, clips.mode, town, number, attempt))
-        for shots in _rounds(made, town, slots, attempt, missing):
-            for n, row, image in _take(made, shots, skipped):
-                file = f"{name}-{n:03d}.jpg"
-                safeio.write_atomic(clips.out / "images" / file, encode_jpeg(image, clips.quality, "420"))
-                about = {"file_name": file, "town": town, "drive": made.trace.key, "part": number, "attempt": attempt}
-                rows[n] = about | {"slot": n} | row
+        prepared = _prepare(recording, town, (recording.seed, recording.mode, town, number, attempt))
+        for viewpoints in _rounds(prepared, town, slots, attempt, missing):
+            for image_index, row, image in _take(prepared, viewpoints, skipped):
+                file = f"{name}-{image_index:03d}.jpg"
+                safeio.write_atomic(recording.out / "images" / file, encode_jpeg(image, recording.quality, "420"))
+                base_row = {
+                    "file_name": file,
+                    "town": town,
+                    "drive": prepared.trace.key,
+                    "part": number,
+                    "attempt": attempt,
+                }
+                rows[image_index] = base_row | {"slot": image_index} | row
         if not missing():
             break
     else:
-        why = ", ".join(f"{v} {k}" for k, v in sorted(skipped.items())) or "the drives are too short"
-        raise ConfigError(
-            f"{town}: {len(rows)} of {count} pictures in {DRIVES} drives ({why}); choose smaller distances"
+        reasons = (
+            ", ".join(f"{occurrences} {reason}" for reason, occurrences in sorted(skipped.items()))
+            or "the drives are too short"
         )
-    safeio.write_atomic(page, safeio.dump_json({"images": [rows[n] for n in range(count)], "skipped": skipped}) + "\n")
+        raise ConfigError(
+            f"{town}: {len(rows)} of {count} pictures in {DRIVES} drives ({reasons}); choose smaller distances"
+        )
+    safeio.write_atomic(
+        page,
+        safeio.dump_json({"images": [rows[image_index] for image_index in range(count)], "skipped": skipped}) + "\n",
+    )
     return name
 
 
@@ -229,45 +253,45 @@ def _take(
     made: _Set, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
 ) -> Iterator[tuple[int, dict[str, Any], U8]]:
     """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
-    clips = made.clips
-    camera = _camera(clips.size)
-    ready: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
-    for n, shot in shots:
-        target = made.targets[n % len(made.targets)]
-        around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
-        if not has_room(target, shot, around):
+    recording = made.clips
+    camera = _camera(recording.size)
+    candidates: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
+    for slot, viewpoint in shots:
+        target = made.targets[slot % len(made.targets)]
+        surrounding = made.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+        if not has_room(target, viewpoint, surrounding):
             skipped["crowded"] += 1
             continue
-        view = _view(made, n, shot, around, camera)
-        around.append(PlacedObject(target, shot.target, 0.0, view.things[0]))
-        ready.append((n, shot, view, around))
-    size = batch_size(clips.device)
-    for k in range(0, len(ready), size):
-        picture = render(made.stage, [view for _, _, view, _ in ready[k : k + size]], linear=False)
-        for index, (n, shot, view, around) in enumerate(ready[k : k + size]):
-            objects, fault = _annotate(made.stage, view, picture, index, around)
-            if fault:
-                skipped[fault] += 1
+        view = _view(made, slot, viewpoint, surrounding, camera)
+        surrounding.append(PlacedObject(target, viewpoint.target, 0.0, view.things[0]))
+        candidates.append((slot, viewpoint, view, surrounding))
+    size = batch_size(recording.device)
+    for start in range(0, len(candidates), size):
+        rendering = render(made.stage, [view for _, _, view, _ in candidates[start : start + size]], linear=False)
+        for index, (slot, viewpoint, view, surrounding) in enumerate(candidates[start : start + size]):
+            objects, reject_reason = _annotate(made.stage, view, rendering, index, surrounding)
+            if reject_reason:
+                skipped[reject_reason] += 1
                 continue
-            target = around[-1].body
+            target = surrounding[-1].body
             row = {
-                "width": clips.size,
-                "height": clips.size,
-                "time": shot.time,
-                "weather": weather_name(shot.weather),
-                "light": asdict(shot.weather),
+                "width": recording.size,
+                "height": recording.size,
+                "time": viewpoint.time,
+                "weather": weather_name(viewpoint.weather),
+                "light": asdict(viewpoint.weather),
                 "intrinsic": camera.intrinsic.tolist(),
-                "pose": shot.camera.tolist(),
-                "target_pose": shot.target.tolist(),
+                "pose": viewpoint.camera.tolist(),
+                "target_pose": viewpoint.target.tolist(),
                 "target_style": target.style,
-                "target_size": [round(v, 3) for v in target.size],
+                "target_size": [round(extent, 3) for extent in target.size],
                 "objects": objects,
             }
-            yield n, row | shot.about, picture.image[index]
+            yield slot, row | viewpoint.about, rendering.image[index]
 
 
 def label_of(kind: str) -> int | None:
-    """Index into `CLASSES` of a kind of body; None for what is background."""
+    """Return the index into `CLASSES` of a kind of body; None for background."""
     if kind in PLAIN_CLASSES:
         return CLASSES.index(kind)
     return CLASSES.index(class_of(kind)) if kind in BODY_CATEGORIES else None
@@ -287,19 +311,19 @@ def _camera(size: int) -> Camera:
 def _view(made: _Set, n: int, shot: Viewpoint, around: Sequence[PlacedObject], camera: Camera) -> View:
     """View `n` of a part: the target first, then who else is there."""
     target = made.targets[n % len(made.targets)]
-    own = Thing(target.meshes[0], shot.target, target.paint, TARGET)
-    noise = int(digest("clips noise", *made.key, n)[:7], 16)
+    target_object = Thing(target.meshes[0], shot.target, target.paint, TARGET)
+    noise_seed = int(digest("clips noise", *made.key, n)[:7], 16)
     lamps = own_lamps(_follower(shot), shot.weather) if made.clips.mode == "drive" else ()
     focus = float(shot.target[0, 3]), float(shot.target[1, 3])
-    rest = (Thing(mesh, shot.target, target.paint) for mesh in target.meshes[1:])
-    things = (own, *rest, *(s.thing for s in around))
-    return View(camera, shot.camera, things, shot.weather, SENSOR, noise, lamps, focus)
+    other_parts = (Thing(mesh, shot.target, target.paint) for mesh in target.meshes[1:])
+    scene_objects = (target_object, *other_parts, *(placed.thing for placed in around))
+    return View(camera, shot.camera, scene_objects, shot.weather, SENSOR, noise_seed, lamps, focus)
 
 
 def _follower(shot: Viewpoint) -> F64:
     """The vehicle [4, 4] that carries the following camera, which is 2 m behind its nose."""
-    eye, ahead = shot.camera[:3, 3], shot.camera[:3, 2]
-    pose = upright_pose(float(eye[0]), float(eye[1]), float(np.arctan2(ahead[1], ahead[0])))
+    eye, forward = shot.camera[:3, 3], shot.camera[:3, 2]
+    pose = upright_pose(float(eye[0]), float(eye[1]), float(np.arctan2(forward[1], forward[0])))
     return pose @ upright_pose(2.0 - NOSE, 0.0, 0.0)
 
 
@@ -308,37 +332,38 @@ def _annotate(
 ) -> tuple[list[dict[str, Any]], str]:
     """What is seen in a picture, the target among it; and why the picture is of no use (else '')."""
     labels = label_picture(stage, view, picture, index)
-    at = {s.body.tag: s for s in around}
-    own = labels.tag == TARGET
-    side = labels.box[:, 2:] - labels.box[:, :2]
-    if not own.any() or labels.share[own][0] < SEEN:
+    placed_by_tag = {placed.body.tag: placed for placed in around}
+    is_target = labels.tag == TARGET
+    extents = labels.box[:, 2:] - labels.box[:, :2]
+    if not is_target.any() or labels.share[is_target][0] < SEEN:
         return [], "hidden"
-    if labels.inside[own][0] < SEEN or side[own].min() < SMALL:
+    if labels.inside[is_target][0] < SEEN or extents[is_target].min() < SMALL:
         return [], "cut or small"
-    away = float(np.linalg.norm(at[TARGET].pose[:3, 3] - view.pose[:3, 3]))
-    if near_share(view, picture.depth[index], picture.tag[index], within=max(2.0, away / 3)) > NEAR:
+    target_distance = float(np.linalg.norm(placed_by_tag[TARGET].pose[:3, 3] - view.pose[:3, 3]))
+    # A wall or post right before the camera leaves too little of the street to see.
+    if near_share(view, picture.depth[index], picture.tag[index], within=max(2.0, target_distance / 3)) > NEAR:
         return [], "blocked"
-    crowd = (side.min(1) < SMALL) | (labels.share < HIDDEN)
+    crowd = (extents.min(1) < SMALL) | (labels.share < HIDDEN)
     objects = []
-    for n, tag in enumerate(labels.tag.tolist()):
-        who = at[tag]
-        label = label_of(who.body.kind)
+    for row, tag in enumerate(labels.tag.tolist()):
+        placed_object = placed_by_tag[tag]
+        label = label_of(placed_object.body.kind)
         if label is not None:
-            tall = who.body.size[2] / 2
-            if who.body.kind in PLAIN_CLASSES:
-                crowd[n] |= not faces(who.pose, view.pose[:3, 3])
-                tall = plate_height(who.body)
-            middle = who.pose[:3, 3] + [0.0, 0.0, tall]
-            x1, y1, x2, y2 = _hull(view, who.pose, who.body.size).tolist()
+            centre_height = placed_object.body.size[2] / 2
+            if placed_object.body.kind in PLAIN_CLASSES:
+                crowd[row] |= not faces(placed_object.pose, view.pose[:3, 3])
+                centre_height = plate_height(placed_object.body)
+            middle = placed_object.pose[:3, 3] + [0.0, 0.0, centre_height]
+            x1, y1, x2, y2 = _hull(view, placed_object.pose, placed_object.body.size).tolist()
             objects.append(
                 {
                     "label": label,
-                    "box": labels.box[n].tolist(),
-                    "pixels": int(labels.pixels[n]),
-                    "crowd": bool(crowd[n]),
+                    "box": labels.box[row].tolist(),
+                    "pixels": int(labels.pixels[row]),
+                    "crowd": bool(crowd[row]),
                     "target": tag == TARGET,
                     "hull": [x1, y1, x2 - x1, y2 - y1],
-                    "visible": round(float(labels.share[n]), 3),
+                    "visible": round(float(labels.share[row]), 3),
                     "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2),
                 }
             )
@@ -346,12 +371,13 @@ def _annotate(
 
 
 def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
-    """x1, y1, x2, y2 around all of a body's 3D box in a picture, whether it is seen or not, px."""
+    """Return x1, y1, x2, y2 (px) around the whole 3D box of a body, visible or not."""
+    # The pose of a body is that of the middle of its base.
     corners = (UNIT_CORNERS + np.array([0.0, 0.0, 0.5])) * size
-    turn = np.linalg.inv(view.pose) @ pose
-    local, camera = corners @ turn[:3, :3].T + turn[:3, 3], view.camera
-    found = hulls(local[None], camera.intrinsic, (camera.width, camera.height))[0]
-    return np.asarray(np.round(found, 2))
+    body_to_camera = np.linalg.inv(view.pose) @ pose
+    camera_corners, camera = corners @ body_to_camera[:3, :3].T + body_to_camera[:3, 3], view.camera
+    box = hulls(camera_corners[None], camera.intrinsic, (camera.width, camera.height))[0]
+    return np.asarray(np.round(box, 2))
 
 
 def record_clips(
@@ -376,32 +402,35 @@ def record_all(
     ray: str | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Path]:
-    """Several recordings as `record_clips` takes them, all their parts side by side; their folders.
+    """Record several recordings, as `record_clips` does, with all their parts side by side.
+
+    Returns:
+        Their folders.
 
     Raises:
-        StoreError: As `record_clips`.
-        ConfigError: As `record_clips`.
+        StoreError: See `record_clips`.
+        ConfigError: See `record_clips`.
     """
     tasks: list[list[tuple[Clips, str, int, int, str]]] = []
-    for clips in recordings:
-        _check_other(clips)
+    for recording in recordings:
+        _check_other(recording)
         tasks.append(
             [
-                (clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}")
-                for town, count in clips.images
+                (recording, town, number, min(EACH, count - start), f"{recording.mode}-{town.lower()}-{number:03d}")
+                for town, count in recording.images
                 for number, start in enumerate(range(0, count, EACH))
             ]
         )
-    every = [task for own in tasks for task in own]
-    with ExitStack() as held:
-        for clips in recordings:
-            held.enter_context(locked(clips.out, "ssad record"))
-            check_parts(clips.out, clips.identity())
-        pool = open_pool(len(every), workers=workers, ray=ray, device=recordings[0].device)
-        run_all(pool, _part, every, timeout_s=PART_S, progress=progress)
-        for clips, own in zip(recordings, tasks, strict=True):
-            _write_pages(clips, own)
-    return [clips.out for clips in recordings]
+    all_tasks = [task for recording_tasks in tasks for task in recording_tasks]
+    with ExitStack() as locks:
+        for recording in recordings:
+            locks.enter_context(locked(recording.out, "ssad record"))
+            check_parts(recording.out, recording.identity())
+        pool = open_pool(len(all_tasks), workers=workers, ray=ray, device=recordings[0].device)
+        run_all(pool, _part, all_tasks, timeout_s=PART_S, progress=progress)
+        for recording, recording_tasks in zip(recordings, tasks, strict=True):
+            _write_pages(recording, recording_tasks)
+    return [recording.out for recording in recordings]
 
 
 def _check_other(clips: Clips) -> None:
@@ -417,28 +446,28 @@ def _check_other(clips: Clips) -> None:
 def _write_pages(clips: Clips, tasks: Sequence[tuple[Clips, str, int, int, str]]) -> None:
     """annotations/{train,test,all}.json of parts that are all there."""
     splits = {
-        "train": [t for t in tasks if t[1] not in clips.held_out],
-        "test": [t for t in tasks if t[1] in clips.held_out],
+        "train": [entry_task for entry_task in tasks if entry_task[1] not in clips.held_out],
+        "test": [entry_task for entry_task in tasks if entry_task[1] in clips.held_out],
         "all": tasks,
     }
-    for split, members in splits.items():
+    for split, split_tasks in splits.items():
         rows: list[dict[str, Any]] = []
-        skipped: Counter[str] = Counter()
-        for task in members:
-            part = safeio.read_json(clips.out / ".parts" / task[4] / "part.json")
-            rows += part["images"]
-            skipped.update(part["skipped"])
-        counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
-        about = {
+        reject_counts: Counter[str] = Counter()
+        for task in split_tasks:
+            part_page = safeio.read_json(clips.out / ".parts" / task[4] / "part.json")
+            rows += part_page["images"]
+            reject_counts.update(part_page["skipped"])
+        counts = Counter(CLASSES[entry["label"]] for row in rows for entry in row["objects"] if not entry["crowd"])
+        split_info = {
             "recording": clips.identity(),
             "split": split,
-            "towns": sorted({t[1] for t in members}),
+            "towns": sorted({entry_task[1] for entry_task in split_tasks}),
             "images": len(rows),
             "objects": counts,
             "weathers": Counter(row["weather"] for row in rows),
-            "skipped": skipped,
+            "skipped": reject_counts,
         }
-        page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
+        page = safeio.dump_json(coco_data(CLASSES, rows, split_info)) + "\n"
         safeio.write_atomic(clips.out / "annotations" / f"{split}.json", page)
 
 
@@ -463,29 +492,33 @@ class ClipView:
 
     def wearing(self, *shown: Layer | Decal) -> View:
         """The view with layers on the target, and with decals, given in the target's frame, around it."""
-        target, *others = self.view.things
-        layers = tuple(one for one in shown if isinstance(one, Layer))
-        decals = tuple(replace(one, pose=target.pose @ one.pose) for one in shown if isinstance(one, Decal))
-        dressed = replace(target, layers=layers)
-        return replace(self.view, things=(dressed, *others), decals=(*self.view.decals, *decals))
+        target, *other_objects = self.view.things
+        layers = tuple(layer for layer in shown if isinstance(layer, Layer))
+        decals = tuple(replace(layer, pose=target.pose @ layer.pose) for layer in shown if isinstance(layer, Decal))
+        textured_target = replace(target, layers=layers)
+        return replace(self.view, things=(textured_target, *other_objects), decals=(*self.view.decals, *decals))
 
 
 Row = Mapping[str, Any]
 
 
 def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ...]]]:
-    """Each picture of a recording, as its annotation file has it, with what is annotated in it; in order.
+    """Return the images of a recording in order, each with its annotations.
+
+    Args:
+        folder: Folder of the recording.
+        split: train, test or all.
 
     Raises:
-        FormatError: No recording.
+        FormatError: The folder holds no recording.
     """
     path = folder / "annotations" / f"{split}.json"
     data = safeio.read_json(path, limit=1 << 30)
     try:
-        own: dict[int, list[Row]] = {row["id"]: [] for row in data["images"]}
-        for one in data["annotations"]:
-            own[one["image_id"]].append(one)
-        return [(row, tuple(own[row["id"]])) for row in data["images"]]
+        by_image: dict[int, list[Row]] = {row["id"]: [] for row in data["images"]}
+        for annotation in data["annotations"]:
+            by_image[annotation["image_id"]].append(annotation)
+        return [(row, tuple(by_image[row["id"]])) for row in data["images"]]
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
 
@@ -530,39 +563,45 @@ def clip_views(
     path = folder / "annotations" / f"{split}.json"
     rows = clip_rows(folder, split)
     try:
-        clips = _clips_of(recording_of(folder, split), folder, device)
-        sets: dict[tuple[object, ...], _Set] = {} if stages is None else stages
+        recording = _clips_of(recording_of(folder, split), folder, device)
+        prepared_drives: dict[tuple[object, ...], _Set] = {} if stages is None else stages
         for row, objects in rows:
             if only is not None and row["file_name"] not in only:
                 continue
-            key = (clips.seed, clips.mode, row["town"], row["part"], row["attempt"])
-            if key not in sets:
+            key = (recording.seed, recording.mode, row["town"], row["part"], row["attempt"])
+            if key not in prepared_drives:
                 if stages is None:  # one part at a time: its pictures may come from several drives
-                    sets = {known: kept for known, kept in sets.items() if known[:-1] == key[:-1]}
-                sets[key] = _prepare(clips, row["town"], key)
-            made = sets[key]
-            target = np.array(row["target_pose"])
-            weather = hour(Weather(**row["light"]), float(np.arctan2(target[1, 0], target[0, 0])))
-            shot = Viewpoint(row["time"], np.array(row["pose"]), target, weather, {})
-            around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
-            view = _view(made, row["slot"], shot, around, _camera(clips.size))
-            yield ClipView(row["file_name"], row, made.stage, view, objects)
+                    prepared_drives = {
+                        other_key: other_drive
+                        for other_key, other_drive in prepared_drives.items()
+                        if other_key[:-1] == key[:-1]
+                    }
+                prepared_drives[key] = _prepare(recording, row["town"], key)
+            prepared = prepared_drives[key]
+            target_pose = np.array(row["target_pose"])
+            weather = hour(Weather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
+            viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
+            surrounding = prepared.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+            view = _view(prepared, row["slot"], viewpoint, surrounding, _camera(recording.size))
+            yield ClipView(row["file_name"], row, prepared.stage, view, objects)
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
 
 
 def _unknown(path: Path, error: Exception) -> FormatError:
-    why = f"({type(error).__name__}: {error})"
-    return FormatError(f"{path}: not the clips of this version {why}; record them again")
+    cause = f"({type(error).__name__}: {error})"
+    return FormatError(f"{path}: not the clips of this version {cause}; record them again")
 
 
 def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:
     """The recording that `Clips.identity` describes."""
-    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items() if k != "clips"}
-    given["images"] = tuple((town, count) for town, count in about["images"])
+    settings: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in about.items() if name != "clips"
+    }
+    settings["images"] = tuple((town, count) for town, count in about["images"])
     if about["target"] is not None:
         size = about["target"]["size"]
-        about_it = {k: v for k, v in about["target"].items() if k != "kind"}
-        make: Any = STANDING[about["target"]["kind"]] if "kind" in about["target"] else TargetCar
-        given["target"] = make(**about_it | {"size": None if size is None else tuple(size)})
-    return Clips(folder, **given | {"mode": about["clips"], "device": device})
+        target_settings = {name: value for name, value in about["target"].items() if name != "kind"}
+        target_class: Any = STANDING[about["target"]["kind"]] if "kind" in about["target"] else TargetCar
+        settings["target"] = target_class(**target_settings | {"size": None if size is None else tuple(size)})
+    return Clips(folder, **settings | {"mode": about["clips"], "device": device})

@@ -1,4 +1,4 @@
-"""What `ssad record --clips` records: towns, target, camera, and what cannot be."""
+"""Settings of `ssad record --clips`: towns, target, camera, and the checks of their values."""
 
 from __future__ import annotations
 
@@ -27,14 +27,26 @@ SMALL: Final = 8.0  # px of a side of a target
 
 @dataclass(frozen=True, slots=True)
 class Clips:
-    """What to record.
+    """Settings of a recording of target images.
 
-    images: town -> how many pictures; mode; size: pixels a side; target: the car (None: another one in each part), or
-    the stop sign that an orbit shows; behind, height: m of the following camera; distances (m), azimuths, elevations
-    (degrees) of an orbit, those of the target where none are given (round a sign: one elevation, 0, which stands for
-    the heights of cameras of cars); weathers: of an orbit, a further factor of its cells (none: drawn as they come);
-    quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`.
-    ConfigError for what cannot be.
+    Attributes:
+        out: Folder of the recording.
+        images: Town and number of its images.
+        held_out: Towns of the test split.
+        mode: "drive" follows the driving target; "orbit" shows it from all around.
+        size: Side of the square images, px.
+        target: Car, stop sign or walker to show; None: another car in each part.
+        behind, height: Place of the following camera, m.
+        distances, azimuths, elevations: Grid of an orbit, m and degrees. Empty azimuths or elevations take the
+            defaults of the target. A sign has one elevation, 0, which stands for the heights of cameras of cars.
+        seed: Root of the random numbers.
+        quality: Quality of JPEG files.
+        device: Device that renders.
+        streets: See `drive_street`.
+        weathers: Further axis of the grid of an orbit; empty: drawn as for drives.
+
+    Raises:
+        ConfigError: A value is out of range, or the values do not fit together.
     """
 
     out: Path
@@ -55,7 +67,7 @@ class Clips:
     weathers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for town in (*(t for t, _ in self.images), *self.held_out):
+        for town in (*(name for name, _ in self.images), *self.held_out):
             if not is_town(town):
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
         check_streets(self.streets)
@@ -64,20 +76,23 @@ class Clips:
         for town, count in self.images:
             if count < 1:
                 raise ConfigError(f"{town}: {count} pictures; ask for one or more")
-            if sum(t == town for t, _ in self.images) > 1:
+            if sum(name == town for name, _ in self.images) > 1:
                 raise ConfigError(f"{town} is named twice; name each town once")
         if not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0 or not 1 <= self.quality <= 100:
             raise ConfigError("behind: 3 to 60 m; height: 0.5 to 30 m; quality: 1 to 100")
-        sign = isinstance(self.target, TargetSign)
-        object.__setattr__(self, "azimuths", self.azimuths or (SIGN_AZIMUTHS if sign else AZIMUTHS))
-        walker = isinstance(self.target, TargetWalker)
-        object.__setattr__(self, "elevations", self.elevations or ((0.0,) if sign or walker else ELEVATIONS))
-        if (sign or walker) and self.mode != "orbit":
-            who = "stop sign stands still" if sign else "walker is not followed"
-            raise ConfigError(f"a {who}: record it with --clips orbit")
+        is_sign = isinstance(self.target, TargetSign)
+        # The dataclass is frozen, so defaults that depend on the target are set past it.
+        object.__setattr__(self, "azimuths", self.azimuths or (SIGN_AZIMUTHS if is_sign else AZIMUTHS))
+        is_walker = isinstance(self.target, TargetWalker)
+        object.__setattr__(self, "elevations", self.elevations or ((0.0,) if is_sign or is_walker else ELEVATIONS))
+        if (is_sign or is_walker) and self.mode != "orbit":
+            complaint = "stop sign stands still" if is_sign else "walker is not followed"
+            raise ConfigError(f"a {complaint}: record it with --clips orbit")
         if not self.distances:
             raise ConfigError("an orbit needs distances")
-        if not all(3.0 <= d <= 80.0 for d in self.distances) or not all(0.0 <= e <= 75.0 for e in self.elevations):
+        if not all(3.0 <= distance <= 80.0 for distance in self.distances) or not all(
+            0.0 <= elevation <= 75.0 for elevation in self.elevations
+        ):
             raise ConfigError("distances: 3 to 80 m; elevations: 0 to 75 degrees")
         for weather in self.weathers:
             if weather not in WEATHERS:
@@ -86,27 +101,41 @@ class Clips:
             raise ConfigError("weathers are those of an orbit; a drive has its own")
         if not np.isfinite(self.azimuths).all():
             raise ConfigError("azimuths: finite numbers of degrees")
-        if sign and (np.cos(np.radians(self.azimuths)) < np.cos(np.radians(BEHIND))).any():
+        if is_sign and (np.cos(np.radians(self.azimuths)) < np.cos(np.radians(BEHIND))).any():
             raise ConfigError(f"azimuths of a sign: less than {BEHIND:g} degrees to either side of its front")
-        if sign and self.elevations != (0.0,):
+        if is_sign and self.elevations != (0.0,):
             raise ConfigError("a sign is seen from the heights of cars: give no elevations")
-        far = self.behind if self.mode == "drive" else max(self.distances)
-        what = "sign" if sign else "walker" if walker else "car"
-        if not FOCAL * self.size * TALL[what] / far >= SMALL or self.size > 4096:
-            least = int(np.ceil(SMALL * far / FOCAL / TALL[what]))
+        max_distance = self.behind if self.mode == "drive" else max(self.distances)
+        target_kind = "sign" if is_sign else "walker" if is_walker else "car"
+        # The smallest side of the farthest target must still span MIN_BOX_SIDE pixels.
+        if not FOCAL * self.size * TALL[target_kind] / max_distance >= SMALL or self.size > 4096:
+            min_size = int(np.ceil(SMALL * max_distance / FOCAL / TALL[target_kind]))
             raise ConfigError(
-                f"pictures of {self.size} pixels: a {what} {far:g} m away needs {least}, and 4096 is the most"
+                f"pictures of {self.size} pixels: a {target_kind} {max_distance:g} m away needs "
+                f"{min_size}, and 4096 is the most"
             )
 
     def identity(self) -> dict[str, Any]:
-        """What decides the bytes."""
-        found = asdict(replace(self, out=Path())) | {"clips": self.mode, "images": [list(pair) for pair in self.images]}
-        skipped = {"out", "mode"} | ({"weathers"} if not self.weathers else set())
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if k not in skipped}
+        """Return the settings that decide the bytes of the recording, as plain data."""
+        settings = asdict(replace(self, out=Path())) | {
+            "clips": self.mode,
+            "images": [list(pair) for pair in self.images],
+        }
+        # An empty value is left out, so that recordings without weathers keep their identity.
+        excluded = {"out", "mode"} | ({"weathers"} if not self.weathers else set())
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in settings.items()
+            if name not in excluded
+        }
 
 
 def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str, int], ...]:
-    """Towns with their numbers of pictures; one number stands for all. ConfigError."""
+    """Pair towns with their numbers of images; a single number applies to all towns.
+
+    Raises:
+        ConfigError: The numbers are not whole, or do not match the towns.
+    """
     try:
         counts = [int(text) for text in images]
     except ValueError:

@@ -1,6 +1,6 @@
-"""Where a camera stands that looks at a target car, and whether anything but air lies between the two.
+"""Camera poses that look at a target, and tests for a free line of sight between the two.
 
-It follows 20 m behind on the target's own way, or stands anywhere around it.
+The camera follows 20 m behind on the target's own route, or stands anywhere around it.
 """
 
 from __future__ import annotations
@@ -33,14 +33,15 @@ Place = tuple[float, float, float, float, float]  # x, y, yaw, z, height of what
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """One picture to take.
+    """One image to take.
 
     Attributes:
-        time: s.
+        time: Time in the drive, s.
         camera: Pose [4, 4], x right, y down, z forward.
         target: Pose [4, 4].
         weather: Weather and hour.
-        about: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation, degrees.
+        annotation: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation,
+            degrees.
     """
 
     time: float
@@ -51,9 +52,9 @@ class Viewpoint:
 
 
 def look_at(eye: F64, point: F64) -> F64:
-    """Pose [4, 4] of an upright camera at `eye` that looks at `point`, which is not straight above or below.
+    """Return the pose [4, 4] of an upright camera at `eye` that looks at `point`.
 
-    Its axes are x right, y down, z forward.
+    The point must not be straight above or below. The axes of the pose are x right, y down, z forward.
     """
     z = (point - eye) / np.linalg.norm(point - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
@@ -65,18 +66,18 @@ def look_at(eye: F64, point: F64) -> F64:
 
 
 def polar(eye: F64, target: F64) -> dict[str, float]:
-    """Distance, azimuth and elevation of an eye [3] about the middle of a target of pose [4, 4]."""
-    ahead, left, up = target[:3, :3].T @ (eye - target[:3, 3] - [0.0, 0.0, AIM])
-    flat = float(np.hypot(ahead, left))
+    """Return distance, azimuth and elevation of an eye [3] about the middle of a target of pose [4, 4]."""
+    forward, left, height = target[:3, :3].T @ (eye - target[:3, 3] - [0.0, 0.0, AIM])
+    ground_distance = float(np.hypot(forward, left))
     return {
-        "distance": round(float(np.hypot(flat, up)), 2),
-        "azimuth": round(float(np.degrees(np.arctan2(left, ahead))) % 360.0, 1),
-        "elevation": round(float(np.degrees(np.arctan2(up, flat))), 1),
+        "distance": round(float(np.hypot(ground_distance, height)), 2),
+        "azimuth": round(float(np.degrees(np.arctan2(left, forward))) % 360.0, 1),
+        "elevation": round(float(np.degrees(np.arctan2(height, ground_distance))), 1),
     }
 
 
 def weather_name(weather: Weather) -> str:
-    """What a drawn weather is called."""
+    """Return the name of a drawn weather."""
     if weather.sun_height < 0.0:
         return "night"
     if weather.fog > 0.0 or weather.wet > 0.0:
@@ -96,20 +97,20 @@ def follow(
     """
     driven = trace.driven.astype(np.float64)
     steps: list[int] = []
-    for t in np.flatnonzero((driven > behind + 0.5) & (trace.speed[:, 0] > SLOW)).tolist():
-        if not steps or driven[t] - driven[steps[-1]] >= MOVED:
-            steps.append(t)
-    spread = np.unique(np.linspace(0, len(steps) - 1, count).round().astype(int)) if steps else np.zeros(0, int)
-    rest = draws.permutation(np.setdiff1d(np.arange(len(steps)), spread))
-    found = []
-    for t in np.array(steps, int)[np.concatenate([spread, rest]).astype(int)].tolist():
-        before = float(np.interp(driven[t] - behind, driven[: t + 1], np.arange(t + 1)))
-        target = ego_at(trace, t * trace.dt)
-        eye = ego_at(trace, before * trace.dt)[:3, 3] + [0.0, 0.0, height]
-        pose = look_at(eye, target[:3, 3] + [0.0, 0.0, AIM])
-        about = polar(eye, target) | {"way": round(float(driven[t]), 2)}
-        found.append(Viewpoint(t * trace.dt, pose, target, weather, about))
-    return found
+    for step in np.flatnonzero((driven > behind + 0.5) & (trace.speed[:, 0] > SLOW)).tolist():
+        if not steps or driven[step] - driven[steps[-1]] >= MOVED:
+            steps.append(step)
+    spread_indices = np.unique(np.linspace(0, len(steps) - 1, count).round().astype(int)) if steps else np.zeros(0, int)
+    other_indices = draws.permutation(np.setdiff1d(np.arange(len(steps)), spread_indices))
+    viewpoints = []
+    for step in np.array(steps, int)[np.concatenate([spread_indices, other_indices]).astype(int)].tolist():
+        camera_step = float(np.interp(driven[step] - behind, driven[: step + 1], np.arange(step + 1)))
+        target = ego_at(trace, step * trace.dt)
+        eye = ego_at(trace, camera_step * trace.dt)[:3, 3] + [0.0, 0.0, height]
+        camera_pose = look_at(eye, target[:3, 3] + [0.0, 0.0, AIM])
+        annotation = polar(eye, target) | {"way": round(float(driven[step]), 2)}
+        viewpoints.append(Viewpoint(step * trace.dt, camera_pose, target, weather, annotation))
+    return viewpoints
 
 
 def orbit(
@@ -120,17 +121,19 @@ def orbit(
     The camera is nowhere lower than `EYE`; the target is not quite in the middle of the picture.
     """
     distance, azimuth, elevation = cell
-    turn = np.radians(azimuth)
-    up = max(distance * float(np.sin(np.radians(elevation))), EYE - AIM)
-    flat = float(np.sqrt(max(distance**2 - up**2, 0.01)))
-    about = {"distance": distance, "azimuth": azimuth, "elevation": elevation}
+    azimuth_rad = np.radians(azimuth)
+    height = max(distance * float(np.sin(np.radians(elevation))), EYE - AIM)
+    ground_distance = float(np.sqrt(max(distance**2 - height**2, 0.01)))
+    annotation = {"distance": distance, "azimuth": azimuth, "elevation": elevation}
     while True:
         time = float(draws.uniform(0.5, (len(trace.x) - 2) * trace.dt))
         target = ego_at(trace, time)
         middle = target[:3, 3] + [0.0, 0.0, AIM]
-        eye = middle + target[:3, :3] @ np.array([flat * np.cos(turn), flat * np.sin(turn), up])
-        aim = middle + draws.normal(0, 0.04 * distance, 3).clip(-0.08 * distance, 0.08 * distance) * [1, 1, 0.4]
-        yield Viewpoint(time, look_at(eye, aim), target, weather, about)
+        eye = middle + target[:3, :3] @ np.array(
+            [ground_distance * np.cos(azimuth_rad), ground_distance * np.sin(azimuth_rad), height]
+        )
+        aim_point = middle + draws.normal(0, 0.04 * distance, 3).clip(-0.08 * distance, 0.08 * distance) * [1, 1, 0.4]
+        yield Viewpoint(time, look_at(eye, aim_point), target, weather, annotation)
 
 
 def orbit_sign(
@@ -151,40 +154,48 @@ def orbit_sign(
     distance, azimuth = cell
     while True:
         time = float(draws.uniform(0.5, seconds - 0.5))
-        x, y, yaw, z, tall = places[int(draws.integers(len(places)))]
+        x, y, yaw, z, plate_height = places[int(draws.integers(len(places)))]
         target = upright_pose(x, y, yaw, z)
         height = float(draws.uniform(*CAR_EYE))
-        aside = draws.normal(0, 0.1 * distance, 3).clip(-0.2 * distance, 0.2 * distance) * [1, 1, 0.5]
-        middle = target[:3, 3] + [0.0, 0.0, tall]
-        up = height - middle[2]
-        flat = float(np.sqrt(distance**2 - up**2))
-        turn = yaw + np.radians(azimuth)
-        eye = middle + np.array([flat * np.cos(turn), flat * np.sin(turn), up])
-        about = {
+        aim_offset = draws.normal(0, 0.1 * distance, 3).clip(-0.2 * distance, 0.2 * distance) * [1, 1, 0.5]
+        middle = target[:3, 3] + [0.0, 0.0, plate_height]
+        height_difference = height - middle[2]
+        ground_distance = float(np.sqrt(distance**2 - height_difference**2))
+        direction = yaw + np.radians(azimuth)
+        eye = middle + np.array(
+            [ground_distance * np.cos(direction), ground_distance * np.sin(direction), height_difference]
+        )
+        annotation = {
             "distance": distance,
             "azimuth": azimuth % 360.0,
-            "elevation": round(float(np.degrees(np.arctan2(up, flat))), 1),
+            "elevation": round(float(np.degrees(np.arctan2(height_difference, ground_distance))), 1),
         }
-        yield Viewpoint(time, look_at(eye, middle + aside), target, weather, about)
+        yield Viewpoint(time, look_at(eye, middle + aim_offset), target, weather, annotation)
 
 
 def turn_of(numbers: range, count: int, *, key: tuple[object, ...]) -> list[int]:
-    """Which of `count` cells pictures show, by number: each cell once, in random order, before any comes again."""
-    orders = [generator("clips cells", *key, turn).permutation(count) for turn in range(numbers.stop // count + 1)]
-    return [int(orders[n // count][n % count]) for n in numbers]
+    """Return the cell of each image by number: all `count` cells in random order before any is repeated."""
+    permutations = [
+        generator("clips cells", *key, round_index).permutation(count)
+        for round_index in range(numbers.stop // count + 1)
+    ]
+    # It depends on the numbers of the images alone, so that parts can be recorded in any order.
+    return [int(permutations[number // count][number % count]) for number in numbers]
 
 
 def has_room(target: ObjectBody, shot: Viewpoint, around: Sequence[PlacedObject]) -> bool:
     """Whether nobody stands in the target or where the camera is."""
-    eye = shot.camera[:3, 3]
+    camera_position = shot.camera[:3, 3]
     if not around:
         return True
-    yaw = [np.arctan2(pose[1, 0], pose[0, 0]) for pose in (shot.target, *(s.pose for s in around))]
-    boxes = np.array([(*s.pose[:2, 3], turn, *s.body.size[:2]) for s, turn in zip(around, yaw[1:], strict=True)])
-    own = np.array([*shot.target[:2, 3], yaw[0], *target.size[:2]])
-    low = np.array([s.pose[2, 3] + s.body.size[2] + 0.3 > eye[2] for s in around])
-    beside = obb_distance(np.array([eye[0], eye[1], 0.0, 0.1, 0.1]), boxes)
-    return bool((obb_distance(own, boxes) > 0.1).all() and (beside[low] > 0.6).all())
+    yaws = [np.arctan2(pose[1, 0], pose[0, 0]) for pose in (shot.target, *(placed.pose for placed in around))]
+    boxes = np.array(
+        [(*placed.pose[:2, 3], turn, *placed.body.size[:2]) for placed, turn in zip(around, yaws[1:], strict=True)]
+    )
+    target_box = np.array([*shot.target[:2, 3], yaws[0], *target.size[:2]])
+    is_tall = np.array([placed.pose[2, 3] + placed.body.size[2] + 0.3 > camera_position[2] for placed in around])
+    camera_distance = obb_distance(np.array([camera_position[0], camera_position[1], 0.0, 0.1, 0.1]), boxes)
+    return bool((obb_distance(target_box, boxes) > 0.1).all() and (camera_distance[is_tall] > 0.6).all())
 
 
 def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int, height: float = 2 * AIM) -> Bool:
@@ -193,17 +204,21 @@ def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int, height
     A camera inside a house sees out of it, for walls have one side; who looks at it from outside sees the wall.
     """
     camera = Camera(PROBE, PROBE, np.array([[200.0, 0, PROBE / 2], [0, 200.0, PROBE / 2], [0, 0, 1]]))
-    free = []
-    for k in range(0, len(shots), at_once):
-        views, away = [], []
-        for shot in shots[k : k + at_once]:
-            start, eye = shot.target[:3, 3] + [0.0, 0.0, height], shot.camera[:3, 3]
-            away.append(float(np.linalg.norm(eye - start)))
-            # thick air: what lies far beyond the camera need not be drawn
-            views.append(View(camera, look_at(start, eye), (), Weather(fog=6.0 / (away[-1] + 20.0))))
-        depth = render(stage, views, scale=1, quality=PLAIN, linear=False).depth
-        free += [bool((d >= a + 0.3).all()) for d, a in zip(depth, away, strict=True)]
-    return np.array(free, bool)
+    is_free = []
+    for batch_start in range(0, len(shots), at_once):
+        views, distances = [], []
+        for viewpoint in shots[batch_start : batch_start + at_once]:
+            target_point, camera_position = viewpoint.target[:3, 3] + [0.0, 0.0, height], viewpoint.camera[:3, 3]
+            distances.append(float(np.linalg.norm(camera_position - target_point)))
+            # thick air: objects far beyond the camera need not be drawn
+            views.append(
+                View(camera, look_at(target_point, camera_position), (), Weather(fog=6.0 / (distances[-1] + 20.0)))
+            )
+        depth_maps = render(stage, views, scale=1, quality=PLAIN, linear=False).depth
+        is_free += [
+            bool((depth_map >= distance + 0.3).all()) for depth_map, distance in zip(depth_maps, distances, strict=True)
+        ]
+    return np.array(is_free, bool)
 
 
 def near_share(view: View, depth: F32, tag: I32, *, within: float) -> float:
@@ -211,13 +226,16 @@ def near_share(view: View, depth: F32, tag: I32, *, within: float) -> float:
 
     Within so many m of it, and without the ground: from half a metre above the road.
     """
+    # Every fourth pixel in both directions is enough for a share.
     rows, columns = slice(2, None, 4), slice(2, None, 4)
-    near = (tag[rows, columns] == 0) & (depth[rows, columns] < within)
-    if not near.any():
+    is_near = (tag[rows, columns] == 0) & (depth[rows, columns] < within)
+    if not is_near.any():
         return 0.0
-    k = view.camera.intrinsic
+    intrinsic = view.camera.intrinsic
     y, x = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]] + 0.5
-    ray = np.stack([(x - k[0, 2]) / k[0, 0], (y - k[1, 2]) / k[1, 1], np.ones_like(x)], -1)[rows, columns]
-    away = np.where(near, depth[rows, columns], 0.0)
-    height = (ray @ view.pose[2, :3]) * away + view.pose[2, 3]
-    return float((near & (height > 0.5)).mean())
+    ray = np.stack(
+        [(x - intrinsic[0, 2]) / intrinsic[0, 0], (y - intrinsic[1, 2]) / intrinsic[1, 1], np.ones_like(x)], -1
+    )[rows, columns]
+    ray_length = np.where(is_near, depth[rows, columns], 0.0)
+    height = (ray @ view.pose[2, :3]) * ray_length + view.pose[2, 3]
+    return float((is_near & (height > 0.5)).mean())

@@ -1,4 +1,4 @@
-"""A physical attack in the closed loop, on an agent or on stop signs: what they wear and what shines on them."""
+"""A physical attack in the closed loop, on an agent or on stop signs: their textures and the light on them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FIRST_SIGN: Final = 1 << 16  # tag of a town's sign 0: no scene has so many agen
 
 @dataclass(frozen=True)
 class LiveAttack:
-    """An attack on an agent or on all stop signs, for `ssad.rendering.onboard.Onboard`.
+    """Edit of an agent or of all stop signs, for `ssad.recording.loop_sensors.Onboard`.
 
     Attributes:
-        edit: What changes around a target, given its body.
-        target: What the attack is made for: a car or a walker plays the agent, in the size that the agent has in the
-            world, a walker without moving its legs; a sign stands in place of every stop sign.
-        agent: Who is attacked; 0 is the ego. Of no account where the target is a sign.
+        edit: Returns the edit of a scene around a target, given its body.
+        target: Target that the attack is made for: a car or a walker plays the agent, in the size that the agent
+            has in the world, a walker without moving its legs; a sign replaces every stop sign.
+        agent: Number of the attacked agent; 0 is the ego. Ignored if the target is a sign.
     """
 
     edit: Callable[[Mesh], SceneEdit]
@@ -36,7 +36,7 @@ class LiveAttack:
 
     @property
     def kind(self) -> AgentKind:
-        """Of the agents that the target can play; of no account where it is a sign."""
+        """Kind of the agents that the target can play; ignored if it is a sign."""
         return AgentKind.WALKER if isinstance(self.target, TargetWalker) else AgentKind.CAR
 
     @cached_property
@@ -44,7 +44,7 @@ class LiveAttack:
         return {}
 
     def body(self, model: str) -> tuple[Mesh, SceneEdit]:
-        """The body that plays an agent of a model, or a sign, and the edit for it; made once.
+        """Return the body that plays an agent of a model, or a sign, and the edit for it; built once.
 
         Raises:
             ConfigError: The target cannot play an agent of this model, or the attack does not fit on it.
@@ -53,13 +53,13 @@ class LiveAttack:
             if isinstance(self.target, TargetSign):
                 mesh = self.target.mesh()
             else:
-                one = MODELS[model]
-                if one.kind != self.kind:
+                model_entry = MODELS[model]
+                if model_entry.kind != self.kind:
                     raise ConfigError(
                         f"agent {self.agent} is a {model}; the attack is made for a {self.kind.name.lower()}: name "
                         "another agent"
                     )
-                mesh = replace(self.target, size=(one.length, one.width, one.height)).mesh()
+                mesh = replace(self.target, size=(model_entry.length, model_entry.width, model_entry.height)).mesh()
             self._bodies[model] = mesh, self.edit(mesh)
         return self._bodies[model]
 
@@ -72,10 +72,12 @@ class LiveAttack:
         return models[self.agent]
 
     def meshes(self, model: str) -> dict[Any, Mesh]:
-        """What the scene must hold, by names of their own."""
+        """Return the meshes that the scene must hold, by their own names: the body first, then the cards."""
         mesh, edit = self.body(model)
-        found: dict[Any, Mesh] = {("attacked", self.target, model): mesh}
-        return found | {("attacked card", self.target, model, k): card for k, card in enumerate(edit.meshes())}
+        named_meshes: dict[Any, Mesh] = {("attacked", self.target, model): mesh}
+        return named_meshes | {
+            ("attacked card", self.target, model, index): card for index, card in enumerate(edit.meshes())
+        }
 
     def dressed(self, things: tuple[Thing, ...], mesh: int, signs: Iterable[int] = ()) -> tuple[Thing, ...]:
         """The things of a view with the target's body in place of what is attacked.
@@ -87,17 +89,21 @@ class LiveAttack:
         """
         if isinstance(self.target, TargetSign):
             return tuple(
-                replace(one, mesh=mesh, paint=self.target.colour, tag=FIRST_SIGN + one.mesh)
-                if one.tag == 0 and one.mesh in signs
-                else one
-                for one in things
+                # Signs have the tag 0 of the street; an edit needs a tag of its own for each of them.
+                replace(scene_object, mesh=mesh, paint=self.target.colour, tag=FIRST_SIGN + scene_object.mesh)
+                if scene_object.tag == 0 and scene_object.mesh in signs
+                else scene_object
+                for scene_object in things
             )
         return tuple(
-            replace(one, mesh=mesh, paint=self.target.colour) if one.tag == self.agent + 1 else one for one in things
+            replace(scene_object, mesh=mesh, paint=self.target.colour)
+            if scene_object.tag == self.agent + 1
+            else scene_object
+            for scene_object in things
         )
 
     def tags(self, things: Iterable[Thing]) -> list[int]:
         """Tags of what is attacked among the things of a view."""
         if isinstance(self.target, TargetSign):
-            return [one.tag for one in things if one.tag >= FIRST_SIGN]
+            return [scene_object.tag for scene_object in things if scene_object.tag >= FIRST_SIGN]
         return [self.agent + 1]

@@ -1,4 +1,4 @@
-"""Pictures of the camera for the report: who can be seen, in which weather, at which hour, and the six-camera rig."""
+"""Sheets of camera images for the report: classes, weathers, hours and the six-camera rig."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ WEATHERS = {
 
 
 def _floor() -> Mesh:
-    """Something to stand on."""
+    """Return a square of asphalt, 120 m a side, under the bodies."""
     vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 60.0
     ground = Material("asphalt", (0.16, 0.16, 0.165), gloss=0.1)
     return build(
@@ -45,81 +45,116 @@ def _floor() -> Mesh:
 
 
 def class_sheet(width: int = 240) -> U8:
-    """The ten classes, one row each kind of body."""
-    meshes, cells = [_floor()], []
+    """Render the ten classes, one row for each kind of body."""
+    meshes, captions = [_floor()], []
     for kind in BODY_CATEGORIES:
         for style in SHOWN.get(kind, tuple(BODIES[kind].styles)[:3]):
             meshes.append(make_body(kind, style=style, generator=generator("gallery", kind, style)))
-            cells.append((f"{class_of(kind)}: {style}".replace("_", " "), len(meshes) - 1))
-    stage = Scene(None, meshes)
+            captions.append((f"{class_of(kind)}: {style}".replace("_", " "), len(meshes) - 1))
+    scene = Scene(None, meshes)
     camera = Camera.typical(width * 2, width * 3 // 2)
     views = []
-    for number, (_, mesh) in enumerate(cells):
-        low, high = meshes[mesh].bounds()
-        away = 1.15 * float(np.linalg.norm(high - low)) + 0.6
+    for index, (_, mesh_index) in enumerate(captions):
+        lower, upper = meshes[mesh_index].bounds()
+        # The distance grows with the body, so that a cone and a bus fill their panels alike.
+        camera_distance = 1.15 * float(np.linalg.norm(upper - lower)) + 0.6
         yaw = np.radians(-145.0)
-        pose = upright_pose(np.cos(yaw + np.pi) * away, np.sin(yaw + np.pi) * away, yaw, 0.45 * away)
-        tilt = np.arctan2(0.45 * away - high[2] / 2, away)
-        turn = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
-        pose[:3, :3] = pose[:3, :3] @ FORWARD[:3, :3] @ turn
-        paint = draw_paint(generator("gallery paint", number))
-        views.append(
-            View(camera, pose, (Thing(0, np.eye(4)), Thing(mesh, np.eye(4), paint, 1)), Weather(0.8, -1.9, 0.4))
+        pose = upright_pose(
+            np.cos(yaw + np.pi) * camera_distance, np.sin(yaw + np.pi) * camera_distance, yaw, 0.45 * camera_distance
         )
-    picture = render(stage, views, scale=3)
-    panels = [captioned(image, text, width) for image, (text, _) in zip(picture.image, cells, strict=True)]
+        tilt = np.arctan2(0.45 * camera_distance - upper[2] / 2, camera_distance)
+        tilt_rotation = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
+        pose[:3, :3] = pose[:3, :3] @ FORWARD[:3, :3] @ tilt_rotation
+        paint = draw_paint(generator("gallery paint", index))
+        views.append(
+            View(camera, pose, (Thing(0, np.eye(4)), Thing(mesh_index, np.eye(4), paint, 1)), Weather(0.8, -1.9, 0.4))
+        )
+    rendering = render(scene, views, scale=3)
+    panels = [captioned(image, caption, width) for image, (caption, _) in zip(rendering.image, captions, strict=True)]
+    # White panels complete the last row of six.
     while len(panels) % 6:
         panels.append(np.full_like(panels[0], 255))
-    return np.vstack([np.hstack(panels[k : k + 6]) for k in range(0, len(panels), 6)])
+    return np.vstack([np.hstack(panels[start : start + 6]) for start in range(0, len(panels), 6)])
 
 
 def street_scene(town: str = "Twinford") -> tuple[Scene, F64, tuple[Thing, ...]]:
-    """A street with traffic: the stage, the pose of the ego, and what stands around it."""
+    """Build a street with traffic.
+
+    Returns:
+        The scene, the pose [4, 4] of the ego, and the objects around it.
+    """
     graph, street = load_town(town), cached_street(town)
     kinds = ("car", "car", "truck", "car", "motorcycle", "car", "bus", "bicycle", "car", "pedestrian")
-    meshes = [make_body(kind, generator=generator("gallery street", k)) for k, kind in enumerate(kinds)]
-    lanes = [k for k in range(len(graph.kind)) if graph.kind[k] == LaneType.DRIVING and graph.junction[k] < 0]
-    start = next(k for k in lanes if graph.s[graph.offset[k + 1] - 1] > 50)
-    first = int(graph.offset[start] + 8)
-    ego = upright_pose(float(graph.xy[first, 0]), float(graph.xy[first, 1]), float(graph.yaw[first]))
-    draws, things = generator("gallery street"), []
-    spots = [i for k in lanes for i in range(graph.offset[k] + 2, graph.offset[k + 1], 13)]
-    poses = [upright_pose(float(graph.xy[i, 0]), float(graph.xy[i, 1]), float(graph.yaw[i])) for i in spots]
-    poses += [upright_pose(float(q[0]), float(q[1]), float(q[2])) for q in street.parking]
-    for number, pose in enumerate(poses):
-        if 8 < np.hypot(*(pose[:2, 3] - ego[:2, 3])) < 110 and draws.random() < 0.7:
-            walker = number % len(kinds) == len(kinds) - 1
-            mesh = number % (len(kinds) - 1) if number < len(spots) else (0, 1, 3, 5)[number % 4]
-            aside = walker and number < len(spots)  # on the sidewalk
-            where = pose @ upright_pose(0.0, -4.2, 0.3) if aside else pose
-            things.append(Thing(len(kinds) - 1 if aside else mesh, where, draw_paint(draws), number + 1))
-    return Scene(street, meshes), ego, tuple(things)
+    meshes = [make_body(kind, generator=generator("gallery street", index)) for index, kind in enumerate(kinds)]
+    road_lanes = [
+        index for index in range(len(graph.kind)) if graph.kind[index] == LaneType.DRIVING and graph.junction[index] < 0
+    ]
+    # More than 50 m of lane leave room for traffic ahead of the ego.
+    start = next(index for index in road_lanes if graph.s[graph.offset[index + 1] - 1] > 50)
+    start_vertex = int(graph.offset[start] + 8)
+    ego = upright_pose(
+        float(graph.xy[start_vertex, 0]), float(graph.xy[start_vertex, 1]), float(graph.yaw[start_vertex])
+    )
+    rng, scene_objects = generator("gallery street"), []
+    lane_vertices = [
+        vertex for index in road_lanes for vertex in range(graph.offset[index] + 2, graph.offset[index + 1], 13)
+    ]
+    poses = [
+        upright_pose(float(graph.xy[vertex, 0]), float(graph.xy[vertex, 1]), float(graph.yaw[vertex]))
+        for vertex in lane_vertices
+    ]
+    poses += [
+        upright_pose(float(parking_place[0]), float(parking_place[1]), float(parking_place[2]))
+        for parking_place in street.parking
+    ]
+    for place_index, pose in enumerate(poses):
+        if 8 < np.hypot(*(pose[:2, 3] - ego[:2, 3])) < 110 and rng.random() < 0.7:
+            plays_walker = place_index % len(kinds) == len(kinds) - 1
+            mesh_index = (
+                place_index % (len(kinds) - 1) if place_index < len(lane_vertices) else (0, 1, 3, 5)[place_index % 4]
+            )
+            on_sidewalk = plays_walker and place_index < len(lane_vertices)  # on the sidewalk
+            placement = pose @ upright_pose(0.0, -4.2, 0.3) if on_sidewalk else pose
+            scene_objects.append(
+                Thing(len(kinds) - 1 if on_sidewalk else mesh_index, placement, draw_paint(rng), place_index + 1)
+            )
+    return Scene(street, meshes), ego, tuple(scene_objects)
 
 
 def weather_sheet(width: int = 480) -> U8:
-    """One street in six weathers and hours."""
-    stage, ego, things = street_scene()
+    """Render one street in six weathers and hours."""
+    scene, ego, scene_objects = street_scene()
     camera = rig_camera("CAM_FRONT", 960)
     views = [
-        View(camera, ego @ camera.to_ego, things, weather, lamps=own_lamps(ego, weather))
+        View(camera, ego @ camera.to_ego, scene_objects, weather, lamps=own_lamps(ego, weather))
         for weather in WEATHERS.values()
     ]
-    images = [render(stage, [view]).image[0] for view in views]
+    images = [render(scene, [view]).image[0] for view in views]
     panels = [captioned(image, name, width) for image, name in zip(images, WEATHERS, strict=True)]
-    return np.vstack([np.hstack(panels[k : k + 3]) for k in range(0, len(panels), 3)])
+    return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
 
 def rig_sheet(width: int = 480) -> U8:
-    """The six cameras of the nuScenes rig at one moment."""
-    stage, ego, things = street_scene("Crossgate")
+    """Render the six cameras of the nuScenes rig at one moment."""
+    scene, ego, scene_objects = street_scene("Crossgate")
     cameras = [rig_camera(channel, 960) for channel in RIG]
-    images = [render(stage, [View(c, ego @ c.to_ego, things, Weather(0.8, 2.2, 0.3))]).image[0] for c in cameras]
-    panels = [captioned(image, c.channel, width) for image, c in zip(images, cameras, strict=True)]
-    return np.vstack([np.hstack(panels[k : k + 3]) for k in range(0, len(panels), 3)])
+    images = [
+        render(scene, [View(camera, ego @ camera.to_ego, scene_objects, Weather(0.8, 2.2, 0.3))]).image[0]
+        for camera in cameras
+    ]
+    panels = [captioned(image, camera.channel, width) for image, camera in zip(images, cameras, strict=True)]
+    return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
 
 def write_gallery(folder: Path) -> dict[str, str]:
-    """Writes what is missing of the gallery; file name -> caption. StoreError."""
+    """Write the missing sheets of the gallery.
+
+    Returns:
+        Captions by file name.
+
+    Raises:
+        StoreError: A file cannot be written.
+    """
     quiet_warp()
     cv2.setNumThreads(1)
     sheets = {
@@ -127,7 +162,7 @@ def write_gallery(folder: Path) -> dict[str, str]:
         "camera-weather.jpg": ("One street in six weathers and hours.", weather_sheet),
         "camera-rig.jpg": ("The six cameras of the nuScenes rig at one moment.", rig_sheet),
     }
-    for name, (_, make) in sheets.items():
+    for name, (_, render_sheet) in sheets.items():
         if not (folder / name).is_file():
-            save_picture(folder / name, make())
+            save_picture(folder / name, render_sheet())
     return {name: caption for name, (caption, _) in sheets.items()}

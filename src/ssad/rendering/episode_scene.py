@@ -1,7 +1,7 @@
-"""How episodes of a town look: its street, signs and lit signals, and a body for each agent, wherever it is.
+"""Appearance of the episodes of a town: its street, signs and lit signals, and a body for each agent.
 
-What an agent carries in the loop and what is rendered from a trace afterwards come from here, so that both are the
-same to the bit. Nothing here depends on which other episodes share a scene.
+Sensors in the loop and images that are rendered from a trace afterwards both use it, so that they agree to the bit.
+The result does not depend on the other episodes that share a scene.
 """
 
 from __future__ import annotations
@@ -45,45 +45,47 @@ BodyKey = tuple[str, int, int]
 
 @lru_cache(maxsize=512)
 def body_of(model: str, variant: int, phase: int = 0) -> Mesh:
-    """The body that plays a model of the world, of its size.
+    """Return the body that plays a model of the world, in the size of the model.
 
     Args:
         model: Name of the model.
-        variant: Which body of that model.
-        phase: Place in the walking cycle or of the pedals, 0 to 7; others have one only.
+        variant: Number of the body among those of the model.
+        phase: Place in the walking cycle or of the pedals, 0 to 7; other bodies have one phase only.
 
     Raises:
-        KeyError: There is no such model.
+        KeyError: Unknown model.
     """
     size = MODELS[model].length, MODELS[model].width, MODELS[model].height
     if model not in ACTOR_BODIES:
         return plain_body(size)
-    kind, styles = ACTOR_BODIES[model]
+    body_kind, styles = ACTOR_BODIES[model]
     style = styles[int(generator("body style", model, variant).integers(len(styles)))]
-    turn = 2 * np.pi * phase / PHASES if kind in CYCLED else None
-    return make_body(kind, style=style, size=size, generator=generator("body", model, variant), detail=1, phase=turn)
+    cycle_phase = 2 * np.pi * phase / PHASES if body_kind in CYCLED else None
+    return make_body(
+        body_kind, style=style, size=size, generator=generator("body", model, variant), detail=1, phase=cycle_phase
+    )
 
 
 @lru_cache(maxsize=3)
 def _lens(state: SignalState) -> Mesh:
-    """A lit lens that faces along x."""
-    turn = np.arange(10) * (2 * np.pi / 10)
-    outline = LENS * np.stack([np.cos(turn), np.sin(turn)], -1)
+    """Return a lit lens that faces along x."""
+    angles = np.arange(10) * (2 * np.pi / 10)
+    outline = LENS * np.stack([np.cos(angles), np.sin(angles)], -1)
     return prism(outline, (0.0, 0.01), material=Material("signal_light", LIGHTS[state], emission=BRIGHT), axis=0)
 
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """What of an episode's looks is the same at all its steps.
+    """Time-invariant appearance of an episode.
 
     Attributes:
-        key: The episode's.
-        models: Of each agent.
-        variants: Which body plays it.
-        paints: Its colour, linear RGB.
-        strides: m of its walking cycle that lie behind it at the start.
-        signals: Signals that are lit, of the town's lane graph: those of the junctions on the ego's route.
-        signs: Which of the town's signs stand near the route.
+        key: Key of the episode.
+        models: Model of each agent.
+        variants: Number of the body that plays each agent.
+        paints: Colour of each agent, linear RGB.
+        strides: Phase of each agent's walking cycle at the start, m.
+        signals: Lit signals of the town's lane graph: those of the junctions on the ego's route.
+        signs: Numbers of the town's signs near the route.
     """
 
     key: str
@@ -95,7 +97,7 @@ class Looks:
     signs: tuple[int, ...]
 
     def bodies(self) -> set[BodyKey]:
-        """The bodies that the agents need, in all phases of their cycles."""
+        """Return the keys of the bodies that the agents need, in all phases of their cycles."""
         return {
             (model, variant, phase)
             for model, variant in zip(self.models, self.variants, strict=True)
@@ -105,13 +107,13 @@ class Looks:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Who is where in an episode at a step.
+    """Poses of the agents of an episode at a step.
 
     Attributes:
-        step: Since the start.
+        step: Steps since the start.
         pose: [A, 3] x, y, yaw.
-        active: [A] whether somebody is there.
-        walked: [A] m that each has moved.
+        active: [A] whether the agent is present.
+        walked: [A] distance covered so far, m.
         signal: [S'] `SignalState` of the lit signals.
     """
 
@@ -133,32 +135,34 @@ def walked_to(walked: F64, before: F32, now: F32) -> F64:
     Returns:
         [A] m.
     """
-    moved = now[:, :2].astype(np.float64) - before[:, :2].astype(np.float64)
-    return walked + np.hypot(moved[:, 0], moved[:, 1])
+    displacement = now[:, :2].astype(np.float64) - before[:, :2].astype(np.float64)
+    return walked + np.hypot(displacement[:, 0], displacement[:, 1])
 
 
 class EpisodeScene:
-    """A town with the bodies of some episodes in it, for the camera and the LiDAR.
+    """Town with the bodies of some episodes, for the camera and the LiDAR.
 
     Args:
-        graph: The town.
-        device: Where it is rendered.
+        graph: Lane graph of the town.
+        device: Device that renders.
     """
 
     def __init__(self, graph: LaneGraph, *, device: str = "cpu") -> None:
         self.graph, self.device = graph, device
         street = self.street = cached_street(graph)
-        at = graph.sign_xy.astype(np.float64).reshape(-1, 2)
-        found = list(street_signs(graph, at, Clear(street), key=(graph.name,), many=False, detail=1))
-        self.stop_signs = frozenset(n for n, sign in enumerate(found) if sign.kind == KINDS[SignKind.STOP])
-        self._sign_poses = [upright_pose(*sign.pose) for sign in found]
-        self._fixed = [merge([sign.plate, sign.post]) for sign in found] + [_lens(state) for state in LENSES]
+        sign_positions = graph.sign_xy.astype(np.float64).reshape(-1, 2)
+        signs = list(street_signs(graph, sign_positions, Clear(street), key=(graph.name,), many=False, detail=1))
+        self.stop_signs = frozenset(index for index, sign in enumerate(signs) if sign.kind == KINDS[SignKind.STOP])
+        self._sign_poses = [upright_pose(*sign.pose) for sign in signs]
+        # Signs and lenses come first: their numbers must not change when bodies are added.
+        self._fixed = [merge([sign.plate, sign.post]) for sign in signs] + [_lens(state) for state in LENSES]
         heads = street.heads.astype(np.float64)
         self._head_places = heads[:, :2]
         self._lenses = [
             {
-                state: Thing(len(found) + n, upright_pose(x, y, yaw, z + up) @ upright_pose(0.01, 0.0, 0.0))
-                for n, (state, up) in enumerate(LENSES.items())
+                # 1 cm in front of the head, so that the lens is not hidden in its surface.
+                state: Thing(len(signs) + index, upright_pose(x, y, yaw, z + offset) @ upright_pose(0.01, 0.0, 0.0))
+                for index, (state, offset) in enumerate(LENSES.items())
             }
             for x, y, z, yaw in heads.tolist()
         ]
@@ -167,56 +171,60 @@ class EpisodeScene:
         self._scene: Scene | None = None
 
     def cast(self, bodies: Iterable[BodyKey]) -> None:
-        """Have these bodies; what is there already stays."""
-        missing = sorted(set(bodies) - set(self._bodies))
-        self._add({key: body_of(*key) for key in missing})
+        """Add bodies; those that exist already stay."""
+        missing_keys = sorted(set(bodies) - set(self._bodies))
+        self._add({key: body_of(*key) for key in missing_keys})
 
     def have(self, meshes: Mapping[object, Mesh]) -> None:
-        """Have other meshes, by names of their own; what is there already stays."""
+        """Add other meshes under their own names; those that exist already stay."""
         self._add({key: mesh for key, mesh in meshes.items() if key not in self._bodies})
 
     def _add(self, meshes: Mapping[object, Mesh]) -> None:
         if meshes:
-            first = len(self._fixed) + len(self._bodies)
-            self._bodies |= {key: first + n for n, key in enumerate(meshes)}
+            first_index = len(self._fixed) + len(self._bodies)
+            self._bodies |= {key: first_index + index for index, key in enumerate(meshes)}
             self._own |= meshes
             self._scene = None
 
     def index(self, key: object) -> int:
-        """Number of a mesh in the scene."""
+        """Return the number of a mesh in the scene."""
         return self._bodies[key]
 
     @property
     def scene(self) -> Scene:
-        """Street and bodies on the device."""
+        """Street and bodies on the device, built on first use."""
         if self._scene is None:
             meshes = [*self._fixed, *self._own.values()]
             self._scene = Scene(self.street, meshes, device=self.device)
         return self._scene
 
     def looks(self, episode: Episode) -> Looks:
-        """How an episode of this town looks."""
+        """Return the appearance of an episode of this town."""
         route = episode.agents[0].route
         assert route is not None  # checked when the world was built
         models = tuple(agent.model for agent in episode.agents)
         return self._looks(episode.key, models, route_signals(self.graph, route), route.xy)
 
     def looks_of_trace(self, trace: EpisodeTrace) -> Looks:
-        """How the episode of a trace of this town looked."""
+        """Return the appearance of the episode of a trace of this town."""
         return self._looks(trace.key, trace.models, trace.signal_ids, trace.route)
 
     def _looks(self, key: str, models: tuple[str, ...], signals: I32, way: F32) -> Looks:
         agents = range(len(models))
-        strides = np.array([generator("stride", key, a).uniform(0, STRIDE) for a in agents])
-        near = [n for n, at in enumerate(self._sign_poses) if np.hypot(*(way - at[:2, 3]).T).min() < REACH]
+        strides = np.array([generator("stride", key, agent).uniform(0, STRIDE) for agent in agents])
+        near_signs = [
+            sign_index
+            for sign_index, sign_pose in enumerate(self._sign_poses)
+            if np.hypot(*(way - sign_pose[:2, 3]).T).min() < REACH
+        ]
         return Looks(
             key,
             models,
-            tuple(int(generator("variant", key, a).integers(VARIANTS)) for a in agents),
-            tuple(draw_paint(generator("paint", key, a)) for a in agents),
+            tuple(int(generator("variant", key, agent).integers(VARIANTS)) for agent in agents),
+            tuple(draw_paint(generator("paint", key, agent)) for agent in agents),
             strides,
             signals,
-            tuple(near),
+            tuple(near_signs),
         )
 
     def things(self, looks: Looks, moment: Moment, *, without: int | None = None) -> tuple[Thing, ...]:
@@ -227,40 +235,42 @@ class EpisodeScene:
             moment: Who is where.
             without: Agent that is left out: who looks.
         """
-        found = [Thing(n, self._sign_poses[n]) for n in looks.signs]
+        visible = [Thing(sign_index, self._sign_poses[sign_index]) for sign_index in looks.signs]
         poses = upright_poses(moment.pose.astype(np.float64))
-        for a, model in enumerate(looks.models):
-            if moment.active[a] and a != without:
+        for agent, model in enumerate(looks.models):
+            if moment.active[agent] and agent != without:
                 phase = 0
                 if _cycles(model):
-                    phase = int((moment.walked[a] + looks.strides[a]) / STRIDE * PHASES) % PHASES
-                mesh = self._bodies[model, looks.variants[a], phase]
-                found.append(Thing(mesh, poses[a], looks.paints[a], a + 1))
-        return tuple(found)
+                    phase = int((moment.walked[agent] + looks.strides[agent]) / STRIDE * PHASES) % PHASES
+                body_index = self._bodies[model, looks.variants[agent], phase]
+                visible.append(Thing(body_index, poses[agent], looks.paints[agent], agent + 1))
+        return tuple(visible)
 
     def lights(self, looks: Looks, moment: Moment, eye: F64) -> tuple[Thing, ...]:
         """The lit lenses of the signals near a place [2]; they belong to the street."""
-        state = dict(zip(looks.signals.tolist(), moment.signal.tolist(), strict=True))
-        away = self._head_places - eye
-        near = np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) < SIGNALS_WITHIN).tolist()
-        lit = (
-            (k, SignalState(state.get(signal, SignalState.OFF)))
-            for k, signal in zip(near, self.street.head_signal[near].tolist(), strict=True)
+        signal_states = dict(zip(looks.signals.tolist(), moment.signal.tolist(), strict=True))
+        head_offsets = self._head_places - eye
+        near_heads = np.flatnonzero(np.hypot(head_offsets[:, 0], head_offsets[:, 1]) < SIGNALS_WITHIN).tolist()
+        head_states = (
+            (head_index, SignalState(signal_states.get(signal, SignalState.OFF)))
+            for head_index, signal in zip(near_heads, self.street.head_signal[near_heads].tolist(), strict=True)
         )
-        return tuple(self._lenses[k][one] for k, one in lit if one in LENSES)
+        return tuple(
+            self._lenses[head_index][lens_state] for head_index, lens_state in head_states if lens_state in LENSES
+        )
 
 
 def moments_of(trace: EpisodeTrace) -> list[Moment]:
-    """Who was where at each step of a trace."""
+    """Return the poses of all agents at each step of a trace."""
     pose = np.stack([trace.x, trace.y, trace.yaw], -1)
     walked = np.zeros(pose.shape[1])
-    found = []
+    moments = []
     for step in range(len(pose)):
         walked = walked_to(walked, pose[max(step - 1, 0)], pose[step])
-        found.append(Moment(step, pose[step], trace.active[step], walked, trace.signal[step]))
-    return found
+        moments.append(Moment(step, pose[step], trace.active[step], walked, trace.signal[step]))
+    return moments
 
 
 def _cycles(model: str) -> bool:
-    """Whether the body of a model has a cycle that goes with how far it has moved."""
+    """Return True if the body of a model has a cycle that depends on the distance covered."""
     return ACTOR_BODIES.get(model, ("",))[0] in CYCLED

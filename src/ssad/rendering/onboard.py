@@ -1,9 +1,10 @@
-"""Cameras and LiDARs that agents carry in the closed loop; what they saw can be rendered again from a trace.
+"""Cameras and LiDARs that agents carry in the closed loop; their readings can be rendered again from a trace.
 
-    eyes = Onboard()
-    rollout(world, driver, sensors={"front": eyes.camera(Camera.typical(640, 384)), "lidar": eyes.lidar()})
+    onboard = Onboard()
+    sensors = {"front": onboard.camera(Camera.typical(640, 384)), "lidar": onboard.lidar()}
+    rollout(world, driver, sensors=sensors)
 
-Nothing is rendered unless a driver names the sensor in its `sensors`.
+A sensor is rendered only if a driver names it in its `sensors`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MO
 
 @dataclass(slots=True)
 class _Track:
-    """Where the agents of a scene have been since its episode began: a row a step."""
+    """Poses of the agents of a scene since its episode began, one entry per step."""
 
     episode: int
     looks: Looks
@@ -50,29 +51,29 @@ class _Track:
     walked: list[F64] = field(default_factory=list)
 
     def follow(self, step: int, pose: F32) -> None:
-        """Another step; an earlier one again goes on from there."""
+        """Append a step; an earlier step discards the entries from there on."""
         if step < len(self.pose):
             if np.array_equal(self.pose[step], pose):
                 return
             del self.pose[step:], self.walked[step:]
-        before = self.pose[-1] if self.pose else pose
+        previous_pose = self.pose[-1] if self.pose else pose
         walked = self.walked[-1] if self.walked else np.zeros(len(pose))
-        # what happened before somebody looked is not known; it decides nothing but where feet are
-        missing = step + 1 - len(self.pose)
-        self.pose += [pose.copy()] * missing
-        self.walked += [walked_to(walked, before, pose)] * missing
+        # steps before the first reading are unknown; they only affect the phase of walking cycles
+        missing_steps = step + 1 - len(self.pose)
+        self.pose += [pose.copy()] * missing_steps
+        self.walked += [walked_to(walked, previous_pose, pose)] * missing_steps
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What an agent could see at a moment.
+    """View of an agent at a moment.
 
     Attributes:
-        row: Which reading it belongs to.
-        town: Where it is.
-        looks: Of the episode.
-        moment: Who is where.
-        agent: Who looks.
+        row: Row of the reading that it belongs to.
+        town: Scene of its town.
+        appearance: Appearance of the episode.
+        moment: Poses of the agents.
+        agent: Number of the viewing agent.
     """
 
     row: int
@@ -83,23 +84,23 @@ class Sight:
 
     @property
     def pose(self) -> F64:
-        """Where the agent is, [4, 4]."""
+        """Pose of the agent, [4, 4]."""
         x, y, yaw = self.moment.pose[self.agent].astype(np.float64).tolist()
         return upright_pose(x, y, yaw)
 
 
 class Onboard:
-    """What agents carry: makes sensors for `ssad.world.rollout.rollout`, and the same readings from traces.
+    """Sensors of agents for `ssad.world.rollout.rollout`, and the same readings from traces.
 
-    Sensors of one Onboard share their scenes: street and bodies are made once for each town. A reading depends on the
-    episode, the step and the agent alone. It is black, or empty, where the episode has ended.
+    Sensors of one Onboard share their scenes: street and bodies are built once for each town. A reading depends on
+    the episode, the step and the agent alone. It is black, or empty, if the episode has ended.
 
     Args:
-        weather: Of all episodes, or a function from an episode's key to its weather.
-        response: What stands between lens and picture; as the recorder's.
-        device: Where it is rendered: cpu or cuda:0.
-        attack: A physical attack on one of the agents, or on stop signs, in what cameras and LiDARs see.
-        resident: Whether pictures stay on a GPU, as torch tensors, for a driver that looks at them there.
+        weather: Weather of all episodes, or a function from an episode's key to its weather.
+        response: Model between lens and image; by default that of the recorder.
+        device: Device that renders: cpu or cuda:0.
+        attack: Edit of one of the agents, or of stop signs, that cameras and LiDARs see.
+        resident: Whether images stay on a GPU, as torch tensors, for a driver that processes them there.
     """
 
     def __init__(
@@ -122,7 +123,7 @@ class Onboard:
         self._tracks: dict[int, _Track] = {}
 
     def camera(self, camera: Camera) -> OnboardCamera:
-        """A camera as a sensor: pictures uint8 [N, 3, height, width], RGB.
+        """Return a camera as a sensor: images uint8 [N, 3, height, width], RGB.
 
         Args:
             camera: Its lens, and its place on the agent: `to_ego` counts from the middle of its base, x forward.
@@ -130,25 +131,25 @@ class Onboard:
         return OnboardCamera(self, camera)
 
     def rig(self, width: int = 640) -> dict[str, OnboardCamera]:
-        """The six cameras of nuScenes by channel, for pictures so many pixels wide (16:9)."""
+        """Return the six cameras of nuScenes by channel, with images of this width in pixels (16:9)."""
         return {channel: self.camera(rig_camera(channel, width)) for channel in RIG}
 
     def together(self, cameras: Mapping[str, Camera]) -> dict[str, OnboardCamera]:
-        """Cameras that are always read together: those of one size are rendered in one call.
+        """Return cameras that are always read together: those of one size are rendered in one call.
 
         Args:
-            cameras: By the names of their sensors.
+            cameras: Cameras by the names of their sensors.
         """
-        sizes = {(camera.width, camera.height): Rig() for camera in cameras.values()}
-        found = {}
+        groups = {(camera.width, camera.height): Rig() for camera in cameras.values()}
+        sensors = {}
         for name, camera in cameras.items():
-            rig = sizes[camera.width, camera.height]
-            rig.cameras.append(camera)
-            found[name] = OnboardCamera(self, camera, rig)
-        return found
+            group = groups[camera.width, camera.height]
+            group.cameras.append(camera)
+            sensors[name] = OnboardCamera(self, camera, group)
+        return sensors
 
     def lidar(self, lidar: Lidar = HDL32E) -> OnboardLidar:
-        """A LiDAR as a sensor: points float32 [N, P, 5]: x, y, z in the sensor's frame, intensity, ring.
+        """Return a LiDAR as a sensor: points float32 [N, P, 5]: x, y, z in the sensor's frame, intensity, ring.
 
         P is the number of its beams times its azimuths; rows after the last point are 0, their ring -1.
 
@@ -158,38 +159,39 @@ class Onboard:
         return OnboardLidar(self, lidar)
 
     def follow(self, simulator: Simulator) -> None:
-        """Take note of where everybody is now, whoever looks; the loop calls it at every step.
+        """Record the current poses of all agents; the loop calls it at every step.
 
         Args:
-            simulator: The one that runs. What was known of another one is forgotten.
+            simulator: The running simulator. The history of another one is discarded.
         """
         self._follow(simulator)
 
     def _follow(self, simulator: Simulator) -> WorldState:
-        """See `follow`; the state of the simulator."""
+        """Record the current poses of all agents and return the state of the simulator."""
         if simulator is not self._simulator:
             self._simulator, self._tracks = simulator, {}
             self._cast(simulator)
         state = simulator.state()
         for scene, episode in enumerate(simulator.assigned.tolist()):
             step = _step_of(simulator, state, scene)
-            track = self._tracks.get(scene)
-            if track is None or track.episode != episode:
-                one = simulator.episodes[episode]
-                looks = self.town(simulator.graphs[one.town]).looks(one)
-                track = self._tracks[scene] = _Track(episode, looks)
-            track.follow(step, state.pose[scene, : len(track.looks.models)])
+            history = self._tracks.get(scene)
+            if history is None or history.episode != episode:
+                episode_spec = simulator.episodes[episode]
+                appearance = self.town(simulator.graphs[episode_spec.town]).looks(episode_spec)
+                history = self._tracks[scene] = _Track(episode, appearance)
+            history.follow(step, state.pose[scene, : len(history.looks.models)])
         return state
 
     def town(self, graph: LaneGraph) -> EpisodeScene:
-        """The scene of a town, with the bodies of all episodes that were seen there."""
-        known = self._towns.get(graph.name)
-        if known is None or known[0] is not graph:
-            known = self._towns[graph.name] = (graph, EpisodeScene(graph, device=self.device))
-        return known[1]
+        """Return the scene of a town, with the bodies of all its episodes so far."""
+        cached = self._towns.get(graph.name)
+        if cached is None or cached[0] is not graph:
+            cached = self._towns[graph.name] = (graph, EpisodeScene(graph, device=self.device))
+        return cached[1]
 
     def _cast(self, simulator: Simulator) -> None:
-        """Have bodies for all episodes that a simulator can run."""
+        """Add the bodies of all episodes that a simulator can run."""
+        # All at once: a body that is added later would rebuild the scene in the middle of a run.
         for episode in simulator.episodes:
             town = self.town(simulator.graphs[episode.town])
             self._prepare(town, town.looks(episode))
@@ -202,22 +204,24 @@ class Onboard:
 
     def things(self, sight: Sight) -> tuple[Thing, ...]:
         """The bodies that an agent could see."""
-        found = sight.town.things(sight.looks, sight.moment, without=sight.agent)
+        scene_objects = sight.town.things(sight.looks, sight.moment, without=sight.agent)
         if self.attack is None:
-            return found
-        (own, *_) = self.attack.meshes(self._attacked(sight))
-        return self.attack.dressed(found, sight.town.index(own), sight.town.stop_signs)
+            return scene_objects
+        (target_key, *_) = self.attack.meshes(self._attacked(sight))
+        return self.attack.dressed(scene_objects, sight.town.index(target_key), sight.town.stop_signs)
 
     def render(self, sights: Sequence[Sight], cameras: Sequence[Camera]) -> Picture:
         """What sights in one town show, all of one edit (see `edit`), camera by camera, with its arrays left there."""
-        seen: dict[int, tuple[Thing, ...]] = {}
-        views = [self.view(sight, camera, seen) for camera in cameras for sight in sights]
+        object_cache: dict[int, tuple[Thing, ...]] = {}
+        views = [self.view(agent_view, camera, object_cache) for camera in cameras for agent_view in sights]
         edit, scene = self.edit(sights[0]), sights[0].town.scene
         if edit is None:
             return render(scene, views, download=False)
-        picture = render_with(scene, views, edit.textures, edit.masks)
-        image, tag, depth = (wp.array(one, device=self.device) for one in (picture.image, picture.tag, picture.depth))
-        return replace(picture, image=image, tag=tag, depth=depth)
+        rendering = render_with(scene, views, edit.textures, edit.masks)
+        image, tag, depth = (
+            wp.array(array, device=self.device) for array in (rendering.image, rendering.tag, rendering.depth)
+        )
+        return replace(rendering, image=image, tag=tag, depth=depth)
 
     def edit(self, sight: Sight) -> SceneEdit | None:
         """What the attack changes in an episode, the same for all episodes whose attacked agent is of one model."""
@@ -228,68 +232,71 @@ class Onboard:
         return self.attack.attacked(sight.looks.models, sight.looks.key)
 
     def sights(self, simulator: Simulator, agents: I32) -> list[Sight]:
-        """What agents [N, 2] (scene, agent) could see now; without those whose episode has ended."""
+        """Return the current views of agents [N, 2] (scene, agent), without those whose episode has ended."""
         state, ended = self._follow(simulator), simulator.ended()
-        found, moments = [], {}
+        agent_views, moments = [], {}
         for row, (scene, agent) in enumerate(agents.tolist()):
             if ended[scene] != End.RUNNING:
                 continue
-            track = self._tracks[scene]
+            history = self._tracks[scene]
             if scene not in moments:
-                step, n = _step_of(simulator, state, scene), len(track.looks.models)
-                signal = state.signal[scene][track.looks.signals]
-                moments[scene] = Moment(step, track.pose[step], state.active[scene, :n], track.walked[step], signal)
-            town = self.town(simulator.graphs[simulator.episodes[track.episode].town])
-            found.append(Sight(row, town, track.looks, moments[scene], agent))
-        return found
+                step, agent_count = _step_of(simulator, state, scene), len(history.looks.models)
+                signal = state.signal[scene][history.looks.signals]
+                moments[scene] = Moment(
+                    step, history.pose[step], state.active[scene, :agent_count], history.walked[step], signal
+                )
+            town = self.town(simulator.graphs[simulator.episodes[history.episode].town])
+            agent_views.append(Sight(row, town, history.looks, moments[scene], agent))
+        return agent_views
 
     def sights_of_trace(
         self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
     ) -> list[Sight]:
-        """What an agent could see at steps of a trace.
+        """Return the views of an agent at steps of a trace.
 
         Args:
-            trace: What happened.
-            graph: Its town.
-            agent: Who looks.
-            steps: Which steps; None: all T.
+            trace: The drive.
+            graph: Lane graph of its town.
+            agent: Number of the viewing agent.
+            steps: Steps to view; None: all T.
 
         Raises:
-            ConfigError: There is no such agent or step.
+            ConfigError: The trace has no such agent or step.
         """
         moments = moments_of(trace)
-        chosen = range(len(moments)) if steps is None else steps
-        if not 0 <= agent < len(trace.models) or any(not 0 <= step < len(moments) for step in chosen):
+        selected_steps = range(len(moments)) if steps is None else steps
+        if not 0 <= agent < len(trace.models) or any(not 0 <= step < len(moments) for step in selected_steps):
             raise ConfigError(
                 f"{trace.key}: has agents 0 to {len(trace.models) - 1} and steps 0 to {len(moments) - 1}, "
-                f"not agent {agent} at steps {list(chosen)}"
+                f"not agent {agent} at steps {list(selected_steps)}"
             )
         town = self.town(graph)
-        looks = town.looks_of_trace(trace)
-        self._prepare(town, looks)
-        return [Sight(row, town, looks, moments[step], agent) for row, step in enumerate(chosen)]
+        appearance = town.looks_of_trace(trace)
+        self._prepare(town, appearance)
+        return [Sight(row, town, appearance, moments[step], agent) for row, step in enumerate(selected_steps)]
 
     def view(self, sight: Sight, camera: Camera, seen: dict[int, tuple[Thing, ...]] | None = None) -> View:
         """A view through a camera that the agent carries; `seen`: things of sights (by `id`) that were gathered."""
-        looks, moment, agent = sight.looks, sight.moment, sight.agent
-        weather = self.weather if isinstance(self.weather, Weather) else self.weather(looks.key)
-        eye = sight.pose @ camera.to_ego
-        things = None if seen is None else seen.get(id(sight))
-        if things is None:
-            things = self.things(sight)
+        appearance, moment, agent = sight.looks, sight.moment, sight.agent
+        weather = self.weather if isinstance(self.weather, Weather) else self.weather(appearance.key)
+        camera_pose = sight.pose @ camera.to_ego
+        scene_objects = None if seen is None else seen.get(id(sight))
+        if scene_objects is None:
+            scene_objects = self.things(sight)
             if seen is not None:
-                seen[id(sight)] = things
-        lights = sight.town.lights(looks, moment, eye[:2, 3])
-        body = MODELS[looks.models[agent]]
-        nose = sight.pose @ upright_pose(0.5 * body.length - NOSE, 0.0, 0.0)
-        lamps = own_lamps(nose, weather) if body.kind in WITH_LAMPS else ()
-        noise = int(digest("onboard noise", looks.key, moment.step, agent, camera.channel)[:7], 16)
-        view = View(camera, eye, (*things, *lights), weather, self.response, noise, lamps)
+                seen[id(sight)] = scene_objects
+        lit_lenses = sight.town.lights(appearance, moment, camera_pose[:2, 3])
+        model_entry = MODELS[appearance.models[agent]]
+        nose_pose = sight.pose @ upright_pose(0.5 * model_entry.length - NOSE, 0.0, 0.0)
+        lamps = own_lamps(nose_pose, weather) if model_entry.kind in WITH_LAMPS else ()
+        # The noise depends on nothing else, so a trace reproduces the reading to the bit.
+        noise_seed = int(digest("onboard noise", appearance.key, moment.step, agent, camera.channel)[:7], 16)
+        view = View(camera, camera_pose, (*scene_objects, *lit_lenses), weather, self.response, noise_seed, lamps)
         edit = self.edit(sight)
         if edit is None or self.attack is None:
             return view
         _, *cards = self.attack.meshes(self._attacked(sight))
-        for tag in self.attack.tags(things):
+        for tag in self.attack.tags(scene_objects):
             view = edit.on(view, tag, cards=[sight.town.index(key) for key in cards])
         return view
 
@@ -311,38 +318,39 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class OnboardCamera:
-    """A camera that agents carry, see `Onboard.camera`."""
+    """Camera that agents carry, see `Onboard.camera`."""
 
     onboard: Onboard
     camera: Camera
     rig: Rig | None = None
 
     def follow(self, simulator: Simulator) -> None:
-        """See `Onboard.follow`."""
+        """Record the poses of this step for the shared scenes."""
         self.onboard.follow(simulator)
 
     def __call__(self, simulator: Simulator, agents: I32) -> Any:
-        """Pictures [N, 3, H, W] of agents [N, 2] (scene, agent); black where the episode has ended."""
+        """Return images [N, 3, H, W] of agents [N, 2] (scene, agent); black if the episode has ended."""
         if self.rig is None:
             return self._read(self.onboard.sights(simulator, agents), len(agents))
         state = simulator.state()
-        parts = (state.time, state.pose, state.active, state.signal, agents)
-        moment = (id(simulator), *(v.tobytes() for v in parts))
-        number = next(k for k, camera in enumerate(self.rig.cameras) if camera is self.camera)
-        if moment != self.rig.moment or number not in self.rig.read:
-            cameras, sights = self.rig.cameras, self.onboard.sights(simulator, agents)
+        state_arrays = (state.time, state.pose, state.active, state.signal, agents)
+        # The first camera that is read renders the whole group; the state tells a new moment from an old one.
+        moment = (id(simulator), *(array.tobytes() for array in state_arrays))
+        camera_index = next(index for index, camera in enumerate(self.rig.cameras) if camera is self.camera)
+        if moment != self.rig.moment or camera_index not in self.rig.read:
+            cameras, agent_views = self.rig.cameras, self.onboard.sights(simulator, agents)
             self.rig.moment = moment
-            self.rig.read = dict(enumerate(self._read_all(sights, len(agents), cameras)))
-        return self.rig.read.pop(number)
+            self.rig.read = dict(enumerate(self._read_all(agent_views, len(agents), cameras)))
+        return self.rig.read.pop(camera_index)
 
     def of_trace(
         self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
     ) -> U8:
         """The pictures [T, 3, H, W] that an agent was shown; arguments and errors as `Onboard.sights_of_trace`."""
-        sights = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
-        shown = self._read(sights, len(sights))
-        found: U8 = shown.cpu().numpy() if self.onboard.resident else shown
-        return found
+        agent_views = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
+        images = self._read(agent_views, len(agent_views))
+        host_images: U8 = images.cpu().numpy() if self.onboard.resident else images
+        return host_images
 
     def _read(self, sights: Sequence[Sight], count: int) -> Any:
         """All pictures in as few calls as possible."""
@@ -354,19 +362,21 @@ class OnboardCamera:
         if self.onboard.resident:
             import torch
 
-            kept = torch.zeros(shape, dtype=torch.uint8, device=self.onboard.device)
-            for part, picture in self.shots(sights, cameras):
-                rows = torch.tensor([sight.row for sight in part], device=kept.device)
+            gpu_images = torch.zeros(shape, dtype=torch.uint8, device=self.onboard.device)
+            for batch, rendering in self.shots(sights, cameras):
+                rows = torch.tensor([agent_view.row for agent_view in batch], device=gpu_images.device)
                 wp.synchronize_device(self.onboard.device)  # torch has a stream of its own
-                kept[:, rows] = wp.to_torch(picture.image).view(len(cameras), len(part), *shape[2:])
-                if kept.is_cuda:
-                    torch.cuda.synchronize(kept.device)
-            return kept.movedim(-1, 2)
-        found = np.zeros(shape, np.uint8)
-        for part, picture in self.shots(sights, cameras):
-            images = picture.image.numpy()  # type: ignore[attr-defined]
-            found[:, [sight.row for sight in part]] = images.reshape(len(cameras), len(part), *shape[2:])
-        return np.moveaxis(found, -1, 2)
+                gpu_images[:, rows] = wp.to_torch(rendering.image).view(len(cameras), len(batch), *shape[2:])
+                if gpu_images.is_cuda:
+                    torch.cuda.synchronize(gpu_images.device)
+            return gpu_images.movedim(-1, 2)
+        host_images = np.zeros(shape, np.uint8)
+        for batch, rendering in self.shots(sights, cameras):
+            images = rendering.image.numpy()  # type: ignore[attr-defined]
+            host_images[:, [agent_view.row for agent_view in batch]] = images.reshape(
+                len(cameras), len(batch), *shape[2:]
+            )
+        return np.moveaxis(host_images, -1, 2)
 
     def shots(
         self, sights: Sequence[Sight], cameras: Sequence[Camera] | None = None
@@ -382,51 +392,52 @@ class OnboardCamera:
             its arrays left where they are.
         """
         cameras = [self.camera] if cameras is None else cameras
-        alike: dict[tuple[int, int], list[Sight]] = {}
-        for sight in sights:
-            alike.setdefault((id(sight.town), id(self.onboard.edit(sight))), []).append(sight)
-        at_once = max(self.onboard.at_once // len(cameras), 1)
-        for here in alike.values():
-            for k in range(0, len(here), at_once):
-                part = here[k : k + at_once]
-                yield part, self.onboard.render(part, cameras)
+        # One call renders one scene under one edit.
+        groups: dict[tuple[int, int], list[Sight]] = {}
+        for agent_view in sights:
+            groups.setdefault((id(agent_view.town), id(self.onboard.edit(agent_view))), []).append(agent_view)
+        views_per_call = max(self.onboard.at_once // len(cameras), 1)
+        for group in groups.values():
+            for start in range(0, len(group), views_per_call):
+                batch = group[start : start + views_per_call]
+                yield batch, self.onboard.render(batch, cameras)
 
 
 @dataclass(frozen=True, slots=True)
 class OnboardLidar:
-    """A LiDAR that agents carry, see `Onboard.lidar`."""
+    """LiDAR that agents carry, see `Onboard.lidar`."""
 
     onboard: Onboard
     lidar: Lidar
 
     def follow(self, simulator: Simulator) -> None:
-        """See `Onboard.follow`."""
+        """Record the poses of this step for the shared scenes."""
         self.onboard.follow(simulator)
 
     def __call__(self, simulator: Simulator, agents: I32) -> F32:
-        """Points [N, P, 5] of agents [N, 2] (scene, agent); none where the episode has ended."""
+        """Return points [N, P, 5] of agents [N, 2] (scene, agent); none if the episode has ended."""
         return self._read(self.onboard.sights(simulator, agents), len(agents))
 
     def of_trace(
         self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
     ) -> F32:
         """The points [T, P, 5] that an agent was shown; arguments and errors as `Onboard.sights_of_trace`."""
-        sights = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
-        return self._read(sights, len(sights))
+        agent_views = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
+        return self._read(agent_views, len(agent_views))
 
     def _read(self, sights: Sequence[Sight], count: int) -> F32:
         """One turn for each."""
-        found = np.zeros((count, len(self.lidar.beams) * self.lidar.azimuths, 5), np.float32)
-        found[..., 4] = -1.0
-        for sight in sights:
-            looks, moment, agent = sight.looks, sight.moment, sight.agent
-            things = self.onboard.things(sight)
-            key = ("onboard lidar", looks.key, moment.step, agent)
-            points, _ = sweep(sight.town.scene, self.lidar, sight.pose, things, key=key)
-            found[sight.row, : len(points)] = points
-        return found
+        readings = np.zeros((count, len(self.lidar.beams) * self.lidar.azimuths, 5), np.float32)
+        readings[..., 4] = -1.0
+        for agent_view in sights:
+            appearance, moment, agent = agent_view.looks, agent_view.moment, agent_view.agent
+            scene_objects = self.onboard.things(agent_view)
+            key = ("onboard lidar", appearance.key, moment.step, agent)
+            points, _ = sweep(agent_view.town.scene, self.lidar, agent_view.pose, scene_objects, key=key)
+            readings[agent_view.row, : len(points)] = points
+        return readings
 
 
 def _step_of(simulator: Simulator, state: WorldState, scene: int) -> int:
-    """Steps since the episode of a scene began."""
+    """Return the steps since the episode of a scene began."""
     return round(float(state.time[scene]) / simulator.dt)

@@ -1,4 +1,4 @@
-"""A radar that agents carry in the closed loop: where its rays end, and how fast that comes nearer."""
+"""A radar that agents carry in the closed loop: the ends of its rays, and their range rates."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ssad.rendering.onboard import Onboard
 
 @dataclass(frozen=True, slots=True)
 class OnboardRadar:
-    """A radar as a sensor: detections float32 [N, P, 4], see `__call__`.
+    """Radar as a sensor: detections float32 [N, P, 4], see `__call__`.
 
     Args:
-        onboard: What it shares its scenes with.
+        onboard: Source of the scenes, shared with other sensors.
         rays: Its rays, as a `Lidar` whose `width` is the radar's horizontal field; its frame is x right, y forward.
     """
 
@@ -25,7 +25,7 @@ class OnboardRadar:
     rays: Lidar
 
     def follow(self, simulator: Simulator) -> None:
-        """See `Onboard.follow`."""
+        """Record the poses of this step for the shared scenes."""
         self.onboard.follow(simulator)
 
     def __call__(self, simulator: Simulator, agents: I32) -> F32:
@@ -34,23 +34,28 @@ class OnboardRadar:
         The speed is that of the thing relative to the radar along the ray, negative where it comes nearer. Rows after
         the last detection are 0: none is so near.
         """
-        found = np.zeros((len(agents), len(self.rays.beams) * self.rays.azimuths, 4), np.float32)
+        detections = np.zeros((len(agents), len(self.rays.beams) * self.rays.azimuths, 4), np.float32)
         state = simulator.state()
-        for sight in self.onboard.sights(simulator, agents):
-            scene = int(agents[sight.row, 0])
-            key = ("onboard radar", sight.looks.key, sight.moment.step, sight.agent)
-            points, tag = sweep(sight.town.scene, self.rays, sight.pose, self.onboard.things(sight), key=key)
-            speed = state.speed[scene].astype(np.float64)
+        for agent_view in self.onboard.sights(simulator, agents):
+            scene = int(agents[agent_view.row, 0])
+            key = ("onboard radar", agent_view.looks.key, agent_view.moment.step, agent_view.agent)
+            points, tags = sweep(
+                agent_view.town.scene, self.rays, agent_view.pose, self.onboard.things(agent_view), key=key
+            )
+            speeds = state.speed[scene].astype(np.float64)
             yaw = state.pose[scene, :, 2].astype(np.float64)
-            moves = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], 1)
-            theirs = np.where((tag > 0)[:, None], moves[np.maximum(tag - 1, 0)], 0.0)
-            found[sight.row, : len(points)] = self._read(points, theirs - moves[sight.agent], sight.pose)
-        return found
+            velocities = speeds[:, None] * np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], 1)
+            # Tag 0 is the street, which stands still; agent a has the tag a + 1.
+            target_velocity = np.where((tags > 0)[:, None], velocities[np.maximum(tags - 1, 0)], 0.0)
+            detections[agent_view.row, : len(points)] = self._read(
+                points, target_velocity - velocities[agent_view.agent], agent_view.pose
+            )
+        return detections
 
     def _read(self, points: F32, relative: F64, pose: F64) -> F32:
-        """Rows of points [P, 5] in the sensor frame, of relative velocities [P, 3] in the world frame."""
+        """Return rows for points [P, 5] in the sensor frame, of relative velocities [P, 3] in the world frame."""
         ray = points[:, :3].astype(np.float64)
-        away = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
-        along = (ray / away[:, None]) @ (pose[:3, :3] @ self.rays.to_ego[:3, :3]).T
-        up, across = np.arcsin(ray[:, 2] / away), np.arctan2(ray[:, 0], ray[:, 1])
-        return np.column_stack([away, up, across, (along * relative).sum(1)]).astype(np.float32)
+        distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
+        direction = (ray / distance[:, None]) @ (pose[:3, :3] @ self.rays.to_ego[:3, :3]).T
+        elevation, azimuth = np.arcsin(ray[:, 2] / distance), np.arctan2(ray[:, 0], ray[:, 1])
+        return np.column_stack([distance, elevation, azimuth, (direction * relative).sum(1)]).astype(np.float32)

@@ -1,6 +1,6 @@
-"""Who is in a recorded drive, and where each is at any moment.
+"""Bodies of a recorded drive and their poses at any moment.
 
-Agents, trailers, parked vehicles, walkers, building sites, signs.
+They are agents, trailers, parked vehicles, walkers, building sites and signs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KERB = 0.12  # m, height of sidewalks
 PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
 ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
-# people of a cast who walk and who stand, by style; many are in more than one place
+# styles of walking and standing people of a drive; many bodies appear in more than one place
 WALKING = (
     "adult",
     "adult",
@@ -85,19 +85,19 @@ def thinned(shares: Mapping[str, float], streets: str) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class ObjectBody:
-    """Somebody or something in a drive.
+    """Body of an agent or object in a drive.
 
     Attributes:
-        tag: Number that masks and boxes name it by, 1 and more.
-        kind: Of the body; "" for what has no label.
-        style: Of the body; it decides the nuScenes attribute.
+        tag: Number of the body in masks and boxes, from 1.
+        kind: Kind of body; "" for unlabelled ones.
+        style: Style of the body; it decides the nuScenes attribute.
         size: Length, width, height, m.
         paint: Linear RGB.
         meshes: Numbers of its meshes: one, or those of a cycle of `STRIDE` m.
-        track: [T, 4] x, y, yaw, z at steps of the world, or [1, 4] if it stands still.
-        active: [T] whether it is there.
-        driven: [T] m so far.
-        parked: Whether nobody drives it.
+        track: [T, 4] x, y, yaw, z at steps of the world, or [1, 4] if it is static.
+        active: [T] whether it is present.
+        driven: [T] distance covered so far, m.
+        parked: Whether it is a vehicle without a driver.
     """
 
     tag: int
@@ -114,7 +114,7 @@ class ObjectBody:
 
 @dataclass(frozen=True, slots=True)
 class PlacedObject:
-    """A body at a moment: pose [4, 4], speed m/s, the thing to draw."""
+    """Body at a moment: pose [4, 4], speed m/s, and the object to draw."""
 
     body: ObjectBody
     pose: F64
@@ -123,13 +123,13 @@ class PlacedObject:
 
 
 class LazyMeshes(Sequence[Mesh]):
-    """Meshes by number, each built when it is first asked for: most bodies of a town are never in view."""
+    """Meshes by number, each built on first access: most bodies of a town are never in view."""
 
     def __init__(self) -> None:
         self._made: list[Mesh | Callable[[], Mesh]] = []
 
     def add(self, mesh: Mesh | Callable[[], Mesh]) -> int:
-        """Add a mesh, or what builds it.
+        """Add a mesh, or a function that builds it.
 
         Returns:
             Its number.
@@ -161,7 +161,15 @@ class LazyMeshes(Sequence[Mesh]):
 
 @dataclass(slots=True)
 class SceneObjects:
-    """All meshes and bodies of a drive. dt: a step of the tracks, s; key: of what is drawn; detail: of the meshes."""
+    """All meshes and bodies of a drive.
+
+    Attributes:
+        dt: Step of the tracks, s.
+        key: Key of the random draws.
+        detail: Detail of the meshes.
+        meshes: Meshes of all bodies.
+        bodies: The bodies.
+    """
 
     dt: float
     key: tuple[object, ...] = ()
@@ -171,25 +179,38 @@ class SceneObjects:
 
     def at(self, time: float, around: F64, reach: float) -> list[PlacedObject]:
         """Who is within reach (m) of a place [2] at a time (s), between steps in between."""
-        found = []
+        placed = []
         for body in self.bodies:
-            last = len(body.track) - 1
-            exact = min(max(time / self.dt, 0.0), float(last))
-            low = min(int(exact), max(last - 1, 0))
-            high, part = min(low + 1, last), exact - low
-            if not (body.active[min(low, len(body.active) - 1)] and body.active[min(high, len(body.active) - 1)]):
+            last_step = len(body.track) - 1
+            exact_step = min(max(time / self.dt, 0.0), float(last_step))
+            lower_step = min(int(exact_step), max(last_step - 1, 0))
+            upper_step, fraction = min(lower_step + 1, last_step), exact_step - lower_step
+            if not (
+                body.active[min(lower_step, len(body.active) - 1)]
+                and body.active[min(upper_step, len(body.active) - 1)]
+            ):
                 continue
-            a, b = body.track[low], body.track[high]
-            turn = wrap_angle(b[2] - a[2])
-            x, y, yaw, z = a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn, a[3]
+            lower_state, upper_state = body.track[lower_step], body.track[upper_step]
+            # Wrapped, so that a body turns the short way round between two steps.
+            yaw_change = wrap_angle(upper_state[2] - lower_state[2])
+            x, y, yaw, z = (
+                lower_state[0] + fraction * (upper_state[0] - lower_state[0]),
+                lower_state[1] + fraction * (upper_state[1] - lower_state[1]),
+                lower_state[2] + fraction * yaw_change,
+                lower_state[3],
+            )
             if np.hypot(x - around[0], y - around[1]) > reach:
                 continue
-            speed = float(np.hypot(b[0] - a[0], b[1] - a[1])) / self.dt if high > low else 0.0
-            walked = float(body.driven[low] + part * (body.driven[high] - body.driven[low]))
+            speed = (
+                float(np.hypot(upper_state[0] - lower_state[0], upper_state[1] - lower_state[1])) / self.dt
+                if upper_step > lower_step
+                else 0.0
+            )
+            walked = float(body.driven[lower_step] + fraction * (body.driven[upper_step] - body.driven[lower_step]))
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
-            found.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag, lit=not body.parked)))
-        return found
+            placed.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag, lit=not body.parked)))
+        return placed
 
     def add(
         self,
@@ -201,12 +222,15 @@ class SceneObjects:
     ) -> None:
         """Another body: kind, style, size, meshes, and where it is. Its paint is drawn."""
         tag = len(self.bodies) + 1
-        steps = np.hypot(*np.diff(track[:, :2], axis=0).T) if len(track) > 1 else np.zeros(0)
-        driven = np.concatenate([[0.0], np.cumsum(steps)]) + generator("stride", *self.key, tag).uniform(0, STRIDE)
-        present = np.ones(len(track), bool) if active is None else active
+        step_lengths = np.hypot(*np.diff(track[:, :2], axis=0).T) if len(track) > 1 else np.zeros(0)
+        # A random offset: walkers that start together must not step in unison.
+        driven = np.concatenate([[0.0], np.cumsum(step_lengths)]) + generator("stride", *self.key, tag).uniform(
+            0, STRIDE
+        )
+        activity = np.ones(len(track), bool) if active is None else active
         paint = draw_paint(generator("paint", *self.key, tag))
         kind, style, size, meshes = who
-        self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, present, driven, parked))
+        self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, activity, driven, parked))
 
     def make(
         self, kind: str, style: str, size: Size, *, name: tuple[object, ...] = (), phases: int = 1
@@ -215,15 +239,15 @@ class SceneObjects:
         key = (*self.key, *(name or (len(self.meshes),)))
 
         def build(phase: float | None) -> Mesh:
-            draws = generator("record mesh", *key)
-            return make_body(kind, style=style, size=size, generator=draws, detail=self.detail, phase=phase)
+            rng = generator("record mesh", *key)
+            return make_body(kind, style=style, size=size, generator=rng, detail=self.detail, phase=phase)
 
-        cycle = [2 * np.pi * k / phases if phases > 1 else None for k in range(phases)]
-        return kind, style, size, tuple(self.meshes.add(partial(build, phase)) for phase in cycle)
+        cycle_phases = [2 * np.pi * index / phases if phases > 1 else None for index in range(phases)]
+        return kind, style, size, tuple(self.meshes.add(partial(build, phase)) for phase in cycle_phases)
 
 
 class Clear:
-    """Where a street has nothing that stands up: squares of half a metre with a vertex from knee to head."""
+    """Occupancy of a street's ground: squares of half a metre with a vertex between knee and head height."""
 
     def __init__(self, street: Street) -> None:
         vertices = street.vertices
@@ -231,18 +255,26 @@ class Clear:
         self.taken = {(int(x), int(y)) for x, y in np.unique(np.floor(upright[:, :2] * 2).astype(int), axis=0)}
 
     def footprint(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
-        """Whether a rectangle is free."""
-        a, b = np.meshgrid(np.arange(-length / 2, length / 2 + 0.4, 0.45), np.arange(-width / 2, width / 2 + 0.4, 0.45))
-        px = np.floor(2 * (x + a * np.cos(yaw) - b * np.sin(yaw))).astype(int)
-        py = np.floor(2 * (y + a * np.sin(yaw) + b * np.cos(yaw))).astype(int)
-        return not any(q in self.taken for q in zip(px.ravel().tolist(), py.ravel().tolist(), strict=True))
+        """Return True if a rectangle is free."""
+        # 0.45 m is below the side of a square, so that none is skipped.
+        along, across = np.meshgrid(
+            np.arange(-length / 2, length / 2 + 0.4, 0.45), np.arange(-width / 2, width / 2 + 0.4, 0.45)
+        )
+        columns = np.floor(2 * (x + along * np.cos(yaw) - across * np.sin(yaw))).astype(int)
+        rows = np.floor(2 * (y + along * np.sin(yaw) + across * np.cos(yaw))).astype(int)
+        return not any(
+            square in self.taken for square in zip(columns.ravel().tolist(), rows.ravel().tolist(), strict=True)
+        )
 
     def take(self, x: float, y: float, yaw: float, length: float, width: float) -> None:
-        """Something stands there now."""
-        for da in np.arange(-length / 2, length / 2 + 0.4, 0.45):
-            for db in np.arange(-width / 2, width / 2 + 0.4, 0.45):
-                px, py = x + da * np.cos(yaw) - db * np.sin(yaw), y + da * np.sin(yaw) + db * np.cos(yaw)
-                self.taken.add((int(np.floor(2 * px)), int(np.floor(2 * py))))
+        """Mark a rectangle as occupied."""
+        for along in np.arange(-length / 2, length / 2 + 0.4, 0.45):
+            for across in np.arange(-width / 2, width / 2 + 0.4, 0.45):
+                point_x, point_y = (
+                    x + along * np.cos(yaw) - across * np.sin(yaw),
+                    y + along * np.sin(yaw) + across * np.cos(yaw),
+                )
+                self.taken.add((int(np.floor(2 * point_x)), int(np.floor(2 * point_y))))
 
 
 def place_objects(
@@ -266,36 +298,47 @@ def place_objects(
         streets: See `ssad.recorders.drives.thinned`.
         many_signs: See `ssad.rendering.street_signs.street_signs`.
     """
-    cast = SceneObjects(trace.dt, key, detail)
-    _agents(cast, trace)
-    way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
-    clear = Clear(street)
-    _kerb(cast, graph, street, way, clear, thinned({kind: PARKED[kind][0] for kind in PARKED}, streets))
-    _sidewalks(cast, graph, way, clear, len(trace.x))
-    _signs(cast, graph, way, clear, many=many_signs)
-    return cast
+    population = SceneObjects(trace.dt, key, detail)
+    _agents(population, trace)
+    route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
+    free_ground = Clear(street)
+    _kerb(
+        population,
+        graph,
+        street,
+        route_points,
+        free_ground,
+        thinned({body_kind: PARKED[body_kind][0] for body_kind in PARKED}, streets),
+    )
+    _sidewalks(population, graph, route_points, free_ground, len(trace.x))
+    # Signs come last: they evade whatever stands at their place, and nothing evades them.
+    _signs(population, graph, route_points, free_ground, many=many_signs)
+    return population
 
 
 def _agents(cast: SceneObjects, trace: EpisodeTrace) -> None:
     """The agents of the world as their traces say; some buses are drawn as a tractor with its trailer."""
-    for a in range(1, len(trace.models)):
-        own = generator("record body", *cast.key, a)
-        model = MODELS[trace.models[a]]
-        track = np.stack([trace.x[:, a], trace.y[:, a], trace.yaw[:, a], 0 * trace.x[:, a]], -1).astype(np.float64)
-        active = trace.active[:, a]
-        full = model.length, model.width, model.height
-        if trace.models[a] not in ACTOR_BODIES:
-            cast.add(("", "", full, (cast.meshes.add(plain_body(full)),)), track, active=active)
+    for agent in range(1, len(trace.models)):
+        rng = generator("record body", *cast.key, agent)
+        model = MODELS[trace.models[agent]]
+        track = np.stack([trace.x[:, agent], trace.y[:, agent], trace.yaw[:, agent], 0 * trace.x[:, agent]], -1).astype(
+            np.float64
+        )
+        active = trace.active[:, agent]
+        model_size = model.length, model.width, model.height
+        if trace.models[agent] not in ACTOR_BODIES:
+            cast.add(("", "", model_size, (cast.meshes.add(plain_body(model_size)),)), track, active=active)
             continue
-        kind, styles = ACTOR_BODIES[trace.models[a]]
-        style = styles[int(own.integers(len(styles)))]
-        if kind == "bus" and own.random() < 0.45:
-            _tractor(cast, track, active, own)
+        kind, styles = ACTOR_BODIES[trace.models[agent]]
+        style = styles[int(rng.integers(len(styles)))]
+        if kind == "bus" and rng.random() < 0.45:
+            _tractor(cast, track, active, rng)
             continue
-        if kind == "truck" and own.random() < 0.3:
-            kind, style = "construction", draw_style("construction", generator=own)
-        drawn = draw_size(kind, style, generator=own)
-        size = (min(drawn[0], full[0]), min(drawn[1], full[1]), drawn[2])
+        if kind == "truck" and rng.random() < 0.3:
+            kind, style = "construction", draw_style("construction", generator=rng)
+        drawn_size = draw_size(kind, style, generator=rng)
+        # A body must not exceed the footprint that the world uses for contacts.
+        size = (min(drawn_size[0], model_size[0]), min(drawn_size[1], model_size[1]), drawn_size[2])
         phases = PHASES if kind in ("pedestrian", "bicycle") else 1
         cast.add(cast.make(kind, style, size, phases=phases), track, active=active)
 
@@ -304,20 +347,24 @@ def _tractor(cast: SceneObjects, track: F64, active: Bool, own: np.random.Genera
     """A tractor on the front half of the agent, a trailer that follows its hitch."""
     height = float(own.uniform(3.2, 3.8))
     sizes: tuple[Size, Size] = ((5.6, 2.5, height), (7.4, 2.5, float(own.uniform(3.3, 3.9))))
-    ahead = track.copy()
-    ahead[:, 0] += 2.3 * np.cos(track[:, 2])
-    ahead[:, 1] += 2.3 * np.sin(track[:, 2])
-    hitch = track[:, :2] + 0.7 * np.stack([np.cos(track[:, 2]), np.sin(track[:, 2])], -1)
-    trailer = track.copy()
-    yaw = float(track[0, 2])
-    for t in range(len(track)):
-        if t:  # the axle, 5.6 m behind the hitch, rolls along its own heading
-            move = hitch[t] - hitch[t - 1]
-            yaw += (-np.sin(yaw) * move[0] + np.cos(yaw) * move[1]) / 5.6
-        trailer[t, :3] = hitch[t, 0] - 3.1 * np.cos(yaw), hitch[t, 1] - 3.1 * np.sin(yaw), yaw
+    tractor_track = track.copy()
+    tractor_track[:, 0] += 2.3 * np.cos(track[:, 2])
+    tractor_track[:, 1] += 2.3 * np.sin(track[:, 2])
+    hitch_track = track[:, :2] + 0.7 * np.stack([np.cos(track[:, 2]), np.sin(track[:, 2])], -1)
+    trailer_track = track.copy()
+    trailer_yaw = float(track[0, 2])
+    for step in range(len(track)):
+        if step:  # the axle, 5.6 m behind the hitch, rolls along its own heading
+            hitch_move = hitch_track[step] - hitch_track[step - 1]
+            trailer_yaw += (-np.sin(trailer_yaw) * hitch_move[0] + np.cos(trailer_yaw) * hitch_move[1]) / 5.6
+        trailer_track[step, :3] = (
+            hitch_track[step, 0] - 3.1 * np.cos(trailer_yaw),
+            hitch_track[step, 1] - 3.1 * np.sin(trailer_yaw),
+            trailer_yaw,
+        )
     style = ("box", "tank", "flatbed")[int(own.integers(3))]
-    cast.add(cast.make("truck", "tractor", sizes[0]), ahead, active=active)
-    cast.add(cast.make("trailer", style, sizes[1]), trailer, active=active)
+    cast.add(cast.make("truck", "tractor", sizes[0]), tractor_track, active=active)
+    cast.add(cast.make("trailer", style, sizes[1]), trailer_track, active=active)
 
 
 def _still(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
@@ -328,45 +375,50 @@ def _kerb(  # noqa: PLR0917
     cast: SceneObjects, graph: LaneGraph, street: Street, way: F64, clear: Clear, shares: Mapping[str, float]
 ) -> None:
     """Vehicles parked at the kerb and on parking places; building sites of cones and barriers round machines."""
-    draws = generator("record kerb", *cast.key)
-    busy = float(draws.uniform(0.25, 0.75))
-    kinds, share = list(shares), np.array(list(shares.values()))
-    lots = [(float(x), float(y), float(yaw), 0.0) for x, y, yaw in np.asarray(street.parking, float)]
-    kerbs = []
+    rng = generator("record kerb", *cast.key)
+    occupancy = float(rng.uniform(0.25, 0.75))
+    kinds, weights = list(shares), np.array(list(shares.values()))
+    parking_lots = [(float(x), float(y), float(yaw), 0.0) for x, y, yaw in np.asarray(street.parking, float)]
+    kerb_places = []
     for lane in np.flatnonzero(graph.kind == LaneType.SHOULDER):
-        walk = int(graph.right[lane])
-        if walk < 0 or graph.kind[walk] != LaneType.SIDEWALK or graph.junction[lane] >= 0:
+        sidewalk = int(graph.right[lane])
+        if sidewalk < 0 or graph.kind[sidewalk] != LaneType.SIDEWALK or graph.junction[lane] >= 0:
             continue
         if graph.left[lane] >= 0 and graph.divided(int(graph.left[lane])):
             continue  # nobody parks in a roundabout
-        s = 9.0 + float(draws.uniform(0, 3))
-        while s < float(graph.length[lane]) - 9.0:
-            x, y, yaw, width = graph.at(int(lane), s)  # the edge of the driving lane:
-            kerbs.append((x - width / 2 * np.sin(yaw), y + width / 2 * np.cos(yaw), yaw, KERB if width < 1 else 0.0))
-            s += 6.5
-    spots = []
-    for spot, at in enumerate([*lots, *kerbs]):
-        if np.hypot(way[:, 0] - at[0], way[:, 1] - at[1]).min() > 55.0 or draws.random() > busy:
+        distance = 9.0 + float(rng.uniform(0, 3))
+        while distance < float(graph.length[lane]) - 9.0:
+            x, y, yaw, width = graph.at(int(lane), distance)  # the edge of the driving lane:
+            kerb_places.append(
+                (x - width / 2 * np.sin(yaw), y + width / 2 * np.cos(yaw), yaw, KERB if width < 1 else 0.0)
+            )
+            distance += 6.5
+    parking_spots = []
+    for spot_index, place in enumerate([*parking_lots, *kerb_places]):
+        if np.hypot(way[:, 0] - place[0], way[:, 1] - place[1]).min() > 55.0 or rng.random() > occupancy:
             continue
-        kind = str(draws.choice(kinds, p=share))
-        long = PARKED[kind][1] > LONG
-        spots.append((not long, spot, "car" if long and spot < len(lots) else kind, at))
-    for _, spot, kind, (edge_x, edge_y, yaw, z) in sorted(spots):
-        number = len(cast.meshes)
-        own = generator("record prop", *cast.key, number)
-        style = "parked" if kind in ("motorcycle", "bicycle") else draw_style(kind, generator=own)
-        size = draw_size(kind, style, generator=own)
-        size = (min(size[0], PARKED[kind][1] - 0.9), min(size[1], 2.55), size[2])
-        aside = size[1] / 2 + 0.08 if spot >= len(lots) else 0.0
-        x, y = edge_x + aside * np.sin(yaw), edge_y - aside * np.cos(yaw)
-        if not clear.footprint(x, y, yaw, PARKED[kind][1], size[1]):
+        body_kind = str(rng.choice(kinds, p=weights))
+        is_long = PARKED[body_kind][1] > LONG
+        parking_spots.append(
+            (not is_long, spot_index, "car" if is_long and spot_index < len(parking_lots) else body_kind, place)
+        )
+    # Long vehicles come first: between others they would hardly find room.
+    for _, spot_index, body_kind, (edge_x, edge_y, yaw, z) in sorted(parking_spots):
+        mesh_number = len(cast.meshes)
+        prop_rng = generator("record prop", *cast.key, mesh_number)
+        style = "parked" if body_kind in ("motorcycle", "bicycle") else draw_style(body_kind, generator=prop_rng)
+        size = draw_size(body_kind, style, generator=prop_rng)
+        size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
+        lateral_offset = size[1] / 2 + 0.08 if spot_index >= len(parking_lots) else 0.0
+        x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
+        if not clear.footprint(x, y, yaw, PARKED[body_kind][1], size[1]):
             continue
-        clear.take(x, y, yaw, PARKED[kind][1], size[1])
-        against = 0.5 if spot < len(lots) else AGAINST.get(kind, 0.0)
-        facing = yaw + (np.pi if own.random() < against else 0.0)
-        cast.add(cast.make(kind, style, size), _still(x, y, facing, z), parked=True)
-        if kind == "construction" or (kind == "truck" and own.random() < 0.3):
-            _site(cast, (x, y, yaw, z), size, own, clear)
+        clear.take(x, y, yaw, PARKED[body_kind][1], size[1])
+        wrong_way_share = 0.5 if spot_index < len(parking_lots) else AGAINST.get(body_kind, 0.0)
+        facing = yaw + (np.pi if prop_rng.random() < wrong_way_share else 0.0)
+        cast.add(cast.make(body_kind, style, size), _still(x, y, facing, z), parked=True)
+        if body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3):
+            _site(cast, (x, y, yaw, z), size, prop_rng, clear)
 
 
 def _site(
@@ -378,26 +430,28 @@ def _site(
 
     def put(kind: str, forward: float, left: float, turn: float) -> None:
         style = draw_style(kind, generator=own)
-        drawn = draw_size(kind, style, generator=own)
-        px, py = x + forward * cos - left * sin, y + forward * sin + left * cos
-        cast.add(cast.make(kind, style, drawn), _still(px, py, yaw + turn + float(own.normal(0.0, ASKEW)), z))
+        drawn_size = draw_size(kind, style, generator=own)
+        world_x, world_y = x + forward * cos - left * sin, y + forward * sin + left * cos
+        cast.add(
+            cast.make(kind, style, drawn_size), _still(world_x, world_y, yaw + turn + float(own.normal(0.0, ASKEW)), z)
+        )
 
     if own.random() < 0.5:
-        for k in range(int(own.integers(3, 7))):
-            put("traffic_cone", -size[0] / 2 - 1.0 + k * (size[0] + 2.0) / 5.0, size[1] / 2 + 0.35, 0.0)
+        for index in range(int(own.integers(3, 7))):
+            put("traffic_cone", -size[0] / 2 - 1.0 + index * (size[0] + 2.0) / 5.0, size[1] / 2 + 0.35, 0.0)
     else:
-        for k in range(int((size[0] + 2.0) / 2.8) + 1):
-            put("barrier", -size[0] / 2 + 0.4 + 2.8 * k, size[1] / 2 + 0.45, np.pi / 2)
-    for end in (-1, 1):
-        for k in range(int(own.integers(1, 3))):
-            put("barrier", end * (size[0] / 2 + 1.2 + 1.3 * k), 0.0, 0.0)
-    for end in (-1, 1):  # between the machine and the barriers
+        for index in range(int((size[0] + 2.0) / 2.8) + 1):
+            put("barrier", -size[0] / 2 + 0.4 + 2.8 * index, size[1] / 2 + 0.45, np.pi / 2)
+    for direction in (-1, 1):
+        for index in range(int(own.integers(1, 3))):
+            put("barrier", direction * (size[0] / 2 + 1.2 + 1.3 * index), 0.0, 0.0)
+    for direction in (-1, 1):  # between the machine and the barriers
         if own.random() < 0.6:
-            worker = draw_size("pedestrian", "worker", generator=own)
-            forward, left = end * (size[0] / 2 + 0.5), float(own.uniform(-0.3, 0.3)) * size[1]
-            px, py = x + forward * cos - left * sin, y + forward * sin + left * cos
-            looks = float(own.uniform(-np.pi, np.pi))
-            cast.add(cast.make("pedestrian", "worker", worker), _still(px, py, looks, z))
+            worker_size = draw_size("pedestrian", "worker", generator=own)
+            forward, worker_lateral = direction * (size[0] / 2 + 0.5), float(own.uniform(-0.3, 0.3)) * size[1]
+            worker_x, worker_y = x + forward * cos - worker_lateral * sin, y + forward * sin + worker_lateral * cos
+            worker_yaw = float(own.uniform(-np.pi, np.pi))
+            cast.add(cast.make("pedestrian", "worker", worker_size), _still(worker_x, worker_y, worker_yaw, z))
     clear.take(x, y, yaw, size[0] + 6.0, size[1])
 
 
@@ -407,73 +461,79 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
     People who walk alone or in pairs, or stand, also at corners; parked two-wheelers side by side, groups of cones,
     rows of barriers.
     """
-    draws = generator("record sidewalks", *cast.key)
-    people, standing = [], []
-    for k, style in enumerate(WALKING):
-        size = draw_size("pedestrian", style, generator=draws)
-        people.append(cast.make("pedestrian", style, size, name=("walker", k), phases=PHASES))
+    rng = generator("record sidewalks", *cast.key)
+    walkers, bystanders = [], []
+    # A few shared bodies: each walker needs the meshes of a whole cycle.
+    for index, style in enumerate(WALKING):
+        size = draw_size("pedestrian", style, generator=rng)
+        walkers.append(cast.make("pedestrian", style, size, name=("walker", index), phases=PHASES))
     for style in WAITING:
-        standing.append(cast.make("pedestrian", style, draw_size("pedestrian", style, generator=draws)))
-    pushed = {k: _stroller(cast, who[2], draws) for k, who in enumerate(people) if who[1] == "stroller"}
-    crowd = float(draws.uniform(0.15, 0.55))
+        bystanders.append(cast.make("pedestrian", style, draw_size("pedestrian", style, generator=rng)))
+    pushed = {index: _stroller(cast, walker[2], rng) for index, walker in enumerate(walkers) if walker[1] == "stroller"}
+    crowd_share = float(rng.uniform(0.15, 0.55))
 
     def stand(x: float, y: float, yaw: float) -> None:
-        who = standing[int(draws.integers(len(standing)))]
+        bystander = bystanders[int(rng.integers(len(bystanders)))]
         if clear.footprint(x, y, 0.0, 0.6, 0.6):
-            cast.add(who, _still(x, y, yaw, KERB))
+            cast.add(bystander, _still(x, y, yaw, KERB))
 
     for lane in np.flatnonzero(graph.kind == LaneType.SIDEWALK):
         length = float(graph.length[lane])
         x, y, yaw, width = graph.at(int(lane), max(length - 1.5, 0.0))
-        if draws.random() < crowd and np.hypot(way[:, 0] - x, way[:, 1] - y).min() < 45.0:
-            for k in range(int(draws.integers(1, 4))):  # at the corner, looking along the walk or across the road
-                aside = float(draws.uniform(-0.3, 0.3)) * width
-                px, py = (
-                    x - aside * np.sin(yaw) - 0.8 * k * np.cos(yaw),
-                    y + aside * np.cos(yaw) - 0.8 * k * np.sin(yaw),
+        if rng.random() < crowd_share and np.hypot(way[:, 0] - x, way[:, 1] - y).min() < 45.0:
+            for index in range(int(rng.integers(1, 4))):  # at the corner, looking along the walk or across the road
+                lateral = float(rng.uniform(-0.3, 0.3)) * width
+                spot_x, spot_y = (
+                    x - lateral * np.sin(yaw) - 0.8 * index * np.cos(yaw),
+                    y + lateral * np.cos(yaw) - 0.8 * index * np.sin(yaw),
                 )
-                stand(px, py, yaw + float(draws.choice([0.0, 0.5 * np.pi])) + float(draws.normal(0.0, 0.3)))
-        for s in np.arange(3.0, length - 3.0, 8.0):
-            x, y, yaw, width = graph.at(int(lane), float(s))
+                stand(spot_x, spot_y, yaw + float(rng.choice([0.0, 0.5 * np.pi])) + float(rng.normal(0.0, 0.3)))
+        for distance in np.arange(3.0, length - 3.0, 8.0):
+            x, y, yaw, width = graph.at(int(lane), float(distance))
             if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > 45.0:
                 continue
-            pick = draws.random()
-            aside = float(draws.uniform(-0.3, 0.3)) * width
-            px, py = x - aside * np.sin(yaw), y + aside * np.cos(yaw)
-            if pick < crowd:
-                group = [int(draws.integers(len(people)))]
-                speed = float(draws.uniform(0.7, 1.6)) * (1 if draws.random() < 0.5 else -1)
-                if draws.random() < 0.35 and width > 1.8:  # somebody walks beside
-                    group.append(int(draws.integers(len(people))))
-                if any(WALKING[k] == "elderly" for k in group):
+            choice = rng.random()
+            lateral = float(rng.uniform(-0.3, 0.3)) * width
+            spot_x, spot_y = x - lateral * np.sin(yaw), y + lateral * np.cos(yaw)
+            if choice < crowd_share:
+                group = [int(rng.integers(len(walkers)))]
+                speed = float(rng.uniform(0.7, 1.6)) * (1 if rng.random() < 0.5 else -1)
+                if rng.random() < 0.35 and width > 1.8:  # somebody walks beside
+                    group.append(int(rng.integers(len(walkers))))
+                if any(WALKING[index] == "elderly" for index in group):
                     speed *= SLOW
-                walk = partial(_walk, graph, int(lane), s0=float(s), speed=speed, steps=steps, dt=cast.dt)
-                for k, place in zip(group, (aside, aside - 0.8 * np.sign(aside)), strict=False):
-                    track = walk(aside=place)
-                    cast.add(people[k], track)
-                    if k in pushed:
-                        cast.add(pushed[k], _ahead(track, GRIP[0] * people[k][2][0] + pushed[k][2][0] / 2 - 0.02))
-            elif pick < crowd + 0.08:
-                stand(px, py, yaw + float(draws.uniform(-3, 3)))
-            elif pick < crowd + 0.13:
-                kind = "bicycle" if draws.random() < 0.65 else "motorcycle"
-                facing = yaw + float(draws.choice([-0.5, 0.5])) * np.pi + float(draws.normal(0.0, 0.5 * ASKEW))
-                for k in range(int(draws.integers(2, 6))):
-                    size = draw_size(kind, "parked", generator=draws)
-                    qx, qy, _, _ = graph.at(int(lane), min(float(s) + RACK[kind] * k, length))
-                    if size[0] < width + 0.4 and clear.footprint(qx, qy, facing, size[0], size[1]):
-                        cast.add(cast.make(kind, "parked", size), _still(qx, qy, facing, KERB), parked=True)
-            elif pick < crowd + 0.2:
-                kind = "traffic_cone" if draws.random() < 0.5 else "barrier"
-                along = draws.random() < 0.6  # else barriers stand one behind the other, across the walk
-                for k in range(int(draws.integers(1, 5))):
-                    style = draw_style(kind, generator=draws)
-                    size = draw_size(kind, style, generator=draws)
-                    gap = (1.6 if kind == "traffic_cone" else 2.8) * k
-                    qx, qy, turn, _ = graph.at(int(lane), min(float(s) + gap, length))
-                    if clear.footprint(qx, qy, 0.0, 0.5, 0.5):
-                        turn += (np.pi / 2 if kind == "barrier" and along else 0.0) + float(draws.normal(0.0, ASKEW))
-                        cast.add(cast.make(kind, style, size), _still(qx, qy, turn, KERB))
+                make_track = partial(_walk, graph, int(lane), s0=float(distance), speed=speed, steps=steps, dt=cast.dt)
+                for index, walker_lateral in zip(group, (lateral, lateral - 0.8 * np.sign(lateral)), strict=False):
+                    track = make_track(aside=walker_lateral)
+                    cast.add(walkers[index], track)
+                    if index in pushed:
+                        cast.add(
+                            pushed[index],
+                            _ahead(track, GRIP[0] * walkers[index][2][0] + pushed[index][2][0] / 2 - 0.02),
+                        )
+            elif choice < crowd_share + 0.08:
+                stand(spot_x, spot_y, yaw + float(rng.uniform(-3, 3)))
+            elif choice < crowd_share + 0.13:
+                kind = "bicycle" if rng.random() < 0.65 else "motorcycle"
+                parked_yaw = yaw + float(rng.choice([-0.5, 0.5])) * np.pi + float(rng.normal(0.0, 0.5 * ASKEW))
+                for index in range(int(rng.integers(2, 6))):
+                    size = draw_size(kind, "parked", generator=rng)
+                    row_x, row_y, _, _ = graph.at(int(lane), min(float(distance) + RACK[kind] * index, length))
+                    if size[0] < width + 0.4 and clear.footprint(row_x, row_y, parked_yaw, size[0], size[1]):
+                        cast.add(cast.make(kind, "parked", size), _still(row_x, row_y, parked_yaw, KERB), parked=True)
+            elif choice < crowd_share + 0.2:
+                kind = "traffic_cone" if rng.random() < 0.5 else "barrier"
+                in_one_row = rng.random() < 0.6  # else barriers stand one behind the other, across the walk
+                for index in range(int(rng.integers(1, 5))):
+                    style = draw_style(kind, generator=rng)
+                    size = draw_size(kind, style, generator=rng)
+                    row_offset = (1.6 if kind == "traffic_cone" else 2.8) * index
+                    row_x, row_y, object_yaw, _ = graph.at(int(lane), min(float(distance) + row_offset, length))
+                    if clear.footprint(row_x, row_y, 0.0, 0.5, 0.5):
+                        object_yaw += (np.pi / 2 if kind == "barrier" and in_one_row else 0.0) + float(
+                            rng.normal(0.0, ASKEW)
+                        )
+                        cast.add(cast.make(kind, style, size), _still(row_x, row_y, object_yaw, KERB))
 
 
 def _stroller(cast: SceneObjects, walker: Size, draws: np.random.Generator) -> tuple[str, str, Size, tuple[int, ...]]:
@@ -487,11 +547,11 @@ def _stroller(cast: SceneObjects, walker: Size, draws: np.random.Generator) -> t
 
 
 def _ahead(track: F64, distance: float) -> F64:
-    """The track [T, 4] of what is a distance (m) ahead of who follows a track."""
-    moved = track.copy()
-    moved[:, 0] += distance * np.cos(track[:, 2])
-    moved[:, 1] += distance * np.sin(track[:, 2])
-    return moved
+    """Return the track [T, 4] of a point at a distance (m) ahead of a track."""
+    shifted_track = track.copy()
+    shifted_track[:, 0] += distance * np.cos(track[:, 2])
+    shifted_track[:, 1] += distance * np.sin(track[:, 2])
+    return shifted_track
 
 
 def take_still(cast: SceneObjects, clear: Clear) -> None:
@@ -505,24 +565,25 @@ def take_still(cast: SceneObjects, clear: Clear) -> None:
 def _signs(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, *, many: bool) -> None:
     """Stop and yield signs: the plate is the body with a kind, the post one without."""
     take_still(cast, clear)
-    for one in street_signs(graph, way, clear, key=cast.key, many=many, detail=cast.detail):
-        for kind, mesh in ((one.kind, one.plate), ("", one.post)):
-            cast.add((kind, one.style, one.size, (cast.meshes.add(mesh),)), _still(*one.pose))
+    for sign in street_signs(graph, way, clear, key=cast.key, many=many, detail=cast.detail):
+        for kind, mesh in ((sign.kind, sign.plate), ("", sign.post)):
+            cast.add((kind, sign.style, sign.size, (cast.meshes.add(mesh),)), _still(*sign.pose))
 
 
 def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float) -> F64:
     """Track of somebody who walks along a sidewalk, back and forth."""
     length = float(graph.length[lane]) - 2.0
-    along = np.abs((s0 - 1.0 + speed * dt * np.arange(steps)) % (2 * length))
-    there = along <= length
-    places = 1.0 + np.where(there, along, 2 * length - along)
-    rows = graph.along(lane, places)
-    back = there == (speed < 0)
+    # The distance runs over twice the length; the second half is the way back.
+    folded = np.abs((s0 - 1.0 + speed * dt * np.arange(steps)) % (2 * length))
+    is_outward = folded <= length
+    distances = 1.0 + np.where(is_outward, folded, 2 * length - folded)
+    lane_states = graph.along(lane, distances)
+    is_reversed = is_outward == (speed < 0)
     return np.stack(
         [
-            rows[:, 0] - aside * np.sin(rows[:, 2]),
-            rows[:, 1] + aside * np.cos(rows[:, 2]),
-            rows[:, 2] + np.pi * back,
+            lane_states[:, 0] - aside * np.sin(lane_states[:, 2]),
+            lane_states[:, 1] + aside * np.cos(lane_states[:, 2]),
+            lane_states[:, 2] + np.pi * is_reversed,
             np.full(steps, KERB),
         ],
         -1,

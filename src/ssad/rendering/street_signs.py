@@ -1,4 +1,4 @@
-"""Stop and yield signs of recorded drives: which stand where, and their bodies in two parts, plate and post."""
+"""Stop and yield signs of recorded drives: their places, and their bodies in two parts, plate and post."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ ASKEW: Final = 0.06  # rad, standard deviation: posts are turned by hand
 
 @dataclass(frozen=True, slots=True)
 class StreetSign:
-    """A sign of a drive.
+    """Sign of a drive.
 
     Attributes:
-        kind: Of its body: stop_sign or yield_sign.
-        style: Of its body.
+        kind: Kind of its body: stop_sign or yield_sign.
+        style: Style of its body.
         size: Length, width, height, m.
-        pose: x, y, yaw (of the way it faces) and z of its foot.
-        plate: What is read and labelled.
-        post: What carries it.
+        pose: x, y, yaw (of the direction that it faces) and z of its foot.
+        plate: Mesh of the labelled plate.
+        post: Mesh of the post.
     """
 
     kind: str
@@ -64,22 +64,23 @@ def street_signs(
     Yields:
         One sign after another.
     """
-    of_map = list(_of_the_map(graph))
-    places = [*of_map, *(_along_kerbs(graph, way, key) if many else ())]
-    for number, (kind, x, y, yaw, z) in enumerate(places):
+    map_signs = list(_of_the_map(graph))
+    candidates = [*map_signs, *(_along_kerbs(graph, way, key) if many else ())]
+    for index, (kind, x, y, yaw, z) in enumerate(candidates):
         if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > REACH:
             continue
         spot = _free(x, y, yaw, clear)
         if spot is None:
             continue
-        own = generator("street sign", *key, number)
-        style = draw_style(kind, generator=own)
-        if style == "all_way" and number < len(of_map):
+        # A generator per place: a sign that has no room changes none of the others.
+        rng = generator("street sign", *key, index)
+        style = draw_style(kind, generator=rng)
+        if style == "all_way" and index < len(map_signs):
             style = "standard"  # the main road of a T-junction does not stop
-        size = draw_size(kind, style, generator=own)
-        facing = yaw + np.pi + float(own.normal(0.0, ASKEW))
-        mesh = make_body(kind, style=style, size=size, generator=own, detail=detail)
-        yield StreetSign(kind, style, size, (*spot, facing, z), *plate_and_post(mesh))
+        size = draw_size(kind, style, generator=rng)
+        facing_yaw = yaw + np.pi + float(rng.normal(0.0, ASKEW))
+        mesh = make_body(kind, style=style, size=size, generator=rng, detail=detail)
+        yield StreetSign(kind, style, size, (*spot, facing_yaw, z), *plate_and_post(mesh))
 
 
 def free_places(
@@ -93,21 +94,22 @@ def free_places(
 
 
 def plate_and_post(mesh: Mesh) -> tuple[Mesh, Mesh]:
-    """The body of a sign in two: the plate, which is what people outline as a stop sign, and all else."""
+    """Split the body of a sign into the plate, which labels outline as a stop sign, and the rest."""
     plate = np.isin(mesh.panel, [mesh.panels.index(name) for name in ("face", "back")])
     return part_of(mesh, plate), part_of(mesh, ~plate)
 
 
 def _of_the_map(graph: LaneGraph) -> Iterator[tuple[str, float, float, float, float]]:
-    """Kind, x, y, yaw of the traffic and height of the ground of each sign of the map."""
+    """Yield kind, x, y, yaw of the traffic and height of the ground of each sign of the map."""
+    # Reversed, so that the first lane of a sign with several rules wins.
     lane_of = dict(zip(graph.rule_sign.tolist()[::-1], graph.rule_lane.tolist()[::-1], strict=True))
-    for k, (x, y) in enumerate(graph.sign_xy.astype(float).tolist()):
-        z = KERB if k in lane_of and _sidewalk(graph, lane_of[k]) else 0.0
-        yield KINDS[SignKind(int(graph.sign_kind[k]))], x, y, float(graph.sign_yaw[k]), z
+    for sign_index, (x, y) in enumerate(graph.sign_xy.astype(float).tolist()):
+        z = KERB if sign_index in lane_of and _sidewalk(graph, lane_of[sign_index]) else 0.0
+        yield KINDS[SignKind(int(graph.sign_kind[sign_index]))], x, y, float(graph.sign_yaw[sign_index]), z
 
 
 def _sidewalk(graph: LaneGraph, lane: int) -> bool:
-    """Whether a sidewalk lies to the right of a lane."""
+    """Return True if a sidewalk lies to the right of a lane."""
     while lane >= 0 and graph.kind[lane] != LaneType.SIDEWALK:
         lane = int(graph.right[lane])
     return lane >= 0
@@ -117,30 +119,35 @@ def _along_kerbs(
     graph: LaneGraph, way: F64, key: tuple[object, ...]
 ) -> Iterator[tuple[str, float, float, float, float]]:
     """As `_of_the_map`, of signs along the streets near the way, on the right of the traffic."""
-    draws = generator("record signs", *key)
+    rng = generator("record signs", *key)
     for lane in np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)).tolist():
-        beside = int(graph.right[lane])
-        if beside >= 0 and graph.kind[beside] == LaneType.DRIVING:
+        right_lane = int(graph.right[lane])
+        if right_lane >= 0 and graph.kind[right_lane] == LaneType.DRIVING:
             continue
-        for s in np.arange(float(draws.uniform(5.0, SPACING)), float(graph.length[lane]) - 3.0, SPACING).tolist():
-            chosen, kind = draws.random() < SHARE, "yield_sign" if draws.random() < YIELDS else "stop_sign"
-            beyond = float(draws.uniform(0.55, 1.1))
-            x, y, yaw, width = graph.at(lane, s)
-            if not chosen or np.hypot(way[:, 0] - x, way[:, 1] - y).min() > REACH:
+        for distance in np.arange(float(rng.uniform(5.0, SPACING)), float(graph.length[lane]) - 3.0, SPACING).tolist():
+            # Every place draws all its numbers, used or not, so that places stay independent of the route.
+            has_sign, kind = rng.random() < SHARE, "yield_sign" if rng.random() < YIELDS else "stop_sign"
+            kerb_offset = float(rng.uniform(0.55, 1.1))
+            x, y, yaw, width = graph.at(lane, distance)
+            if not has_sign or np.hypot(way[:, 0] - x, way[:, 1] - y).min() > REACH:
                 continue
-            verge = graph.at(beside, s)[3] if beside >= 0 and graph.kind[beside] == LaneType.SHOULDER else 0.0
-            aside = 0.5 * width + verge + beyond
+            shoulder_width = (
+                graph.at(right_lane, distance)[3]
+                if right_lane >= 0 and graph.kind[right_lane] == LaneType.SHOULDER
+                else 0.0
+            )
+            lateral_offset = 0.5 * width + shoulder_width + kerb_offset
             z = KERB if _sidewalk(graph, lane) else 0.0
-            yield kind, x + aside * float(np.sin(yaw)), y - aside * float(np.cos(yaw)), yaw, z
+            yield kind, x + lateral_offset * float(np.sin(yaw)), y - lateral_offset * float(np.cos(yaw)), yaw, z
 
 
 def _free(x: float, y: float, yaw: float, clear: Clear) -> tuple[float, float] | None:
     """The place, or the first one near it, before it and further from the road, where nothing stands; taken now."""
-    for away in (0.0, 0.3, 0.6):
-        for back in (0.0, 0.6, 1.2):
-            px = x + away * float(np.sin(yaw)) - back * float(np.cos(yaw))
-            py = y - away * float(np.cos(yaw)) - back * float(np.sin(yaw))
-            if clear.footprint(px, py, yaw, ROOM, ROOM):
-                clear.take(px, py, yaw, ROOM, ROOM)
-                return px, py
+    for outward in (0.0, 0.3, 0.6):
+        for backward in (0.0, 0.6, 1.2):
+            spot_x = x + outward * float(np.sin(yaw)) - backward * float(np.cos(yaw))
+            spot_y = y - outward * float(np.cos(yaw)) - backward * float(np.sin(yaw))
+            if clear.footprint(spot_x, spot_y, yaw, ROOM, ROOM):
+                clear.take(spot_x, spot_y, yaw, ROOM, ROOM)
+                return spot_x, spot_y
     return None

@@ -1,4 +1,4 @@
-"""The target of attacks, a car, a stop sign or a walker, named once: the same metal in every town and clip."""
+"""Target of attacks: a car, a stop sign or a walker, defined once, with the same mesh in every town and recording."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ssad.rendering.meshes.mesh import Mesh, Point
 
 @dataclass(frozen=True, slots=True)
 class TargetCar:
-    """A car that is the same wherever it is made.
+    """Car with the same mesh in every recording.
 
     Attributes:
-        style: Body style, see `ssad.rendering.bodies.BODIES`.
-        paint: Name of its paint, see `ssad.rendering.bodies.PAINTS`.
-        size: Length, width, height, m; the mean of the style where None.
-        seed: Of what else differs between cars of a style.
+        style: Body style, see `ssad.assets.bodies.BODIES`.
+        paint: Name of its paint, see `ssad.assets.bodies.PAINTS`.
+        size: Length, width, height, m; the mean of the style if None.
+        seed: Seed of all other differences between cars of a style.
     """
 
     style: str = "sedan"
@@ -44,20 +44,20 @@ class TargetCar:
         return PAINTS[self.paint]
 
     def mesh(self) -> Mesh:
-        """Its body."""
-        draws = generator("target car", self.style, self.seed)
-        return make_body("car", style=self.style, size=self.full_size, generator=draws)
+        """Build its body."""
+        rng = generator("target car", self.style, self.seed)
+        return make_body("car", style=self.style, size=self.full_size, generator=rng)
 
 
 @dataclass(frozen=True, slots=True)
 class _Standing:
-    """What is no car and the same wherever it is made.
+    """Target other than a car, with the same mesh in every recording.
 
     Attributes:
-        style: Body style, see `ssad.rendering.bodies.BODIES`.
-        size: Length, width, height, m; the mean of the style where None.
-        seed: Of what else differs between bodies of a style.
-        kind: Of its body.
+        style: Body style, see `ssad.assets.bodies.BODIES`.
+        size: Length, width, height, m; the mean of the style if None.
+        seed: Seed of all other differences between bodies of a style.
+        kind: Kind of its body.
     """
 
     style: str
@@ -77,19 +77,19 @@ class _Standing:
 
     @property
     def colour(self) -> tuple[float, float, float]:
-        """Linear RGB: what has no paint is grey."""
+        """Linear RGB: grey, since these bodies have no paint."""
         return (0.5, 0.5, 0.5)
 
     def mesh(self) -> Mesh:
-        """Its body; of a sign plate and post."""
+        """Build its body; that of a sign has plate and post."""
         noun = "sign" if self.kind == "stop_sign" else self.kind
-        draws = generator(f"target {noun}", self.style, self.seed)
-        return make_body(self.kind, style=self.style, size=self.full_size, generator=draws)
+        rng = generator(f"target {noun}", self.style, self.seed)
+        return make_body(self.kind, style=self.style, size=self.full_size, generator=rng)
 
 
 @dataclass(frozen=True, slots=True)
 class TargetSign(_Standing):
-    """A stop sign that is the same wherever it is made."""
+    """Stop sign with the same mesh in every recording."""
 
     style: str = "standard"
     kind: str = field(default="stop_sign", init=False)
@@ -97,7 +97,7 @@ class TargetSign(_Standing):
 
 @dataclass(frozen=True, slots=True)
 class TargetWalker(_Standing):
-    """A person on foot who is the same wherever they are; their shirt is the panels torso_front and torso_back."""
+    """Person on foot with the same mesh in every recording; the shirt is the panels torso_front and torso_back."""
 
     style: str = "standing"
     kind: str = field(default="pedestrian", init=False)
@@ -108,19 +108,24 @@ STANDING: dict[str, type[TargetSign] | type[TargetWalker]] = {"stop_sign": Targe
 
 
 def class_of_target(target: Target) -> str:
-    """The class of detectors that finds a target."""
+    """Return the class of detectors that finds a target."""
     return "car" if isinstance(target, TargetCar) else target.kind
 
 
 def parse_target(text: str) -> Target:
-    """STYLE[:PAINT[:SEED]] of a car, stop_sign[:STYLE[:SEED]] or pedestrian[:STYLE[:SEED]] as a target. ConfigError."""
+    """Parse STYLE[:PAINT[:SEED]] of a car, stop_sign[:STYLE[:SEED]] or pedestrian[:STYLE[:SEED]].
+
+    Raises:
+        ConfigError: The text has another form, or names an unknown style or paint.
+    """
     kind = text.partition(":")[0]
     if kind in STANDING:
+        # Padded, so that missing fields become empty and take their defaults.
         _, style, seed = [*text.split(":"), "", ""][:3]
         if text.count(":") > 2 or (seed and not seed.isdigit()):
             raise ConfigError(f"--target {text}: expected {kind}, {kind}:STYLE or {kind}:STYLE:SEED")
-        make = STANDING[kind]
-        return make(style or make().style, seed=int(seed or 0))
+        target_class = STANDING[kind]
+        return target_class(style or target_class().style, seed=int(seed or 0))
     style, paint, seed = [*text.split(":"), "", "", ""][:3]
     if text.count(":") > 2 or (seed and not seed.isdigit()):
         raise ConfigError(f"--target {text}: expected STYLE, STYLE:PAINT or STYLE:PAINT:SEED, such as sedan:silver:0")

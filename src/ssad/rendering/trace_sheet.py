@@ -1,4 +1,4 @@
-"""An episode as the ego's camera sees it, beside the view from above: from its recorded trace alone."""
+"""An episode from the ego's camera, beside the view from above: from its recorded trace alone."""
 
 from __future__ import annotations
 
@@ -20,50 +20,64 @@ def above(pose: F64, height: float, width: int, tall: int) -> tuple[Camera, F64]
     """A camera over a place, looking straight down, the driving direction up."""
     focal = 1.2 * tall
     camera = Camera(width, tall, np.array([[focal, 0, width / 2], [0, focal, tall / 2], [0, 0, 1]]))
-    down = np.eye(4)
-    down[:3, :3] = np.array([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], float)
-    down[:3, 3] = [8.0, 0, height]
-    return camera, pose @ down
+    downward = np.eye(4)
+    downward[:3, :3] = np.array([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], float)
+    # 8 m ahead of the ego: the road in front matters more than the road behind.
+    downward[:3, 3] = [8.0, 0, height]
+    return camera, pose @ downward
 
 
 def moments(trace: EpisodeTrace) -> list[int]:
-    """Three steps worth seeing: 3 s and 1.2 s before the first contact, and the contact; else spread over the drive."""
-    last = len(trace.x) - 1
-    hits = np.flatnonzero(trace.contact)
-    if len(hits):
-        return [max(int(hits[0] - seconds / trace.dt), 0) for seconds in (3.0, 1.2, 0.0)]
-    return [last // 4, last // 2, 3 * last // 4]
+    """Return three steps worth showing.
+
+    They are 3 s and 1.2 s before the first contact and the contact itself; without one they are spread over the
+    drive.
+    """
+    last_step = len(trace.x) - 1
+    contact_steps = np.flatnonzero(trace.contact)
+    if len(contact_steps):
+        return [max(int(contact_steps[0] - seconds / trace.dt), 0) for seconds in (3.0, 1.2, 0.0)]
+    return [last_step // 4, last_step // 2, 3 * last_step // 4]
 
 
 def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) -> U8:
-    """Three moments, camera left, view from above right."""
-    front = Camera.typical(width, width * 9 // 16)
+    """Render three moments, the camera on the left, the view from above on the right."""
+    camera_model = Camera.typical(width, width * 9 // 16)
     onboard = Onboard()
     steps = moments(trace)
-    ahead = onboard.camera(front).of_trace(trace, graph, steps=steps)
-    town, at = onboard.town(graph), moments_of(trace)
-    looks = town.looks_of_trace(trace)
+    front_images = onboard.camera(camera_model).of_trace(trace, graph, steps=steps)
+    town, all_moments = onboard.town(graph), moments_of(trace)
+    appearance = town.looks_of_trace(trace)
     rows = []
-    for step, seen in zip(steps, ahead, strict=True):
+    for step, front_image in zip(steps, front_images, strict=True):
         pose = upright_pose(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
-        over, over_pose = above(pose, 42.0, front.width, front.height)
-        things = (*town.things(looks, at[step]), *town.lights(looks, at[step], pose[:2, 3]))
-        top = render(town.scene, [View(over, over_pose, things, DAY)]).image[0]
+        overhead_camera, overhead_pose = above(pose, 42.0, camera_model.width, camera_model.height)
+        scene_objects = (
+            *town.things(appearance, all_moments[step]),
+            *town.lights(appearance, all_moments[step], pose[:2, 3]),
+        )
+        top_image = render(town.scene, [View(overhead_camera, overhead_pose, scene_objects, DAY)]).image[0]
         text = f"{step * trace.dt:.1f} s, {trace.speed[step, 0]:.1f} m/s"
-        left = captioned(np.ascontiguousarray(np.moveaxis(seen, 0, -1)), text, width)
-        rows.append(np.hstack([left, captioned(top, "from above", width)]))
+        left = captioned(np.ascontiguousarray(np.moveaxis(front_image, 0, -1)), text, width)
+        rows.append(np.hstack([left, captioned(top_image, "from above", width)]))
     return np.vstack(rows)
 
 
 def pick_trace(folder: Path) -> Path | None:
-    """The recording of a collision of the run, with a walker if there is one; any recording if nobody collides."""
+    """Return the recorded trace of a collision of the run, of any episode if there is none; None without traces.
+
+    Collisions with walkers come first.
+    """
     from ssad.core.jsonl import read_lines
 
-    found = []
+    candidates = []
     for record in read_lines(folder / "results.jsonl"):
         trace = record.get("artefacts", {}).get("trace", "")
         if trace and (folder / trace).is_file():
-            hit = bool(record.get("metrics", {}).get("collision"))
-            walker = bool(record.get("metrics", {}).get("collisions_walker"))
-            found.append((not hit, not walker, str(record["spec"]["scenario"]["name"]), record["system"], trace))
-    return folder / min(found)[-1] if found else None
+            collided = bool(record.get("metrics", {}).get("collision"))
+            hit_walker = bool(record.get("metrics", {}).get("collisions_walker"))
+            # False sorts first; the names make the choice independent of the order of the records.
+            candidates.append(
+                (not collided, not hit_walker, str(record["spec"]["scenario"]["name"]), record["system"], trace)
+            )
+    return folder / min(candidates)[-1] if candidates else None

@@ -1,4 +1,4 @@
-"""Scenarios driven in the closed loop: towns, systems, episodes, and one loop over the simulators that there are."""
+"""Scenarios driven in the closed loop: towns, systems, episodes, and one loop over all available simulators."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ HIGHWAY_TYPE = "ssad.simulators.highway_env:SCENARIO"
 
 
 class Order(Protocol):
-    """An episode that is to be driven, as plain data."""
+    """Request to drive one episode, as plain data."""
 
     @property
     def key(self) -> str:
-        """Of the episode and its trace."""
+        """Key of the episode and of its trace."""
 
     @property
     def system(self) -> str:
-        """Who drives."""
+        """Name of the driving system."""
 
     @property
     def seed(self) -> int:
-        """Of the episode."""
+        """Seed of the episode."""
 
     @property
     def spec(self) -> Mapping[str, Any]:
-        """Scenario (see `scenario_json`), repetition (0: the nominal case), spread; simulator, if it is not ours."""
+        """Scenario (see `scenario_json`), repetition (0: nominal), spread, and any external simulator."""
 
 
 def load_world(device: str) -> None:
-    """Loads the world's kernels, which are compiled on first use."""
+    """Load the world's kernels, which are compiled on first use."""
     import warp
 
     import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
@@ -62,7 +62,7 @@ def load_world(device: str) -> None:
 
 @lru_cache(maxsize=8)
 def town(name: str) -> LaneGraph:
-    """A town, read once a process."""
+    """Return a town, read once per process."""
     from ssad.simulators.highway_env import PLACES, highway_town
     from ssad.world.roads import load_town
 
@@ -71,7 +71,7 @@ def town(name: str) -> LaneGraph:
 
 @lru_cache(maxsize=4)
 def system_of(name: str) -> Driver:
-    """A driving system, made once a process."""
+    """Return a driving system, built once per process."""
     from ssad.drivers import make_system
 
     return make_system(name)
@@ -86,30 +86,31 @@ def system_version(name: str) -> str:
     """
     from ssad.drivers import find_system, weights_version
 
-    found = find_system(name)
-    if not callable(getattr(found, "act", None)) or not callable(getattr(found, "reset", None)):
+    system_type = find_system(name)
+    if not callable(getattr(system_type, "act", None)) or not callable(getattr(system_type, "reset", None)):
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(observation)")
-    source = source_version((found if isinstance(found, type) else type(found)).__module__)
-    detector = getattr(found, "weights", "")
-    if detector:  # of a perceiving system, with the weights that are shipped
+    # A system may be registered as a class or as an instance.
+    source_hash = source_version((system_type if isinstance(system_type, type) else type(system_type)).__module__)
+    weights_name = getattr(system_type, "weights", "")
+    if weights_name:  # of a perceiving system, with the weights that are shipped
         from ssad.detectors import SHIPPED
 
-        return f"{source} {safeio.read_json(SHIPPED / f'{detector}.json')['hash'][:12]}"
-    return f"{source} {weights_version(name)[:12]}".strip()
+        return f"{source_hash} {safeio.read_json(SHIPPED / f'{weights_name}.json')['hash'][:12]}"
+    return f"{source_hash} {weights_version(name)[:12]}".strip()
 
 
 def policies_of(scenario: Scenario) -> list[str]:
-    """The drivers that a scenario names for its actors, each once."""
+    """Return the distinct drivers that a scenario names for its actors, sorted."""
     return sorted({actor.policy for actor in scenario.actors} - {""})
 
 
 def type_version(name: str) -> str:
-    """12 hex digits over the source of a scenario type of the user's own ("module:object"); "" for a built-in one.
+    """Return 12 hex digits over the source of a user's scenario type ("module:object"); "" for a built-in one.
 
-    For the type that highway-env runs, with its version.
+    The type that highway-env runs has the version of highway-env appended.
     """
-    found = source_version(name.partition(":")[0]) if ":" in name else ""
-    return f"{found} {version('highway-env')}" if name == HIGHWAY_TYPE else found
+    source_hash = source_version(name.partition(":")[0]) if ":" in name else ""
+    return f"{source_hash} {version('highway-env')}" if name == HIGHWAY_TYPE else source_hash
 
 
 def in_highway(order: Order) -> bool:
@@ -127,14 +128,15 @@ def town_version(graph: LaneGraph) -> str:
     total = hashlib.sha256()
     for name, value in sorted(vars(graph).items()):
         if hasattr(value, "tobytes"):
+            # Type and shape are hashed too: equal bytes can hold different arrays.
             total.update(f"{name}{value.dtype.str}{value.shape}".encode() + value.tobytes())
     return total.hexdigest()[:12]
 
 
 def scenario_json(scenario: Scenario) -> dict[str, Any]:
-    """A scenario as plain data, as it stands in YAML, with its defaults written out."""
-    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
-    return data
+    """Return a scenario as plain data, as it stands in YAML, with its defaults written out."""
+    plain: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
+    return plain
 
 
 def episode_of(order: Order) -> Episode:
@@ -184,88 +186,106 @@ def drive(
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
-    episodes = [replace(episode_of(order), key=key(order)) for order in orders]
+    # Runs that are to be compared can share the noise of their sensors through this key.
+    episodes = [replace(episode_of(request), key=key(request)) for request in orders]
     graphs = {episode.town: town(episode.town) for episode in episodes}
     system = driver or system_of(orders[0].system)
     policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
-    for one in (system, *policies.values()):
-        if callable(getattr(one, "to", None)):
-            one.to(device)  # type: ignore[attr-defined]
-    away = orders[0].spec.get("simulator")
+    for agent_driver in (system, *policies.values()):
+        if callable(getattr(agent_driver, "to", None)):
+            agent_driver.to(device)  # type: ignore[attr-defined]
+    server_spec = orders[0].spec.get("simulator")
     simulator: Simulator
-    if away:
+    if server_spec:
         from ssad.simulators.carla.sensors import Own, eyes_of
         from ssad.simulators.carla.server import Server
         from ssad.simulators.carla.simulator import Carla
 
-        server = Server.of(away)
-        eyes = eyes_of(asked_sensors([system]), STEP) if server.sensors == "carla" and sensors is None else {}
-        simulator = Carla(episodes, graphs, server=server, eyes=eyes)
-        if eyes:
-            sensors = onboard_sensors(list(policies.values()), device) | {name: Own(name) for name in eyes}
+        server = Server.of(server_spec)
+        carla_cameras = eyes_of(asked_sensors([system]), STEP) if server.sensors == "carla" and sensors is None else {}
+        simulator = Carla(episodes, graphs, server=server, eyes=carla_cameras)
+        if carla_cameras:
+            sensors = onboard_sensors(list(policies.values()), device) | {name: Own(name) for name in carla_cameras}
     else:
         simulator = HighwayEnv(episodes, graphs) if in_highway(orders[0]) else World(episodes, graphs, device=device)
     if sensors is None:
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
         traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
-        measured = dict(getattr(simulator, "measured", {}))
+        simulator_metrics = dict(getattr(simulator, "measured", {}))
     finally:
+        # External simulators hold a connection, which must end even if a driver raises.
         getattr(simulator, "close", lambda: None)()
-    return episodes, [replace(trace, key=order.key) for trace, order in zip(traces, orders, strict=True)], measured
+    return (
+        episodes,
+        [replace(trace, key=request.key) for trace, request in zip(traces, orders, strict=True)],
+        simulator_metrics,
+    )
 
 
 def asked_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
-    """The cameras that drivers ask for, and the LiDARs and radars beside a word that says which, by name."""
+    """Return the sensors that drivers name in `sensors`, by name.
+
+    Returns:
+        Cameras, and pairs ("lidar" or "radar", model).
+    """
     from ssad.rendering.camera.rig import rig_camera
     from ssad.rendering.lidar import HDL32E
 
-    found: dict[str, Camera | tuple[str, Lidar]] = {}
+    sensors: dict[str, Camera | tuple[str, Lidar]] = {}
     for driver in drivers:
-        own: dict[str, Camera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
-        own |= {name: ("lidar", one) for name, one in getattr(driver, "lidars", {}).items()}
-        own |= {name: ("radar", one) for name, one in getattr(driver, "radars", {}).items()}
+        # A driver's own models take precedence over the sensors of nuScenes with the same name.
+        driver_sensors: dict[str, Camera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        driver_sensors |= {
+            name: ("lidar", sensor_model) for name, sensor_model in getattr(driver, "lidars", {}).items()
+        }
+        driver_sensors |= {
+            name: ("radar", sensor_model) for name, sensor_model in getattr(driver, "radars", {}).items()
+        }
         for name in getattr(driver, "sensors", ()):
-            if name in own:
-                found[name] = own[name]
+            if name in driver_sensors:
+                sensors[name] = driver_sensors[name]
             elif name in CAMERAS:
-                found[name] = rig_camera(name, WIDTH)
+                sensors[name] = rig_camera(name, WIDTH)
             elif name == LIDAR:
-                found[name] = "lidar", HDL32E
-    return found
+                sensors[name] = "lidar", HDL32E
+    return sensors
 
 
 def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
     """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own sensors."""
-    asked = asked_sensors(drivers)
-    if not asked:
+    required = asked_sensors(drivers)
+    if not required:
         return {}
     from ssad.rendering.onboard import Onboard
     from ssad.rendering.radar import OnboardRadar
 
     onboard = Onboard(device=device)
-    found: dict[str, Sensor] = {**onboard.rig(), LIDAR: onboard.lidar()}
-    for name, one in asked.items():
-        if isinstance(one, tuple):
-            found[name] = onboard.lidar(one[1]) if one[0] == "lidar" else OnboardRadar(onboard, one[1])
+    sensors: dict[str, Sensor] = {**onboard.rig(), LIDAR: onboard.lidar()}
+    for name, sensor_model in required.items():
+        if isinstance(sensor_model, tuple):
+            sensors[name] = (
+                onboard.lidar(sensor_model[1]) if sensor_model[0] == "lidar" else OnboardRadar(onboard, sensor_model[1])
+            )
         else:
-            found[name] = onboard.camera(one)
-    return found
+            sensors[name] = onboard.camera(sensor_model)
+    return sensors
 
 
 def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:
-    """Who could have avoided the collision of a drive."""
+    """Grade the collision of a drive by the drivers that could have avoided it."""
     return grades_of([(episode, trace)], device)[0]
 
 
 def grades_of(drives: Sequence[tuple[Episode, EpisodeTrace]], device: str) -> list[Grade]:
-    """Who could have avoided the collision of each drive; all are played side by side."""
+    """Grade the collisions of drives by the drivers that could have avoided them; all are replayed side by side."""
     from ssad.drivers import make_system
     from ssad.drivers.careful.grade import grade_collisions
 
-    made = [
-        make_system(name) for name in dict.fromkeys(n for episode, _ in drives for n in policies_of(episode.scenario))
+    policies = [
+        make_system(name)
+        for name in dict.fromkeys(policy_name for episode, _ in drives for policy_name in policies_of(episode.scenario))
     ]
-    sensors = onboard_sensors(made, device)
-    known = [(episode, town(episode.town), trace) for episode, trace in drives]
-    return grade_collisions(known, device=device, policies=make_system, sensors=sensors)
+    sensors = onboard_sensors(policies, device)
+    graded_drives = [(episode, town(episode.town), trace) for episode, trace in drives]
+    return grade_collisions(graded_drives, device=device, policies=make_system, sensors=sensors)

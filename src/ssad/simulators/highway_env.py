@@ -1,10 +1,10 @@
 """highway-env as a simulator: its intersection and its highway, with SSAD's drivers, sensors, metrics and reports.
 
-highway-env moves everybody by its own models; its vehicles are mirrored, step by step, in a `World` in which each is
-placed where highway-env has it. The mirror knows lanes, routes and contacts, so that all that SSAD has for its own
-world works here too: also the Autopilot and the blind follower, which plan in the mirror and act in highway-env.
+highway-env moves all vehicles by its own models; a `World` mirrors them at each step, each placed where highway-env
+has it. The mirror knows lanes, routes and contacts, so that SSAD's own tools work here too, including the Autopilot
+and the blind follower, which plan in the mirror and act in highway-env.
 
-Needs the extra `highway`. highway-env's y axis points down: it is turned here and nowhere else.
+Needs the extra `highway`. highway-env's y axis points down: it is flipped here and nowhere else.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from ssad.simulators.mirrored import Mirrored
 from ssad.world.kernels.data import Presence
 from ssad.world.world import World
 
-TYPE = "ssad.simulators.highway_env:SCENARIO"  # of the scenarios made here
+TYPE = "ssad.simulators.highway_env:SCENARIO"  # type of the scenarios of this module
 SPARE = 12  # slots of an episode for vehicles that appear while it runs
 SUBSTEPS = 2  # of highway-env in a step of 0.1 s, as in `World`
-LONGEST_LANE = 1500.0  # m of its highway, which is 10 km long, that are mapped
+LONGEST_LANE = 1500.0  # m, mapped part of its highway, which is 10 km long
 MAX_STEER = np.pi / 4  # rad, highway-env's own limits of a continuous action
 MAX_ACCELERATION = 5.0  # m/s^2
 # highway-env's bicycle turns about the middle of a body of 5 m, as the world's does with that wheelbase
@@ -56,9 +56,9 @@ class Place:
     Attributes:
         environment: Its name.
         route: Nodes of the ego's route; empty: straight on.
-        target_speed: m/s.
-        duration: s.
-        spawn_every: Steps after which a vehicle may appear; 0: never.
+        target_speed: Target speed of the ego, m/s.
+        duration: Time limit, s.
+        spawn_every: Steps between possible new vehicles; 0: none appear.
     """
 
     environment: str
@@ -76,36 +76,36 @@ PLACES: dict[str, Place] = {
 
 
 def highway_scenarios(count: int = 4) -> tuple[Scenario, ...]:
-    """`count` scenarios of each place; the seed says which traffic meets the ego."""
-    found = []
+    """Return `count` scenarios of each place; the seed determines the traffic."""
+    scenarios = []
     for town, place in PLACES.items():
         limits = Limits(max_steps=round(place.duration * 10), max_time=place.duration)
         for seed in range(count):
             ego = highway_episode(Scenario("", TYPE, town, (), seed=seed, limits=limits)).agents[0]
             assert ego.route is not None
-            ends = tuple(Pose(*(float(v) for v in ego.route.xy[k])) for k in (0, -1))
+            ends = tuple(Pose(*(float(coordinate) for coordinate in ego.route.xy[end_index])) for end_index in (0, -1))
             name = f"{town}/{seed:02d}"
-            found.append(
+            scenarios.append(
                 Scenario(name, TYPE, town, ends, seed=seed, limits=limits, target_speed=place.target_speed, group=town)
             )
-    return tuple(found)
+    return tuple(scenarios)
 
 
 def _gymnasium(place: Place, seed: int) -> Any:
-    """A running environment of highway-env. ConfigError if it is not installed."""
+    """Return a running environment of highway-env. ConfigError if it is not installed."""
     try:
         import gymnasium
         import highway_env  # noqa: F401  registers its environments
         from highway_env.vehicle.behavior import IDMVehicle
     except ImportError as error:
         raise ConfigError(f"highway-env is not installed ({error}); install the extra 'highway'") from None
-    for name, value in _DEFAULTS.items():  # its intersection changes them for everybody
+    for name, value in _DEFAULTS.items():  # its intersection changes them for all environments of the process
         setattr(IDMVehicle, name, value)
     config = {"simulation_frequency": 10 * SUBSTEPS, "policy_frequency": 10, "action": {"type": "ContinuousAction"}}
-    env: Any = gymnasium.make(place.environment, config=config, disable_env_checker=True).unwrapped
-    env.reset(seed=seed)
-    env.vehicle.collidable = False  # contacts are told by the mirror; highway-env would push bodies apart before
-    return env
+    environment: Any = gymnasium.make(place.environment, config=config, disable_env_checker=True).unwrapped
+    environment.reset(seed=seed)
+    environment.vehicle.collidable = False  # the mirror detects contacts; highway-env would push bodies apart before
+    return environment
 
 
 # IDMVehicle's parameters before an environment changes them
@@ -113,59 +113,81 @@ _DEFAULTS = {"DISTANCE_WANTED": 10.0, "COMFORT_ACC_MAX": 3.0, "COMFORT_ACC_MIN":
 
 
 def _pose(vehicle: Any) -> tuple[float, float, float]:
-    x, y = (float(v) for v in vehicle.position)
+    x, y = (float(coordinate) for coordinate in vehicle.position)
+    # The angle of a unit complex number lies in (-pi, pi]; highway-env's headings are not wrapped.
     return x, -y, -float(np.angle(np.exp(1j * vehicle.heading)))
 
 
 def _lane_points(lane: Any) -> tuple[F32, F32, F32]:
-    """Points [n, 2], headings and arc lengths of a lane of highway-env."""
+    """Return points [n, 2], headings and arc lengths of a lane of highway-env."""
     length = min(float(lane.length), LONGEST_LANE)
     step = 5.0 if type(lane).__name__ == "StraightLane" else 0.5
     s = np.linspace(0.0, length, max(int(np.ceil(length / step)) + 1, 2))
-    xy = np.array([lane.position(v, 0.0) for v in s]) * [1.0, -1.0]
-    yaw = -np.array([lane.heading_at(v) for v in s])
+    xy = np.array([lane.position(distance, 0.0) for distance in s]) * [1.0, -1.0]
+    yaw = -np.array([lane.heading_at(distance) for distance in s])
     yaw = np.angle(np.exp(1j * yaw))
     return xy.astype(np.float32), yaw.astype(np.float32), s.astype(np.float32)
 
 
 @lru_cache(maxsize=4)
 def highway_town(name: str) -> LaneGraph:
-    """The lane graph of one of highway-env's places."""
+    """Return the lane graph of one of highway-env's places."""
     graph = _gymnasium(PLACES[name], 0).road.network.graph
-    edges = [(a, b) for a in graph for b in graph[a]]
-    index = {(a, b, k): None for a, b in edges for k in range(len(graph[a][b]))}
-    number = {key: n for n, key in enumerate(index)}
-    lanes = [graph[a][b][k] for a, b, k in index]
-    parts = [_lane_points(lane) for lane in lanes]
-    offset = np.cumsum([0, *(len(p[2]) for p in parts)])
-    succ = [
-        [number[b, c, j] for c in graph.get(b, {}) for j in range(len(graph[b][c])) if len(graph[b][c]) == 1 or j == k]
-        for a, b, k in index
+    edges = [(start_node, end_node) for start_node in graph for end_node in graph[start_node]]
+    lane_keys = {
+        (start_node, end_node, lane_index): None
+        for start_node, end_node in edges
+        for lane_index in range(len(graph[start_node][end_node]))
+    }
+    lane_numbers = {key: position for position, key in enumerate(lane_keys)}
+    lanes = [graph[start_node][end_node][lane_index] for start_node, end_node, lane_index in lane_keys]
+    geometry = [_lane_points(lane) for lane in lanes]
+    offset = np.cumsum([0, *(len(part[2]) for part in geometry)])
+    successors = [
+        [
+            lane_numbers[end_node, following_node, following_index]
+            for following_node in graph.get(end_node, {})
+            for following_index in range(len(graph[end_node][following_node]))
+            if len(graph[end_node][following_node]) == 1 or following_index == lane_index
+        ]
+        for start_node, end_node, lane_index in lane_keys
     ]
-    ways_in = {b: sum(1 for edge in edges if edge[1] == b) for _, b in edges}
-    inside = [len(graph[a]) > 1 and ways_in[b] > 1 for a, b, _ in index]
-    marks = {0: Marking.NONE, 1: Marking.BROKEN, 2: Marking.SOLID, 3: Marking.SOLID}
-    count = len(lanes)
+    ways_in = {end_node: sum(1 for edge in edges if edge[1] == end_node) for _, end_node in edges}
+    is_junction = [len(graph[start_node]) > 1 and ways_in[end_node] > 1 for start_node, end_node, _ in lane_keys]
+    marking_of_line = {0: Marking.NONE, 1: Marking.BROKEN, 2: Marking.SOLID, 3: Marking.SOLID}
+    lane_count = len(lanes)
     return LaneGraph(
         name=name,
-        xy=np.concatenate([p[0] for p in parts]),
+        xy=np.concatenate([part[0] for part in geometry]),
         z=np.zeros(offset[-1], np.float32),
-        yaw=np.concatenate([p[1] for p in parts]),
+        yaw=np.concatenate([part[1] for part in geometry]),
         width=np.full(offset[-1], 4.0, np.float32),
-        s=np.concatenate([p[2] for p in parts]),
+        s=np.concatenate([part[2] for part in geometry]),
         offset=offset.astype(np.int32),
-        kind=np.full(count, LaneType.DRIVING, np.uint8),
-        road=np.array([edges.index(key[:2]) for key in index], np.int32),
-        section=np.zeros(count, np.int32),
-        lane_id=np.array([-1 - k for _, _, k in index], np.int32),
-        junction=np.where(inside, 0, -1).astype(np.int32),
+        kind=np.full(lane_count, LaneType.DRIVING, np.uint8),
+        road=np.array([edges.index(key[:2]) for key in lane_keys], np.int32),
+        section=np.zeros(lane_count, np.int32),
+        lane_id=np.array([-1 - lane_index for _, _, lane_index in lane_keys], np.int32),
+        junction=np.where(is_junction, 0, -1).astype(np.int32),
         speed_limit=np.array([lane.speed_limit or 30.0 for lane in lanes], np.float32),
-        left=np.array([number.get((a, b, k - 1), -1) for a, b, k in index], np.int32),
-        right=np.array([number.get((a, b, k + 1), -1) for a, b, k in index], np.int32),
-        left_marking=np.array([marks[lane.line_types[0]] for lane in lanes], np.uint8),
-        right_marking=np.array([marks[lane.line_types[1]] for lane in lanes], np.uint8),
-        succ_offset=np.cumsum([0, *(len(s) for s in succ)]).astype(np.int32),
-        succ=np.array([k for s in succ for k in s], np.int32),
+        left=np.array(
+            [
+                lane_numbers.get((start_node, end_node, lane_index - 1), -1)
+                for start_node, end_node, lane_index in lane_keys
+            ],
+            np.int32,
+        ),
+        right=np.array(
+            [
+                lane_numbers.get((start_node, end_node, lane_index + 1), -1)
+                for start_node, end_node, lane_index in lane_keys
+            ],
+            np.int32,
+        ),
+        left_marking=np.array([marking_of_line[lane.line_types[0]] for lane in lanes], np.uint8),
+        right_marking=np.array([marking_of_line[lane.line_types[1]] for lane in lanes], np.uint8),
+        succ_offset=np.cumsum([0, *(len(lane_successors) for lane_successors in successors)]).astype(np.int32),
+        succ=np.array([lane_index for lane_successors in successors for lane_index in lane_successors], np.int32),
         **no_signals(),
     )
 
@@ -173,62 +195,72 @@ def highway_town(name: str) -> LaneGraph:
 def _ego_route(env: Any, place: Place) -> Route:
     """A point a metre, from the ego along its lanes: to the end, or as far as it comes at its target speed."""
     network, ego = env.road.network, env.vehicle
-    keys = list(zip(place.route, place.route[1:], strict=False)) or [ego.lane_index[:2]]
-    index = [(*key, ego.lane_index[2] if not place.route else 0) for key in keys]
-    numbers = {key: n for n, key in enumerate(network.lanes_dict())}
-    first = float(network.get_lane(index[0]).local_coordinates(ego.position)[0])
+    node_pairs = list(zip(place.route, place.route[1:], strict=False)) or [ego.lane_index[:2]]
+    lane_keys = [(*key, ego.lane_index[2] if not place.route else 0) for key in node_pairs]
+    numbers = {key: key_index for key_index, key in enumerate(network.lanes_dict())}
+    start_distance = float(network.get_lane(lane_keys[0]).local_coordinates(ego.position)[0])
     rows = []
-    for n, key in enumerate(index):
+    for key_index, key in enumerate(lane_keys):
         lane = network.get_lane(key)
-        start = first if n == 0 else 0.0
-        end = float(lane.length) if place.route else first + place.duration * place.target_speed
-        for s in np.arange(start, end, 0.25):
-            rows.append((*lane.position(s, 0.0), lane.heading_at(s), numbers[key], lane.speed_limit or 30.0))
+        start = start_distance if key_index == 0 else 0.0
+        end = float(lane.length) if place.route else start_distance + place.duration * place.target_speed
+        for distance in np.arange(start, end, 0.25):
+            rows.append(
+                (*lane.position(distance, 0.0), lane.heading_at(distance), numbers[key], lane.speed_limit or 30.0)
+            )
     table = np.array(rows)
-    u = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(table[:, :2], axis=0).T))])
-    at = np.arange(0.0, u[-1])
-    near = np.searchsorted(u, at)
-    xy = np.stack([np.interp(at, u, table[:, 0]), -np.interp(at, u, table[:, 1])], 1)
-    yaw = np.angle(np.exp(-1j * table[near, 2]))
+    arc_lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(table[:, :2], axis=0).T))])
+    point_distances = np.arange(0.0, arc_lengths[-1])
+    nearest = np.searchsorted(arc_lengths, point_distances)
+    xy = np.stack(
+        [np.interp(point_distances, arc_lengths, table[:, 0]), -np.interp(point_distances, arc_lengths, table[:, 1])], 1
+    )
+    yaw = np.angle(np.exp(-1j * table[nearest, 2]))
     return Route(
         xy=xy.astype(np.float32),
         yaw=yaw.astype(np.float32),
-        lane=table[near, 3].astype(np.int32),
-        speed_limit=table[near, 4].astype(np.float32),
-        width=np.full(len(at), 4.0, np.float32),
+        lane=table[nearest, 3].astype(np.int32),
+        speed_limit=table[nearest, 4].astype(np.float32),
+        width=np.full(len(point_distances), 4.0, np.float32),
     )
 
 
 def highway_episode(scenario: Scenario, seed: int | None = None) -> Episode:
-    """The concrete episode of a scenario of `highway_scenarios`: the ego, its traffic, slots for who comes later.
+    """Return the episode of a scenario of `highway_scenarios`: the ego, its traffic, and slots for later vehicles.
 
-    `seed` draws other traffic than the scenario's own.
+    Args:
+        scenario: The scenario.
+        seed: Draws other traffic than the scenario's own; None: the scenario's seed.
     """
     place = PLACES[scenario.town]
     seed = scenario.seed if seed is None else seed
-    env = _gymnasium(place, seed)
-    x, y, yaw = _pose(env.vehicle)
+    environment = _gymnasium(place, seed)
+    x, y, yaw = _pose(environment.vehicle)
     ego = EpisodeAgent(
         "ego",
         "car",
         Controller.FOLLOW,
         Pose(x, y, yaw),
-        float(env.vehicle.speed),
+        float(environment.vehicle.speed),
         place.target_speed,
-        route=_ego_route(env, place),
+        route=_ego_route(environment, place),
     )
-    others = [v for v in env.road.vehicles if v is not env.vehicle]
+    others = [vehicle for vehicle in environment.road.vehicles if vehicle is not environment.vehicle]
     agents = [
-        EpisodeAgent(f"vehicle {k}", "car", Controller.PLACED, Pose(*_pose(v)), float(v.speed))
-        for k, v in enumerate(others, 1)
+        EpisodeAgent(f"vehicle {number}", "car", Controller.PLACED, Pose(*_pose(vehicle)), float(vehicle.speed))
+        for number, vehicle in enumerate(others, 1)
     ]
-    spare = SPARE if place.spawn_every else 0
-    later = [EpisodeAgent(f"later {k}", "car", Controller.PLACED, Pose(x, y, yaw)) for k in range(spare)]
-    return Episode(scenario.name, scenario, scenario.town, (ego, *agents, *later), limits=scenario.limits, seed=seed)
+    spare_count = SPARE if place.spawn_every else 0
+    spare_agents = [
+        EpisodeAgent(f"later {number}", "car", Controller.PLACED, Pose(x, y, yaw)) for number in range(spare_count)
+    ]
+    return Episode(
+        scenario.name, scenario, scenario.town, (ego, *agents, *spare_agents), limits=scenario.limits, seed=seed
+    )
 
 
 def _traffic(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """The agents after the ego; highway-env draws them by the scenario's seed."""
+    """Return the agents after the ego; highway-env draws them by the scenario's seed."""
     return list(highway_episode(scenario).agents[1:])
 
 
@@ -254,86 +286,93 @@ class HighwayEnv(Mirrored):
 
     @property
     def assigned(self) -> I32:
-        """[B] number of the episode that each scene runs."""
+        """[B] number of the episode of each scene."""
         return self.mirror.assigned
 
     def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
-        """Start scenes again, with other episodes if given."""
+        """Restart scenes, with other episodes if given."""
         from highway_env.vehicle.behavior import IDMVehicle
 
         self.mirror.reset(scenes, episodes=episodes)
-        gone = np.zeros((self.batch, self.agents), bool)
-        for b in range(self.batch) if scenes is None else np.asarray(scenes).tolist():
-            episode = self.episodes[self.assigned[b]]
-            env = _gymnasium(PLACES[episode.town], episode.seed)
-            others = [v for v in env.road.vehicles if v is not env.vehicle]
-            self._environments[b] = env
-            self._slots[b] = [env.vehicle, *others, *[None] * (self.agents - 1 - len(others))]
-            self._habits[b] = {name: getattr(IDMVehicle, name) for name in _DEFAULTS}
-            gone[b] = [v is None for v in self._slots[b]]
-            self._controls[b] = 0.0
-        self.mirror.remove(gone)
+        absent = np.zeros((self.batch, self.agents), bool)
+        for scene_index in range(self.batch) if scenes is None else np.asarray(scenes).tolist():
+            episode = self.episodes[self.assigned[scene_index]]
+            environment = _gymnasium(PLACES[episode.town], episode.seed)
+            others = [vehicle for vehicle in environment.road.vehicles if vehicle is not environment.vehicle]
+            self._environments[scene_index] = environment
+            self._slots[scene_index] = [environment.vehicle, *others, *[None] * (self.agents - 1 - len(others))]
+            self._habits[scene_index] = {name: getattr(IDMVehicle, name) for name in _DEFAULTS}
+            absent[scene_index] = [vehicle is None for vehicle in self._slots[scene_index]]
+            self._controls[scene_index] = 0.0
+        self.mirror.remove(absent)
 
     def step(self, controls: npt.ArrayLike | None = None) -> None:
-        """Advance every running scene by 0.1 s."""
+        """Advance all running scenes by 0.1 s."""
         world = self.mirror
         if controls is not None:
             world.set_controls(controls)
             self._controls[:] = world.array("controls")
         world.plan()
-        said = world.array("controller").copy()
-        control = np.where((said == Controller.EXTERNAL)[..., None], self._controls, world.array("control"))
-        places = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
+        controllers = world.array("controller").copy()
+        control = np.where((controllers == Controller.EXTERNAL)[..., None], self._controls, world.array("control"))
+        placements = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
         active = world.array("active").copy()
-        for b in np.flatnonzero(world.ended() == 0).tolist():
-            self._advance(b, said[b], control[b])
-            for i, vehicle in enumerate(self._slots[b]):
-                active[b, i] = Presence.ABSENT if vehicle is None else Presence.AWAKE
+        for scene_index in np.flatnonzero(world.ended() == 0).tolist():
+            self._advance(scene_index, controllers[scene_index], control[scene_index])
+            for agent_index, vehicle in enumerate(self._slots[scene_index]):
+                active[scene_index, agent_index] = Presence.ABSENT if vehicle is None else Presence.AWAKE
                 if vehicle is not None:
-                    places[b, i] = *_pose(vehicle), vehicle.speed
+                    placements[scene_index, agent_index] = *_pose(vehicle), vehicle.speed
         world.put("control", control.astype(np.float32))
         world.put("active", active)
-        world.place(places)
-        # who moves here is highway-env alone
-        world.put("controller", np.full_like(said, Controller.PLACED))
+        world.place(placements)
+        # while the mirror advances, highway-env alone moves agents
+        world.put("controller", np.full_like(controllers, Controller.PLACED))
         world.advance()
-        world.put("controller", said)
+        world.put("controller", controllers)
 
     def _advance(self, b: int, controller: I32, control: F32) -> None:
         """Let highway-env move a scene by a step."""
         from highway_env.vehicle.behavior import IDMVehicle
 
-        env, slots = self._environments[b], self._slots[b]
+        environment, slots = self._environments[b], self._slots[b]
+        # These are class attributes, shared by all environments of the process: set this scene's before it moves.
         for name, value in self._habits[b].items():
             setattr(IDMVehicle, name, value)
-        ours = [i for i, v in enumerate(slots) if v is not None and (i == 0 or controller[i] != Controller.PLACED)]
+        controlled = [
+            agent_index
+            for agent_index, candidate in enumerate(slots)
+            if candidate is not None and (agent_index == 0 or controller[agent_index] != Controller.PLACED)
+        ]
         for _ in range(SUBSTEPS):
-            env.road.act()
-            for i in ours:
-                slots[i].action = self._action(slots[i], control[i])
-            env.road.step(self.dt / SUBSTEPS)
-            for i in ours:  # the brake holds, it does not reverse
-                if slots[i].speed < 0.0 and control[i, 3] <= 0.5:
-                    slots[i].speed = 0.0
-        env.time += self.dt
+            environment.road.act()
+            for agent_index in controlled:
+                slots[agent_index].action = self._action(slots[agent_index], control[agent_index])
+            environment.road.step(self.dt / SUBSTEPS)
+            for agent_index in controlled:  # the brake holds, it does not reverse
+                if slots[agent_index].speed < 0.0 and control[agent_index, 3] <= 0.5:
+                    slots[agent_index].speed = 0.0
+        environment.time += self.dt
         place = PLACES[self.episodes[self.assigned[b]].town]
         step = int(self.mirror.array("step")[b]) + 1
         if place.spawn_every and step % place.spawn_every == 0:
-            env._clear_vehicles()
-            env._spawn_vehicle(spawn_probability=env.config["spawn_probability"])
-        free = [i for i, v in enumerate(slots) if v is None]  # who left in this step leaves a slot for the next one
-        present = {id(v) for v in env.road.vehicles}
-        known = {id(v) for v in slots if v is not None}
-        for i, vehicle in enumerate(slots):
-            if vehicle is not None and id(vehicle) not in present:
-                slots[i] = None
-        appeared = [v for v in env.road.vehicles if id(v) not in known]
-        for i, vehicle in zip(free, appeared, strict=False):
-            slots[i] = vehicle
+            environment._clear_vehicles()
+            environment._spawn_vehicle(spawn_probability=environment.config["spawn_probability"])
+        free_slots = [
+            agent_index for agent_index, candidate in enumerate(slots) if candidate is None
+        ]  # who left in this step leaves a slot for the next one
+        present_ids = {id(candidate) for candidate in environment.road.vehicles}
+        tracked_ids = {id(candidate) for candidate in slots if candidate is not None}
+        for agent_index, vehicle in enumerate(slots):
+            if vehicle is not None and id(vehicle) not in present_ids:
+                slots[agent_index] = None
+        appeared = [candidate for candidate in environment.road.vehicles if id(candidate) not in tracked_ids]
+        for agent_index, vehicle in zip(free_slots, appeared, strict=False):
+            slots[agent_index] = vehicle
 
     @staticmethod
     def _action(vehicle: Any, control: F32) -> dict[str, float]:
-        throttle, brake, steer, reverse = (float(v) for v in np.clip(control, [0, 0, -1, 0], 1))
-        push = throttle * MAX_ACCELERATION * (-1.0 if reverse > 0.5 else 1.0)
-        drag = brake * MAX_ACCELERATION * float(np.sign(vehicle.speed))
-        return {"acceleration": push - drag, "steering": -steer * MAX_STEER}
+        throttle, brake, steer, reverse = (float(value) for value in np.clip(control, [0, 0, -1, 0], 1))
+        drive_acceleration = throttle * MAX_ACCELERATION * (-1.0 if reverse > 0.5 else 1.0)
+        brake_deceleration = brake * MAX_ACCELERATION * float(np.sign(vehicle.speed))
+        return {"acceleration": drive_acceleration - brake_deceleration, "steering": -steer * MAX_STEER}

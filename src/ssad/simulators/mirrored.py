@@ -1,4 +1,4 @@
-"""What every adapter of a foreign simulator answers from the embedded world that follows it, its mirror."""
+"""Base of the adapters of foreign simulators, backed by an embedded world that mirrors their state."""
 
 from __future__ import annotations
 
@@ -14,34 +14,35 @@ class Mirrored:
     """A simulator whose state is copied into an embedded world at each step.
 
     Attributes:
-        mirror: The world that follows; it holds who drives whom, what egos believe and how episodes went.
+        mirror: The world that mirrors it; it holds the drivers, the beliefs of egos and the outcomes of
+            episodes.
     """
 
     mirror: World
 
     def state(self) -> WorldState:
-        """Where everybody is."""
+        """Return the state of all agents."""
         return self.mirror.state()
 
     @property
     def measured(self) -> Mapping[str, Any]:
-        """What it has counted in this episode by sensors of its own, beside what the mirror measures."""
+        """Return what the simulator's own sensors have measured in this episode, beyond the mirror's measurements."""
         return {}
 
     def ended(self) -> I32:
-        """[B] why scenes ended, an index into ENDS."""
+        """Return [B] the reasons why scenes ended, as indices into ENDS."""
         return self.mirror.ended()
 
     def take(
         self, agents: Bool, controller: Controller | None, *, policy: int = -1, target_speed: float | None = None
     ) -> None:
-        """Let somebody else drive agents, as `World.take`."""
+        """Hand agents over to another driver, as `World.take`."""
         self.mirror.take(agents, controller, policy=policy, target_speed=target_speed)
 
     def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
-        """Hand in what egos believe, as `World.believe`."""
+        """Store the beliefs of egos, as `World.believe`."""
         self.mirror.believe(belief, scenes)
 
     def truth(self) -> Belief:
-        """The truth as a belief, as `World.truth`."""
+        """Return the truth as a belief, as `World.truth`."""
         return self.mirror.truth()

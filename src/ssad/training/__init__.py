@@ -1,1 +1,1 @@
-"""Training of detectors: recipes, batches, the loop."""
+"""Training of detectors, drivers and adversaries: recipes, batches and training loops."""

@@ -1,4 +1,4 @@
-"""`ssad train adversary`: Adv.PPO, a policy that drives background vehicles into an ego's way, with its card."""
+"""`ssad train adversary`: Adv.PPO, a policy that drives background vehicles into the ego's path, with its card."""
 
 from __future__ import annotations
 
@@ -89,16 +89,17 @@ REWARDS = ("adversary", "colliding", "feasible")
 
 @dataclass(frozen=True, slots=True)
 class AdversaryPlan:
-    """A training run.
+    """Plan of an adversary training.
 
     Attributes:
         algorithm: A name of `ADVERSARIES`.
         out: Folder to write to.
-        ego: Driving system that it is trained against.
-        scenarios: Natural traffic to learn in; none: the usual of the algorithm (`SCENARIOS`, or `training`).
-        test: What the weights are measured on in the end.
-        literal: Whether the reward is equation 6 as it is printed.
-        off_road: What each step off the road costs an adversary (the paper and FREA: 0).
+        ego: Driving system under attack.
+        scenarios: Training scenarios with natural traffic; empty: the default of the algorithm (`SCENARIOS`, or
+            `training`).
+        test: Scenarios of the final test.
+        literal: Use equation 6 as printed for the reward.
+        off_road: Cost of each step of an adversary off the road (the paper and FREA: 0).
         changes: Changed values of the recipe.
         seconds: Time limit, s; None: none.
     """
@@ -114,46 +115,48 @@ class AdversaryPlan:
     seconds: float | None = None
 
     def learned_in(self) -> tuple[str, ...]:
-        """The sets and files that it learns in."""
+        """Return the sets and files of the training."""
         return self.scenarios or SCENARIOS.get(self.algorithm, ("training",))
 
 
 def natural_only(refs: Sequence[str]) -> tuple[list[Scenario], dict[str, Any]]:
     """The scenarios of some sets that have background traffic, and the lane graphs of their towns."""
-    found, graphs = find_scenarios(refs)
-    kept = [s for s in found if s.type == "NaturalJunction" or s.traffic is not None]
-    return kept, {name: graphs[name] for name in sorted({s.town for s in kept})}
+    scenarios, graphs = find_scenarios(refs)
+    with_traffic = [
+        scenario for scenario in scenarios if scenario.type == "NaturalJunction" or scenario.traffic is not None
+    ]
+    return with_traffic, {name: graphs[name] for name in sorted({scenario.town for scenario in with_traffic})}
 
 
 def measure_adversary(
     driver: Driver | None, ego: str, scenarios: Sequence[Scenario], graphs: Any, *, seed: int, count: int = 1
 ) -> dict[str, float]:
-    """What adversaries do to an ego.
+    """Measure the effect of adversaries on an ego.
 
     Args:
-        driver: Drives those whom FREA's rules choose; None: nobody is chosen.
+        driver: Driver of the agents selected by FREA's rules; None: no adversaries.
         ego: Driving system.
-        scenarios: Where.
+        scenarios: Scenarios of the test.
         graphs: Lane graphs of their towns.
-        seed: Of the episodes.
-        count: Adversaries at once.
+        seed: Seed of the episodes.
+        count: Simultaneous adversaries.
 
     Returns:
-        Shares of the episodes: CR, the ego collides with anybody; valid, with an adversary that stayed on the road and
-        touched nobody else; off, an adversary left the road; others, one touched somebody else.
+        Shares of the episodes: CR, the ego collides; valid, it collides with an adversary that stayed on the road and
+        touched no other agent; off, an adversary left the road; others, an adversary touched another agent.
     """
     trials = Trials(lambda: make_system(ego), policies=make_system)
     drivers = {} if driver is None else {FreaSelection(count=count): driver}
-    bases = [
+    proposals = [
         (Base(episode, graphs[episode.town], None), Proposal(episode.scenario, drivers=drivers))  # type: ignore[arg-type]
         for episode in draw_episodes(scenarios, graphs, draws=1, seed=seed)
     ]
-    found = trials.run(bases)
+    outcomes = trials.run(proposals)
     shares = {
-        "CR": [o.trace is not None and o.trace.end == "collision" for o in found],
-        "valid": [o.valid for o in found],
-        "off": [o.off_road for o in found],
-        "others": [o.hit_others for o in found],
+        "CR": [outcome.trace is not None and outcome.trace.end == "collision" for outcome in outcomes],
+        "valid": [outcome.valid for outcome in outcomes],
+        "off": [outcome.off_road for outcome in outcomes],
+        "others": [outcome.hit_others for outcome in outcomes],
     }
     return {name: sum(values) / len(values) for name, values in shares.items()}
 
@@ -162,15 +165,15 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
     """Train an adversary, and write OUT/ALGORITHM.safetensors with its card, log.jsonl and curves.png.
 
     Args:
-        plan: What to train.
-        say: Called with a line about progress.
+        plan: Plan of the training.
+        say: Called with progress messages.
 
     Yields:
         Lines about what was written.
 
     Raises:
         ConfigError: The plan is not valid, there is no traffic to learn in, or the training diverged.
-        FormatError: An interrupted training is broken or another one.
+        FormatError: The checkpoint is broken or belongs to another training.
     """
     learning = find_learning(ADVERSARIES, plan.algorithm, dict(plan.changes))
     if learning.reward not in REWARDS:
@@ -187,27 +190,29 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
         )
     episodes = draw_episodes(scenarios, graphs, draws=learning.draws, seed=0)
     say(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}; ego: {plan.ego}")
-    env = _environment(learning, plan, episodes, graphs, ego)
-    model = make_model(learning, env)
-    held = {"ego": plan.ego, "scenarios": scenarios, "graphs": graphs, "seed": VALIDATION_SEED}
+    environment = _environment(learning, plan, episodes, graphs, ego)
+    model = make_model(learning, environment)
+    validation_setup = {"ego": plan.ego, "scenarios": scenarios, "graphs": graphs, "seed": VALIDATION_SEED}
 
     def validate(policy: Policy) -> dict[str, float]:
-        found = measure_adversary(PolicyDriver(policy, name="candidate"), **held)  # type: ignore[arg-type]
-        # of what could have been avoided CR says nothing: there the last weights count
-        return found | ({} if learning.reward == "feasible" else {"score": found["valid"]})
+        metrics = measure_adversary(PolicyDriver(policy, name="candidate"), **validation_setup)  # type: ignore[arg-type]
+        # CR says nothing about avoidable collisions: without a score the last weights are kept
+        return metrics | ({} if learning.reward == "feasible" else {"score": metrics["valid"]})
 
-    about = digest("adversary training", plan.ego, plan.literal, plan.off_road, *(e.key for e in episodes))[:16]
-    state = learn(model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=about)
+    fingerprint = digest(
+        "adversary training", plan.ego, plan.literal, plan.off_road, *(episode.key for episode in episodes)
+    )[:16]
+    state = learn(model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=fingerprint)
     if state["steps"] < learning.steps:
         say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
-    where = f"{', '.join(plan.learned_in())}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}"
+    description = f"{', '.join(plan.learned_in())}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}"
     path = plan.out / f"{plan.algorithm}.safetensors"
     yield finish(
         path,
         learning,
         model,
         state=state,
-        data=f"{where}; ego {plan.ego}",
+        data=f"{description}; ego {plan.ego}",
         command=command_of(plan),
         test=measure_all(plan),
         about={"ego": plan.ego},
@@ -235,26 +240,26 @@ def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs:
 
 
 def measure_all(plan: AdversaryPlan) -> Callable[[Driver], dict[str, float]]:
-    """A function that measures a driver in the sets of a plan, as `SET_CR`, `SET_valid` and so on."""
+    """Return a test function of drivers in the sets of a plan: `SET_CR`, `SET_valid` and so on."""
 
-    def found(driver: Driver) -> dict[str, float]:
+    def test_driver(driver: Driver) -> dict[str, float]:
         metrics: dict[str, float] = {}
-        for ref in plan.test:
-            scenarios, graphs = natural_only([ref])
-            measured = measure_adversary(driver, plan.ego, scenarios, graphs, seed=0)
-            metrics |= {f"{Path(ref).stem}_{name}": round(value, 4) for name, value in measured.items()}
+        for reference in plan.test:
+            scenarios, graphs = natural_only([reference])
+            set_metrics = measure_adversary(driver, plan.ego, scenarios, graphs, seed=0)
+            metrics |= {f"{Path(reference).stem}_{name}": round(value, 4) for name, value in set_metrics.items()}
         return metrics
 
-    return found
+    return test_driver
 
 
 def command_of(plan: AdversaryPlan) -> str:
-    """The command that trains this anew."""
+    """Return the command that repeats the training."""
     words = ["ssad", "train", "adversary", plan.algorithm]
-    usual = AdversaryPlan("", Path())
-    words += ["--ego", plan.ego] if plan.ego != usual.ego else []
-    words += ["--scenarios", ",".join(plan.scenarios)] if plan.scenarios != usual.scenarios else []
-    words += ["--test", ",".join(plan.test)] if plan.test != usual.test else []
+    defaults = AdversaryPlan("", Path())
+    words += ["--ego", plan.ego] if plan.ego != defaults.ego else []
+    words += ["--scenarios", ",".join(plan.scenarios)] if plan.scenarios != defaults.scenarios else []
+    words += ["--test", ",".join(plan.test)] if plan.test != defaults.test else []
     words += ["--literal"] if plan.literal else []
-    words += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != usual.off_road else []
+    words += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != defaults.off_road else []
     return shlex.join([*words, *set_words(plan.changes)])

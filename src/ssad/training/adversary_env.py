@@ -26,26 +26,26 @@ from ssad.world.selection import FreaSelection, Note
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World
 
-_ADVERSARY = 1_000  # number of the driver of adversaries, beyond those of the loop
+_ADVERSARY = 1_000  # index of the adversaries' driver, beyond those of the loop
 
 
 class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
-    """`num_envs` scenes with one adversary at a time, which FREA's rules choose and let go.
+    """`num_envs` scenes with one adversary at a time, selected and released by FREA's rules.
 
-    An adversary's time from choice to release is an episode of the learner. It is terminated by a contact or by the
-    goal, truncated when it is let go for another reason or the scene ends. Where a scene has no adversary, its row is
-    an episode of one step with zeros for an observation and no reward.
+    The time from selection to release of an adversary is an episode of the learner. A contact or the goal terminates
+    it; release for another reason or the end of the scene truncates it. A scene without an adversary yields episodes
+    of one step with a zero observation and no reward.
 
     Args:
-        episodes: What scenes run.
+        episodes: Episodes of the scenes.
         graphs: Lane graphs of their towns.
-        num_envs: Scenes.
-        ego: Drives the egos.
-        seed: Of the draws of episodes.
+        num_envs: Number of scenes.
+        ego: Driver of the egos.
+        seed: Seed of the draws of episodes.
         reward: `adversary`, `colliding` (equation 5) or `feasible` of `ssad.world.rewards`.
         literal: Equation 6 as it is printed, see `ssad.world.rewards.adversary`.
-        off_road: What a step off the road costs, likewise.
-        scale: The reward is multiplied by it.
+        off_road: Cost of a step off the road, likewise.
+        scale: Factor on the reward.
         action: As in `ssad.world.actions.to_controls`.
     """
 
@@ -92,88 +92,89 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         return self._observe(self._who)
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Keep the actions of the next step."""
+        """Store the actions of the next step."""
         self._actions = actions
 
     def step_wait(
         self,
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.bool_], list[dict[str, Any]]]:
-        """One step of 0.1 s in every scene."""
-        world, who = self.world, self._who.copy()
-        acting = np.flatnonzero(who >= 0)
-        agents = np.stack([acting, who[acting]], 1).astype(np.int32)
-        before = self._before(world.state(), agents)
+        """Advance every scene by one step of 0.1 s."""
+        world, adversary = self.world, self._who.copy()
+        active_scenes = np.flatnonzero(adversary >= 0)
+        agents = np.stack([active_scenes, adversary[active_scenes]], 1).astype(np.int32)
+        before_step = self._before(world.state(), agents)
         controls = np.zeros((self.num_envs, world.agents, 4), np.float32)
-        controls[acting, who[acting]] = to_controls(self._action, self._actions[acting])
+        controls[active_scenes, adversary[active_scenes]] = to_controls(self._action, self._actions[active_scenes])
         self.loop.step(controls)
         state = world.state()
         if self._hindsight is not None:
             self._hindsight.note(state)
         reward = np.zeros(self.num_envs)
-        gain: F64 = self._reward(state, agents, before)
-        reward[acting] = self._scale * gain
-        self._returns[acting] += gain
-        self._lengths[acting] += 1
-        seen = self._observe(who)  # before anybody leaves
-        touched = np.zeros(self.num_envs, bool)
-        touched[acting] = state.touch[acting, who[acting]] != 0
+        rewards: F64 = self._reward(state, agents, before_step)
+        reward[active_scenes] = self._scale * rewards
+        self._returns[active_scenes] += rewards
+        self._lengths[active_scenes] += 1
+        observation = self._observe(adversary)  # before agents are released or removed
+        in_contact = np.zeros(self.num_envs, bool)
+        in_contact[active_scenes] = state.touch[active_scenes, adversary[active_scenes]] != 0
         ended = world.ended() != End.RUNNING
         self._choose()
         arrived = np.zeros(self.num_envs, bool)
-        arrived[acting] = (world.state().note[acting, who[acting]] & Note.ARRIVED) != 0  # type: ignore[index]
-        released = (who >= 0) & ((self._who != who) | ended)
-        terminated = released & (touched | arrived)
+        arrived[active_scenes] = (world.state().note[active_scenes, adversary[active_scenes]] & Note.ARRIVED) != 0  # type: ignore[index]
+        released = (adversary >= 0) & ((self._who != adversary) | ended)
+        terminated = released & (in_contact | arrived)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for b in np.flatnonzero(released).tolist():
-            infos[b] = {
-                "terminal_observation": seen[b],
-                "TimeLimit.truncated": not terminated[b],
-                "episode": {"r": float(self._returns[b]) * self._scale, "l": int(self._lengths[b]), "t": 0.0},
+        for scene in np.flatnonzero(released).tolist():
+            infos[scene] = {
+                "terminal_observation": observation[scene],
+                "TimeLimit.truncated": not terminated[scene],
+                "episode": {"r": float(self._returns[scene]) * self._scale, "l": int(self._lengths[scene]), "t": 0.0},
             }
         self._returns[released], self._lengths[released] = 0.0, 0
-        over = np.flatnonzero(ended)
-        if len(over):
-            self._start(over)
-            self._who[over] = -1
-        return self._observe(self._who), reward.astype(np.float32), released | (who < 0), infos
+        ended_scenes = np.flatnonzero(ended)
+        if len(ended_scenes):
+            self._start(ended_scenes)
+            self._who[ended_scenes] = -1
+        return self._observe(self._who), reward.astype(np.float32), released | (adversary < 0), infos
 
     def _start(self, scenes: npt.NDArray[np.intp] | None = None) -> None:
-        """Start scenes again, None: all."""
+        """Restart scenes; None: all."""
         self.loop.reset(scenes, episodes=self._draw(self.num_envs if scenes is None else len(scenes)))
         if self._hindsight is not None:
             self._hindsight.forget(np.arange(self.num_envs) if scenes is None else scenes)
 
     def _feasible(self, state: WorldState, agents: I32, before: F64, *, off_road: float) -> F64:
-        """`feasible`, with hindsight for those who touch the ego."""
+        """Return the reward `feasible`, with hindsight for adversaries in contact with the ego."""
         assert self._hindsight is not None
-        avoided = hit_ego(state, agents)
-        if avoided.any():
-            avoided[avoided] = self._hindsight.avoided(state, agents[avoided])
-        return feasible(state, agents, before, avoided, off_road=off_road)
+        avoidable = hit_ego(state, agents)
+        if avoidable.any():
+            avoidable[avoidable] = self._hindsight.avoided(state, agents[avoidable])
+        return feasible(state, agents, before, avoidable, off_road=off_road)
 
     def _draw(self, count: int) -> I32:
         return self._random.integers(len(self.world.episodes), size=count).astype(np.int32)
 
     def _choose(self) -> None:
-        """Let adversaries go and choose new ones, in the order in which `Loop` does."""
+        """Release adversaries and select new ones, in the same order as `Loop`."""
         choice = self.select(self.world.state())
         running = self.world.ended() == End.RUNNING
-        chosen: Bool = choice.agents & running[:, None]
-        now = np.where(chosen.any(1), chosen.argmax(1), -1)
+        selected: Bool = choice.agents & running[:, None]
+        adversary = np.where(selected.any(1), selected.argmax(1), -1)
         self.world.keep_note(choice.note)
         if choice.remove.any():
             self.world.remove(choice.remove)
-        had = np.zeros(chosen.shape, bool)
-        held = np.flatnonzero(self._who >= 0)
-        had[held, self._who[held]] = True
-        if (had & ~chosen).any():
-            self.world.take(had & ~chosen, None)
-        if (chosen & ~had).any():
-            self.world.take(chosen & ~had, Controller.EXTERNAL, policy=_ADVERSARY)
-        self._who = now
+        previous = np.zeros(selected.shape, bool)
+        occupied_scenes = np.flatnonzero(self._who >= 0)
+        previous[occupied_scenes, self._who[occupied_scenes]] = True
+        if (previous & ~selected).any():
+            self.world.take(previous & ~selected, None)
+        if (selected & ~previous).any():
+            self.world.take(selected & ~previous, Controller.EXTERNAL, policy=_ADVERSARY)
+        self._who = adversary
 
     def _observe(self, who: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
         """[num_envs, 24]; zeros where there is no adversary."""
+        # The sensor needs a valid agent in every row; rows without an adversary are zeroed below.
         agents = np.stack([np.arange(self.num_envs), np.maximum(who, 0)], 1).astype(np.int32)
         rows = SENSORS["adversary"](self.world, agents)
         return np.where((who >= 0)[:, None], rows, 0.0).astype(np.float32)

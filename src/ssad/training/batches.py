@@ -1,4 +1,4 @@
-"""Pictures and truth for training: held decoded in memory, changed at random on the device."""
+"""Images and truth for training: kept decoded in memory, augmented at random on the device."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ssad.core.types import F64, U8
 from ssad.training.recipe import Recipe
 
 GREY = 0.447
-SHRUNK = 0.7  # zoom below which pictures are halved first
-ROOM = 0.6  # share of the free memory that pictures may take
+SHRUNK = 0.7  # zoom below which images are halved first
+ROOM = 0.6  # share of the free memory for images
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One picture: how to read it (uint8 RGB [H, W, 3]), and what is in it."""
+    """One image: a function that reads it (uint8 RGB [H, W, 3]), and its truth."""
 
     read: Callable[[], U8]
     truth: Truth
@@ -35,25 +35,25 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class OnDisk:
-    """Pictures that are read when they are asked for: uint8 [n, H, W, 3] for indices [n] or a slice."""
+    """Images that are read on access: uint8 [n, H, W, 3] for indices [n] or a slice."""
 
     items: Sequence[Item]
     shape: tuple[int, ...]
 
     @property
     def device(self) -> torch.device:
-        """Where they come out."""
+        """Device of the images: the CPU."""
         return torch.device("cpu")
 
     def __getitem__(self, rows: Tensor | slice) -> Tensor:
-        numbers = range(len(self.items))[rows] if isinstance(rows, slice) else rows.tolist()
+        indices = range(len(self.items))[rows] if isinstance(rows, slice) else rows.tolist()
         with ThreadPoolExecutor(8) as pool:
-            return torch.stack(list(pool.map(lambda k: _read(self.items, k, self.shape), numbers)))
+            return torch.stack(list(pool.map(lambda index: _read(self.items, index, self.shape), indices)))
 
 
 @dataclass(frozen=True, slots=True)
 class PictureSet:
-    """All pictures of a set, uint8 [N, H, W, 3], and their truth (on the CPU)."""
+    """All images of a set, uint8 [N, H, W, 3], and their truth (on the CPU)."""
 
     pictures: Tensor | OnDisk
     truth: tuple[Truth, ...]
@@ -63,49 +63,49 @@ class PictureSet:
 
 
 def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = None) -> PictureSet:
-    """Read all pictures, in parallel, into the fastest memory that has room for them.
+    """Read all images, in parallel, into the fastest memory that has room for them.
 
-    That is the device, else the host; if neither has room, they stay on disk and are read when they are needed.
+    That is the device, else the host; if neither has room, images stay on disk and are read on access.
 
     Args:
-        items: The pictures; at least one.
-        device: Where they should be.
-        threads: Threads that read; None: a quarter of the cores, at least 8.
+        items: The images; at least one.
+        device: Preferred device.
+        threads: Reading threads; None: a quarter of the cores, at least 8.
 
     Returns:
-        The pictures and their truth.
+        The images and their truth.
 
     Raises:
-        ConfigError: There is no picture, or the pictures differ in size.
+        ConfigError: There is no image, or the images differ in size.
     """
     if not items:
         raise ConfigError("no picture to train on")
     shape = items[0].read().shape
     truth = tuple(item.truth for item in items)
-    needed = len(items) * math.prod(shape)
-    device = next((d for d in (device, "cpu") if needed < ROOM * free_memory(d)), "")
+    required_bytes = len(items) * math.prod(shape)
+    device = next((candidate for candidate in (device, "cpu") if required_bytes < ROOM * free_memory(candidate)), "")
     if not device:
         return PictureSet(OnDisk(items, shape), truth)
-    pictures = torch.empty((len(items), *shape), dtype=torch.uint8, device=device)
+    images = torch.empty((len(items), *shape), dtype=torch.uint8, device=device)
 
     def load(start: int) -> None:
-        block = [_read(items, k, shape) for k in range(start, min(start + 32, len(items)))]
-        pictures[start : start + len(block)] = torch.stack(block).to(device)
+        block = [_read(items, index, shape) for index in range(start, min(start + 32, len(items)))]
+        images[start : start + len(block)] = torch.stack(block).to(device)
 
     with ThreadPoolExecutor(threads or max(8, (os.cpu_count() or 8) // 4)) as pool:
         list(pool.map(load, range(0, len(items), 32)))
-    return PictureSet(pictures, truth)
+    return PictureSet(images, truth)
 
 
 def _read(items: Sequence[Item], number: int, shape: tuple[int, ...]) -> Tensor:
-    picture = items[number].read()
-    if picture.shape != shape:
-        raise ConfigError(f"picture {number} has the size {picture.shape[:2]}, the first {shape[:2]}")
-    return torch.from_numpy(np.ascontiguousarray(picture))
+    image = items[number].read()
+    if image.shape != shape:
+        raise ConfigError(f"picture {number} has the size {image.shape[:2]}, the first {shape[:2]}")
+    return torch.from_numpy(np.ascontiguousarray(image))
 
 
 def free_memory(device: str) -> float:
-    """Bytes that are free on a device; infinite where that cannot be told."""
+    """Return the free bytes of a device; infinite if unknown."""
     if torch.device(device).type == "cuda":
         return float(torch.cuda.mem_get_info(torch.device(device))[0])
     try:
@@ -132,10 +132,13 @@ def repeats(truths: Sequence[Truth], least: float) -> F64 | None:
     """
     if least <= 0:
         return None
-    kinds = [torch.unique(t.label if t.crowd is None else t.label[~t.crowd]).tolist() for t in truths]
-    share = Counter(kind for one in kinds for kind in one)
-    factor = {kind: max(1.0, math.sqrt(least * len(truths) / count)) for kind, count in share.items()}
-    return np.array([max((factor[kind] for kind in one), default=1.0) for one in kinds])
+    labels_by_image = [
+        torch.unique(image_truth.label if image_truth.crowd is None else image_truth.label[~image_truth.crowd]).tolist()
+        for image_truth in truths
+    ]
+    image_counts = Counter(label for labels in labels_by_image for label in labels)
+    factors = {label: max(1.0, math.sqrt(least * len(truths) / count)) for label, count in image_counts.items()}
+    return np.array([max((factors[label] for label in labels), default=1.0) for labels in labels_by_image])
 
 
 def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = None) -> list[list[int]]:
@@ -152,53 +155,64 @@ def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = 
     Returns:
         Indices of each batch.
     """
-    rng = np.random.default_rng([seed, epoch])
-    shuffled = rng.permutation(count)
+    random = np.random.default_rng([seed, epoch])
+    shuffled = random.permutation(count)
     if often is not None:
-        ends = np.cumsum(often[shuffled])
-        shown = math.ceil(ends[-1] - 1e-9)
-        places = (np.arange(shown) + rng.random()) * (ends[-1] / shown)
-        shuffled = rng.permutation(shuffled[np.searchsorted(ends, places, side="right").clip(max=count - 1)])
-    full = max(len(shuffled) // batch, 1)
-    return [shuffled[k * batch : (k + 1) * batch].tolist() for k in range(full)]
+        cumulative = np.cumsum(often[shuffled])
+        image_count = math.ceil(cumulative[-1] - 1e-9)
+        # Systematic sampling: frequencies are met within one, and the total is exact.
+        positions = (np.arange(image_count) + random.random()) * (cumulative[-1] / image_count)
+        shuffled = random.permutation(
+            shuffled[np.searchsorted(cumulative, positions, side="right").clip(max=count - 1)]
+        )
+    batch_count = max(len(shuffled) // batch, 1)
+    return [shuffled[batch_index * batch : (batch_index + 1) * batch].tolist() for batch_index in range(batch_count)]
 
 
 def _send(value: Tensor, device: torch.device | str) -> Tensor:
-    """Copy a small tensor to a device without waiting for what a GPU was given before."""
+    """Copy a small tensor to a device without waiting for earlier GPU work."""
     return value.to(device, non_blocking=True)
 
 
 def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
-    """Truth on a device, in one transfer for each kind of value."""
+    """Move truth to a device, in one transfer per kind of value."""
     truths = list(truths)
-    counts = [len(t.label) for t in truths]
+    counts = [len(image_truth.label) for image_truth in truths]
 
-    def together(values: list[Tensor | None]) -> list[Tensor | None]:
-        if any(v is None for v in values):
-            return [None if v is None else _send(v, device) for v in values]
-        given = [v for v in values if v is not None]
-        return list(torch.split(_send(torch.cat(given), device), counts))
+    def transferred(values: list[Tensor | None]) -> list[Tensor | None]:
+        if any(value is None for value in values):
+            return [None if value is None else _send(value, device) for value in values]
+        present = [value for value in values if value is not None]
+        return list(torch.split(_send(torch.cat(present), device), counts))
 
-    columns = {name: together([getattr(t, name) for t in truths]) for name in ("label", "box", "crowd")}
-    lens = [t.intrinsic for t in truths]
-    if lens and all(k is not None for k in lens):
-        stacked = _send(torch.stack([k for k in lens if k is not None]), device)
+    columns = {
+        name: transferred([getattr(image_truth, name) for image_truth in truths]) for name in ("label", "box", "crowd")
+    }
+    intrinsics = [image_truth.intrinsic for image_truth in truths]
+    if intrinsics and all(index is not None for index in intrinsics):
+        stacked = _send(torch.stack([index for index in intrinsics if index is not None]), device)
         columns["intrinsic"] = list(stacked.unbind())
     else:
         columns["intrinsic"] = [None] * len(truths)
     solids: list[Solids | None] = [None] * len(truths)
-    if truths and all(t.solid is not None for t in truths):
-        parts = {f.name: together([getattr(t.solid, f.name) for t in truths]) for f in fields(Solids)}
-        solids = [Solids(**{name: values[k] for name, values in parts.items()}) for k in range(len(truths))]  # type: ignore[arg-type]
+    if truths and all(image_truth.solid is not None for image_truth in truths):
+        solid_columns = {
+            column.name: transferred([getattr(image_truth.solid, column.name) for image_truth in truths])
+            for column in fields(Solids)
+        }
+        solids = [
+            Solids(**{name: values[index] for name, values in solid_columns.items()})
+            for index in range(len(truths))  # type: ignore[arg-type]
+        ]
     return [
-        Truth(solid=solids[k], **{name: values[k] for name, values in columns.items()})  # type: ignore[arg-type]
-        for k in range(len(truths))
+        Truth(solid=solids[index], **{name: values[index] for name, values in columns.items()})  # type: ignore[arg-type]
+        for index in range(len(truths))
     ]
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What happens to one picture: mirrored, then scaled by `zoom` and moved by `shift` (x, y) pixels."""
+    """Geometric augmentation of one image: mirrored, then scaled by `zoom` and moved by `shift` (x, y) pixels."""
 
     mirror: bool
     zoom: float
@@ -215,77 +229,93 @@ def draw_change(
     Without one the crop lies anywhere.
     """
     zoom = float(np.exp(rng.uniform(np.log(recipe.zoom[0]), np.log(recipe.zoom[1]))))
-    free = [length * (1.0 - zoom) for length in (size[1], size[0])]
+    free_range = [length * (1.0 - zoom) for length in (size[1], size[0])]
     mirror = bool(rng.random() < recipe.flip)
-    share = [rng.random(), rng.random()]
-    rise = float(rng.uniform(-recipe.rise, recipe.rise)) if recipe.rise else 0.0
+    crop_position = [rng.random(), rng.random()]
+    row_shift = float(rng.uniform(-recipe.rise, recipe.rise)) if recipe.rise else 0.0
     if lens is not None:
-        share = [float(lens[0, 2]) / size[1], float(lens[1, 2]) / size[0]]
-        share[0] = 1.0 - share[0] if mirror else share[0]
-    return Change(mirror, zoom, (share[0] * free[0], share[1] * free[1] + rise))
+        crop_position = [float(lens[0, 2]) / size[1], float(lens[1, 2]) / size[0]]
+        crop_position[0] = 1.0 - crop_position[0] if mirror else crop_position[0]
+    return Change(mirror, zoom, (crop_position[0] * free_range[0], crop_position[1] * free_range[1] + row_shift))
 
 
 def change_truths(
     truths: Sequence[Truth], changes: Sequence[Change], size: tuple[int, int], *, keep: float
 ) -> list[Truth]:
-    """Truth of changed pictures.
+    """Return the truth of augmented images.
 
-    In 2D, an object whose visible share falls below `keep` becomes crowd, and is removed once it is out of sight. In
-    3D, an object is removed when its middle leaves the picture.
+    In 2D, an object whose visible share falls below `keep` becomes crowd, and is removed once it is invisible. In
+    3D, an object is removed when its centre leaves the image.
 
     Args:
-        truths: Truth before the change, all with or all without 3D boxes.
-        changes: What happened to each picture.
-        size: Height and width, the same for all pictures.
-        keep: Least visible share of an object that counts, in 2D.
+        truths: Truth before the augmentation, all with or all without 3D boxes.
+        changes: Augmentation of each image.
+        size: Height and width, the same for all images.
+        keep: Minimum visible share of an object that counts, in 2D.
 
     Returns:
-        Truth after the change.
+        Truth after the augmentation.
     """
     height, width = size
-    counts = torch.tensor([len(t.label) for t in truths])
-    image = torch.repeat_interleave(torch.arange(len(truths)), counts)
-    mirror = torch.tensor([c.mirror for c in changes])
-    zoom = torch.tensor([c.zoom for c in changes], dtype=torch.float64)
-    shift = torch.tensor([c.shift for c in changes], dtype=torch.float64)
-    box = torch.cat([t.box for t in truths])
-    turned = torch.stack([width - box[:, 2], box[:, 1], width - box[:, 0], box[:, 3]], -1)
-    box = torch.where(mirror[image][:, None], turned, box) * zoom.to(box)[image][:, None]
-    box = box + shift.to(box).repeat(1, 2)[image]
-    limit = box.new_tensor([width, height, width, height])
-    cut = box.clamp_min(0.0).minimum(limit)
+    object_counts = torch.tensor([len(image_truth.label) for image_truth in truths])
+    image_index = torch.repeat_interleave(torch.arange(len(truths)), object_counts)
+    mirror = torch.tensor([change.mirror for change in changes])
+    zoom = torch.tensor([change.zoom for change in changes], dtype=torch.float64)
+    shift = torch.tensor([change.shift for change in changes], dtype=torch.float64)
+    box = torch.cat([image_truth.box for image_truth in truths])
+    mirrored_box = torch.stack([width - box[:, 2], box[:, 1], width - box[:, 0], box[:, 3]], -1)
+    box = torch.where(mirror[image_index][:, None], mirrored_box, box) * zoom.to(box)[image_index][:, None]
+    box = box + shift.to(box).repeat(1, 2)[image_index]
+    image_limit = box.new_tensor([width, height, width, height])
+    clipped = box.clamp_min(0.0).minimum(image_limit)
     area = (box[:, 2:] - box[:, :2]).prod(-1).clamp_min(1e-6)
-    share = (cut[:, 2:] - cut[:, :2]).prod(-1) / area
-    lens = _changed_lens([t.intrinsic for t in truths], mirror, zoom, shift, width)
-    solid = None if truths[0].solid is None or lens is None else _mirrored([t.solid for t in truths], mirror[image])
-    crowd = torch.cat([torch.zeros(len(t.box), dtype=torch.bool) if t.crowd is None else t.crowd for t in truths])
-    if solid is not None and lens is not None:
-        flat = (lens[image] @ solid.centre[..., None])[..., 0]
-        middle = flat[:, :2] / flat[:, 2:].clamp_min(1e-3)
-        stays = (middle >= 0).all(-1) & (middle[:, 0] < width) & (middle[:, 1] < height)
-        stays &= (solid.centre[:, 2] > 0) & (share > 0)
+    # A zoom changes both areas alike, so the share measures clipping only.
+    visible_share = (clipped[:, 2:] - clipped[:, :2]).prod(-1) / area
+    intrinsics = _changed_lens([image_truth.intrinsic for image_truth in truths], mirror, zoom, shift, width)
+    solid = (
+        None
+        if truths[0].solid is None or intrinsics is None
+        else _mirrored([image_truth.solid for image_truth in truths], mirror[image_index])
+    )
+    crowd = torch.cat(
+        [
+            torch.zeros(len(image_truth.box), dtype=torch.bool) if image_truth.crowd is None else image_truth.crowd
+            for image_truth in truths
+        ]
+    )
+    if solid is not None and intrinsics is not None:
+        projected = (intrinsics[image_index] @ solid.centre[..., None])[..., 0]
+        centre = projected[:, :2] / projected[:, 2:].clamp_min(1e-3)
+        is_kept = (centre >= 0).all(-1) & (centre[:, 0] < width) & (centre[:, 1] < height)
+        is_kept &= (solid.centre[:, 2] > 0) & (visible_share > 0)
     else:
-        crowd |= share < keep
-        stays = share > 0.02
-    ends = torch.bincount(image[stays], minlength=len(truths)).tolist()
+        crowd |= visible_share < keep
+        is_kept = visible_share > 0.02
+    kept_counts = torch.bincount(image_index[is_kept], minlength=len(truths)).tolist()
 
-    def parts(values: Tensor) -> tuple[Tensor, ...]:
-        return torch.split(values[stays], ends)
+    def split_kept(values: Tensor) -> tuple[Tensor, ...]:
+        return torch.split(values[is_kept], kept_counts)
 
-    labels, boxes, crowds = parts(torch.cat([t.label for t in truths])), parts(cut), parts(crowd)
+    labels, boxes, crowds = (
+        split_kept(torch.cat([image_truth.label for image_truth in truths])),
+        split_kept(clipped),
+        split_kept(crowd),
+    )
     solids: list[Solids | None] = [None] * len(truths)
     if solid is not None:
-        columns = {f.name: parts(getattr(solid, f.name)) for f in fields(Solids)}
-        solids = [Solids(**{name: values[k] for name, values in columns.items()}) for k in range(len(truths))]
+        solid_columns = {column.name: split_kept(getattr(solid, column.name)) for column in fields(Solids)}
+        solids = [
+            Solids(**{name: values[index] for name, values in solid_columns.items()}) for index in range(len(truths))
+        ]
     return [
         Truth(
-            labels[k],
-            boxes[k],
-            solids[k],
-            None if lens is None else lens[k],
-            crowd=None if solid is not None and truths[k].crowd is None else crowds[k],
+            labels[index],
+            boxes[index],
+            solids[index],
+            None if intrinsics is None else intrinsics[index],
+            crowd=None if solid is not None and truths[index].crowd is None else crowds[index],
         )
-        for k in range(len(truths))
+        for index in range(len(truths))
     ]
 
 
@@ -293,26 +323,28 @@ def _changed_lens(
     lenses: Sequence[Tensor | None], mirror: Tensor, zoom: Tensor, shift: Tensor, width: int
 ) -> Tensor | None:
     """Intrinsics [B, 3, 3] of the changed pictures; None where there are none."""
-    given = [k for k in lenses if k is not None]
-    if len(given) < len(lenses):
+    present = [matrix for matrix in lenses if matrix is not None]
+    if len(present) < len(lenses):
         return None
-    lens = torch.stack(given)
-    lens[:, 0, 2] = torch.where(mirror, width - lens[:, 0, 2], lens[:, 0, 2])
-    lens[:, :2, :2] *= zoom.to(lens)[:, None, None]
-    lens[:, :2, 2] = zoom.to(lens)[:, None] * lens[:, :2, 2] + shift.to(lens)
-    return lens
+    intrinsics = torch.stack(present)
+    intrinsics[:, 0, 2] = torch.where(mirror, width - intrinsics[:, 0, 2], intrinsics[:, 0, 2])
+    intrinsics[:, :2, :2] *= zoom.to(intrinsics)[:, None, None]
+    intrinsics[:, :2, 2] = zoom.to(intrinsics)[:, None] * intrinsics[:, :2, 2] + shift.to(intrinsics)
+    return intrinsics
 
 
 def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
-    """All solids in one, those of mirrored pictures mirrored."""
-    given = [s for s in solids if s is not None]
-    columns = {f.name: torch.cat([getattr(s, f.name) for s in given]) for f in fields(Solids)}
-    side = torch.where(mirror, -1.0, 1.0).to(columns["centre"])[:, None]
-    one = torch.ones_like(side)
-    columns["centre"] = columns["centre"] * torch.cat([side, one, one], 1)
-    columns["velocity"] = columns["velocity"] * torch.cat([side, one], 1)
-    columns["yaw"] = torch.where(mirror, torch.pi - columns["yaw"], columns["yaw"])
-    return Solids(**columns)
+    """Return all solids in one table, those of mirrored images mirrored."""
+    present = [solid for solid in solids if solid is not None]
+    solid_columns = {
+        column.name: torch.cat([getattr(solid, column.name) for solid in present]) for column in fields(Solids)
+    }
+    sign = torch.where(mirror, -1.0, 1.0).to(solid_columns["centre"])[:, None]
+    unchanged = torch.ones_like(sign)
+    solid_columns["centre"] = solid_columns["centre"] * torch.cat([sign, unchanged, unchanged], 1)
+    solid_columns["velocity"] = solid_columns["velocity"] * torch.cat([sign, unchanged], 1)
+    solid_columns["yaw"] = torch.where(mirror, torch.pi - solid_columns["yaw"], solid_columns["yaw"])
+    return Solids(**solid_columns)
 
 
 def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
@@ -321,27 +353,28 @@ def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
     Below a zoom of `SHRUNK` samples are taken from the picture averaged to half its size: at full size they would skip
     pixels, which no camera does.
     """
-    if all(not c.mirror and c.zoom == 1.0 for c in changes):
+    if all(not change.mirror and change.zoom == 1.0 for change in changes):
         return pictures
     height, width = pictures.shape[2:]
-    rows = []
-    for c in changes:
-        side = -1.0 if c.mirror else 1.0
-        x = side * (1 / c.zoom - 2 * c.shift[0] / (c.zoom * width) - 1)
-        y = 1 / c.zoom - 2 * c.shift[1] / (c.zoom * height) - 1
-        rows.append([[side / c.zoom, 0.0, x], [0.0, 1 / c.zoom, y]])
-    theta = _send(torch.tensor(rows, dtype=pictures.dtype), pictures.device)
-    grid = affine_grid(theta, list(pictures.shape), align_corners=False)
-    centred = pictures - GREY
-    moved = torch.empty_like(centred)
-    half = (max(height // 2, 1), max(width // 2, 1))
-    for small in (False, True):
-        members = [k for k, c in enumerate(changes) if (c.zoom < SHRUNK) == small]
-        if members:
-            chosen = _send(torch.tensor(members), pictures.device)
-            source = adaptive_avg_pool2d(centred[chosen], half) if small else centred[chosen]
-            moved[chosen] = grid_sample(source, grid[chosen], align_corners=False)
-    return moved + GREY
+    matrices = []
+    for change in changes:
+        sign = -1.0 if change.mirror else 1.0
+        x = sign * (1 / change.zoom - 2 * change.shift[0] / (change.zoom * width) - 1)
+        y = 1 / change.zoom - 2 * change.shift[1] / (change.zoom * height) - 1
+        matrices.append([[sign / change.zoom, 0.0, x], [0.0, 1 / change.zoom, y]])
+    transforms = _send(torch.tensor(matrices, dtype=pictures.dtype), pictures.device)
+    grid = affine_grid(transforms, list(pictures.shape), align_corners=False)
+    # grid_sample pads with zeros, so grey must be zero.
+    offsets = pictures - GREY
+    augmented = torch.empty_like(offsets)
+    half_size = (max(height // 2, 1), max(width // 2, 1))
+    for is_small in (False, True):
+        member_indices = [index for index, change in enumerate(changes) if (change.zoom < SHRUNK) == is_small]
+        if member_indices:
+            selected = _send(torch.tensor(member_indices), pictures.device)
+            source = adaptive_avg_pool2d(offsets[selected], half_size) if is_small else offsets[selected]
+            augmented[selected] = grid_sample(source, grid[selected], align_corners=False)
+    return augmented + GREY
 
 
 def change_colours(pictures: Tensor, recipe: Recipe, draws: torch.Generator) -> Tensor:
@@ -350,33 +383,34 @@ def change_colours(pictures: Tensor, recipe: Recipe, draws: torch.Generator) -> 
         return pictures
     device = pictures.device
 
-    def about(spread: float) -> Tensor:
+    def random_factor(spread: float) -> Tensor:
         value = torch.rand((len(pictures), 1, 1, 1), generator=draws)
         return _send(1.0 + spread * (2 * value - 1), device)
 
-    grey = pictures.mean(1, keepdim=True)
-    pictures = grey + (pictures - grey) * about(1.5 * recipe.jitter)
-    middle = pictures.mean((1, 2, 3), keepdim=True)
-    pictures = (middle + (pictures - middle) * about(recipe.jitter)) * about(recipe.jitter)
+    luminance = pictures.mean(1, keepdim=True)
+    pictures = luminance + (pictures - luminance) * random_factor(1.5 * recipe.jitter)
+    mean_value = pictures.mean((1, 2, 3), keepdim=True)
+    pictures = (mean_value + (pictures - mean_value) * random_factor(recipe.jitter)) * random_factor(recipe.jitter)
     tint = 1.0 + recipe.jitter * 0.15 * (torch.rand((len(pictures), 3, 1, 1), generator=draws) * 2 - 1)
     pictures = pictures * _send(tint, device)
-    pictures = pictures.clamp(1e-4, 1.0) ** about(recipe.jitter)
+    pictures = pictures.clamp(1e-4, 1.0) ** random_factor(recipe.jitter)
     if recipe.noise > 0:
-        level = _send(torch.rand((len(pictures), 1, 1, 1), generator=draws), device) ** 2 * recipe.noise
-        grain = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=draws)))
-        pictures = pictures + torch.randn(pictures.shape, generator=grain, device=device) * level
+        noise_level = _send(torch.rand((len(pictures), 1, 1, 1), generator=draws), device) ** 2 * recipe.noise
+        # Noise is drawn on the device; its seed comes from the key of the batch.
+        noise_generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=draws)))
+        pictures = pictures + torch.randn(pictures.shape, generator=noise_generator, device=device) * noise_level
     return pictures.clamp(0.0, 1.0)
 
 
 def make_batch(
     bank: PictureSet, indices: Sequence[int], recipe: Recipe, *, key: tuple[int, ...], device: torch.device
 ) -> tuple[Tensor, list[Truth]]:
-    """Pictures float [B, 3, H, W] and their truth on the device, changed at random as the key says."""
-    rng = np.random.default_rng(key)
-    draws = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    chosen = _send(torch.tensor(indices), bank.pictures.device)
-    pictures = bank.pictures[chosen].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
-    size = (pictures.shape[2], pictures.shape[3])
-    changes = [draw_change(recipe, size, rng, lens=bank.truth[i].intrinsic) for i in indices]
-    truths = change_truths([bank.truth[i] for i in indices], changes, size, keep=recipe.keep)
-    return change_colours(change_pictures(pictures, changes), recipe, draws), move(truths, device)
+    """Return images float [B, 3, H, W] and their truth on the device, augmented at random by the key."""
+    random = np.random.default_rng(key)
+    torch_random = torch.Generator().manual_seed(int(random.integers(2**62)))
+    selected = _send(torch.tensor(indices), bank.pictures.device)
+    images = bank.pictures[selected].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
+    size = (images.shape[2], images.shape[3])
+    changes = [draw_change(recipe, size, random, lens=bank.truth[index].intrinsic) for index in indices]
+    truths = change_truths([bank.truth[index] for index in indices], changes, size, keep=recipe.keep)
+    return change_colours(change_pictures(images, changes), recipe, torch_random), move(truths, device)

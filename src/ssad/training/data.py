@@ -1,4 +1,4 @@
-"""Pictures and truth for training and evaluation of detectors, from data sets on disk."""
+"""Images and truth for training and evaluation of detectors, from data sets on disk."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from ssad.training.batches import Item
 
 
 def nuscenes_items(root: Path, version: str | None, split: str, *, limit: int | None = None) -> Iterator[Item]:
-    """Every key picture of every camera of a split.
+    """Yield every key image of every camera of a split.
 
     Args:
-        root: The nuScenes root.
-        version: Its version; None: the only one.
+        root: Root folder of the nuScenes data set.
+        version: Version of the data set; None: the only one.
         split: Name of the split.
-        limit: Number of scenes; None: all.
+        limit: Maximum number of scenes; None: all.
 
     Raises:
         ConfigError: The split is unknown.
     """
-    with NuScenes(root, version) as data:
-        names = scenes_of(data, split)
+    with NuScenes(root, version) as dataset:
+        names = scenes_of(dataset, split)
         for name in names[:limit]:
-            scene = data.scene(name)
+            scene = dataset.scene(name)
             for frame in scene.frames:
                 if frame.modality == "camera" and frame.key_frame:
                     truth = camera_truth(frame, scene.annotations(frame.sample_token))

@@ -1,4 +1,4 @@
-"""`ssad train detector`: from a recipe and a data set to weights with a card, on the CPU or on GPUs of this machine."""
+"""`ssad train detector`: from a recipe and data to weights with a card, on the CPU or local GPUs."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from ssad.training.loop import LAST, LOG, Share, read_last, read_rows, train, wr
 from ssad.training.recipe import Recipe, find_recipe, recipe_data, set_words
 
 Say = Callable[[str], None]
-VAL_SCENES = 4  # of a data set in the nuScenes schema, while training; at the end all are used
+VAL_SCENES = 4  # scenes of a nuScenes data set for validation during training; the final validation uses all
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A training run.
+    """Plan of a detector training.
 
     Attributes:
         recipe: Name of the recipe.
@@ -49,9 +49,9 @@ class Plan:
         split: Split to train on.
         val: Split to validate on.
         changes: Changed values of the recipe.
-        weights: First weights; None: fresh ones. Layers of another shape start fresh.
+        weights: Initial weights; None: random ones. Layers of another shape start at random.
         device: auto, cpu or cuda.
-        gpus: How many GPUs to train on.
+        gpus: Number of GPUs.
         seconds: Time limit, s; None: none.
         val_data: Another data set in the nuScenes schema to validate on.
     """
@@ -70,27 +70,27 @@ class Plan:
 
 
 def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
-    """Names and values from key=value pairs, values as YAML.
+    """Parse key=value pairs, values as YAML.
 
     Raises:
         ConfigError: A pair has no "=".
     """
-    found = []
+    changes = []
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
             raise ConfigError(f"--set {text}: expected key=value")
         parsed = safeio.parse_yaml(value, text)
-        found.append((key.strip(), tuple(parsed) if isinstance(parsed, list) else parsed))
-    return tuple(found)
+        changes.append((key.strip(), tuple(parsed) if isinstance(parsed, list) else parsed))
+    return tuple(changes)
 
 
 def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
-    """The truth of each picture.
+    """Return the truth of each image.
 
     Args:
         data: The set.
-        target: Whether only the object that the set is about counts; all others are then crowd.
+        target: Only the target object counts; all others become crowd.
     """
     return [
         Truth(
@@ -103,10 +103,10 @@ def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
 
 
 def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
-    """Classes and pictures of a split of clips.
+    """Return classes and images of a split of recordings.
 
     Raises:
-        ConfigError: There is no such split.
+        ConfigError: The split does not exist.
     """
     path = folder / "annotations" / f"{split}.json"
     if not path.is_file():
@@ -122,15 +122,15 @@ def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
     """Train a detector, and write OUT/NAME.safetensors with its card.
 
     Args:
-        plan: What to train.
-        say: Called with a line about progress.
+        plan: Plan of the training.
+        say: Called with progress messages.
 
     Yields:
         Lines about what was written.
 
     Raises:
         ConfigError: The plan does not fit the data or this machine.
-        FormatError: Data, weights or an interrupted training are broken.
+        FormatError: Data, weights or the checkpoint are broken.
     """
     recipe = find_recipe(plan.recipe, **dict(plan.changes))
     device = _device(plan.device)
@@ -142,19 +142,21 @@ def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
             spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)  # type: ignore[no-untyped-call]
     else:
         _run(plan, recipe, device, Share(), say)
-    log = safeio.read_text(plan.out / LOG).splitlines()
-    yield f"{plan.out / f'{recipe.detector}.safetensors'}: {len(log)} epochs; card, {LOG} and curves.png beside it"
+    log_lines = safeio.read_text(plan.out / LOG).splitlines()
+    yield (
+        f"{plan.out / f'{recipe.detector}.safetensors'}: {len(log_lines)} epochs; card, {LOG} and curves.png beside it"
+    )
 
 
 @contextmanager
 def _one_line() -> Iterator[None]:
-    """The SSADError of a process, which comes as the text of its traceback, as what it was."""
+    """Re-raise an SSADError of a worker process, which arrives as the text of its traceback."""
     try:
         yield
     except ProcessRaisedException as error:
-        last = str(error).strip().splitlines()[-1]
-        kind, _, text = last.partition(": ")
-        module, _, name = kind.rpartition(".")
+        last_line = str(error).strip().splitlines()[-1]
+        qualified_name, _, text = last_line.partition(": ")
+        module, _, name = qualified_name.rpartition(".")
         if module != errors.__name__ or not hasattr(errors, name):
             raise
         raise getattr(errors, name)(text) from None
@@ -169,60 +171,68 @@ def _device(wanted: str) -> str:
 
 
 def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
 
 
 def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> None:
-    """One of several processes."""
+    """Run the training in one of several processes."""
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    world = plan.gpus
-    distributed.init_process_group(backend, rank=rank, world_size=world)
+    process_count = plan.gpus
+    distributed.init_process_group(backend, rank=rank, world_size=process_count)
     try:
         device = f"cuda:{rank}" if backend == "nccl" else "cpu"
         if backend == "nccl":
             torch.cuda.set_device(rank)
-        _run(plan, recipe, device, Share(rank, world), partial(print, flush=True))
+        _run(plan, recipe, device, Share(rank, process_count), partial(print, flush=True))
     finally:
         distributed.destroy_process_group()
 
 
 def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
-    """Data, detector, training, weights. What can be wrong is looked at before pictures are read."""
-    items, options = _items(plan, three=recipe.three)
+    """Run data loading, training and validation. All settings are checked before images are read."""
+    sources, options = _items(plan, three=recipe.three)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
-        fresh = start_from(detector, load_weights(plan.weights), str(plan.weights))
-        if fresh:
-            say(f"{plan.weights}: {len(fresh)} weights do not fit and start fresh: {', '.join(fresh)}")
-    about = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(items))[:16]
-    last = read_last(plan.out / LAST, recipe, about)
+        unmatched_weights = start_from(detector, load_weights(plan.weights), str(plan.weights))
+        if unmatched_weights:
+            say(
+                f"{plan.weights}: {len(unmatched_weights)} weights do not fit and start fresh: "
+                f"{', '.join(unmatched_weights)}"
+            )
+    fingerprint = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(sources))[:16]
+    checkpoint = read_last(plan.out / LAST, recipe, fingerprint)
     validate = _validation(plan, device, three=recipe.three)
-    before = _before(plan.weights)
+    initial_weights = _before(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"
-    done, ends = (last["epoch"], recipe.last_epoch(last["epoch"], last["spent"], last["quickest"])) if last else (0, 1)
-    if done >= ends and _card_epochs(weights) == done:
-        say(f"all {done} epochs are done, and {weights.name} is there")
+    completed, last_epoch = (
+        (checkpoint["epoch"], recipe.last_epoch(checkpoint["epoch"], checkpoint["spent"], checkpoint["quickest"]))
+        if checkpoint
+        else (0, 1)
+    )
+    if completed >= last_epoch and _card_epochs(weights) == completed:
+        say(f"all {completed} epochs are done, and {weights.name} is there")
         return
-    del last
-    mine = items[share.rank :: share.world][: len(items) // share.world]
-    say(f"{len(items)} pictures to learn from, {sum(len(i.truth.label) for i in items)} objects")
-    final = train(
+    del checkpoint
+    # Equal shares: all processes must take the same number of steps.
+    own_sources = sources[share.rank :: share.world][: len(sources) // share.world]
+    say(f"{len(sources)} pictures to learn from, {sum(len(source.truth.label) for source in sources)} objects")
+    trained = train(
         detector,
-        fill(mine, device=device),
+        fill(own_sources, device=device),
         recipe,
         out=plan.out,
         device=device,
-        validate=lambda d: validate(d, quick=True),
+        validate=lambda candidate: validate(candidate, quick=True),
         say=say,
         share=share,
         seconds=plan.seconds,
-        about=about,
+        about=fingerprint,
     )
     if share.rank:
         return
-    metrics = validate(final, quick=False)
+    metrics = validate(trained, quick=False)
     row = read_rows(plan.out)[-1]
     write_row(plan.out, row | metrics)
     say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
@@ -234,17 +244,17 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
         command=command_of(plan),
         seed=recipe.seed,
         metrics=metrics,
-        classes=tuple(final.classes),
-        config=recipe_data(recipe) | {"epochs_done": row["epoch"]} | before,
+        classes=tuple(trained.classes),
+        config=recipe_data(recipe) | {"epochs_done": row["epoch"]} | initial_weights,
     )
-    save_weights(weights, final.state_dict(), card=card, half=True)
+    save_weights(weights, trained.state_dict(), card=card, half=True)
     draw_curves(plan.out)
 
 
 def _before(weights: Path | None) -> dict[str, Any]:
-    """How the first weights were made, and what they were made from in turn, by the card beside them.
+    """Return the origin of the initial weights, recursively, from the card beside them.
 
-    The file beside the weights may not be a card of ours; what it lacks is left out.
+    The file beside the weights may not be an SSAD card; missing entries are omitted.
 
     Raises:
         FormatError: The card is not JSON.
@@ -255,13 +265,13 @@ def _before(weights: Path | None) -> dict[str, Any]:
     card = safeio.read_json(path) if path.is_file() else {}
     card = card if isinstance(card, dict) else {}
     config = card["config"] if isinstance(card.get("config"), dict) else {}
-    about = {name: card[name] for name in ("data", "command", "hash") if name in card}
-    about |= {name: config[name] for name in ("epochs_done", "first_weights") if name in config}
-    return {"first_weights": {"file": weights.name, **about}}
+    provenance = {name: card[name] for name in ("data", "command", "hash") if name in card}
+    provenance |= {name: config[name] for name in ("epochs_done", "first_weights") if name in config}
+    return {"first_weights": {"file": weights.name, **provenance}}
 
 
 def _card_epochs(weights: Path) -> int:
-    """Epochs that the card of weights tells of; 0 without a card."""
+    """Return the epochs in the card of weights; 0 without a card."""
     path = weights.with_suffix(".json")
     return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
 
@@ -272,60 +282,64 @@ def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:
     if not three and plan.val_data is not None:
         raise ConfigError("--val-data is for 3D detectors; clips have a split of their own to validate on")
     if three:
-        items = [item for folder in plan.data for item in nuscenes_items(folder, None, plan.split)]
+        sources = [source for folder in plan.data for source in nuscenes_items(folder, None, plan.split)]
     else:
-        items = []
+        sources = []
         for folder in plan.data:
-            names, found = coco_items(folder, plan.split)
-            if options and options["classes"] != names:
+            class_names, folder_items = coco_items(folder, plan.split)
+            if options and options["classes"] != class_names:
                 raise ConfigError(f"{folder}: other classes than {plan.data[0]}")
-            options["classes"] = names
-            items += found
-    if not items:
+            options["classes"] = class_names
+            sources += folder_items
+    if not sources:
         raise ConfigError(f"{', '.join(map(str, plan.data))}: no picture to learn from in the split '{plan.split}'")
-    return items, options
+    return sources, options
 
 
 def _hash_items(items: Sequence[Item]) -> str:
     """Of what is to be learned: labels and boxes of all pictures, in their order."""
-    whole = hashlib.sha256()
-    for item in items:
-        whole.update(item.truth.label.numpy().tobytes() + b"|" + item.truth.box.numpy().tobytes())
-    return whole.hexdigest()
+    digest_state = hashlib.sha256()
+    for source in items:
+        digest_state.update(source.truth.label.numpy().tobytes() + b"|" + source.truth.box.numpy().tobytes())
+    return digest_state.hexdigest()
 
 
 def describe_data(folder: Path) -> str:
-    """The command that records a folder anew, for data that SSAD recorded; else the folder's name."""
-    clips = folder / "annotations" / "all.json"
-    if clips.is_file():
-        about = safeio.read_json(clips, limit=1 << 30).get("info", {}).get("recording", {})
-        if "clips" not in about:
+    """Return the command that repeats a recording by SSAD, else the name of the folder."""
+    coco_index = folder / "annotations" / "all.json"
+    if coco_index.is_file():
+        recording = safeio.read_json(coco_index, limit=1 << 30).get("info", {}).get("recording", {})
+        if "clips" not in recording:
             return folder.name
-        towns, counts = zip(*about["images"], strict=True)
-        words = ["--clips", about["clips"], "--towns", ",".join(towns), "--images", ",".join(map(str, counts))]
-        target = about.get("target")
-        # of a car style, paint and seed, of a sign kind, style and seed
-        named = [str(target[key]) for key in ("kind", "style", "paint", "seed") if key in target] if target else []
-        words += ["--target", ":".join(named)] if named else []
+        towns, counts = zip(*recording["images"], strict=True)
+        arguments = ["--clips", recording["clips"], "--towns", ",".join(towns), "--images", ",".join(map(str, counts))]
+        target = recording.get("target")
+        # a car has style, paint and seed; a sign has kind, style and seed
+        target_parts = (
+            [str(target[target_key]) for target_key in ("kind", "style", "paint", "seed") if target_key in target]
+            if target
+            else []
+        )
+        arguments += ["--target", ":".join(target_parts)] if target_parts else []
     elif (folder / ".parts" / "recording.json").is_file():
-        about = safeio.read_json(folder / ".parts" / "recording.json")
-        words = ["--towns", ",".join(about["towns"]), "--scenes", str(about["scenes"])]
-        words += ["--seconds", f"{about['seconds']:g}", "--width", str(about["width"])]
+        recording = safeio.read_json(folder / ".parts" / "recording.json")
+        arguments = ["--towns", ",".join(recording["towns"]), "--scenes", str(recording["scenes"])]
+        arguments += ["--seconds", f"{recording['seconds']:g}", "--width", str(recording["width"])]
     else:
         return folder.name
-    words += ["--streets", about["streets"]] if about.get("streets", "town") != "town" else []
-    words += ["--device", about["device"]] if about.get("device", "cpu") != "cpu" else []
-    held = ",".join(about["held_out"])
-    words += ["--held-out", held or '""', *(["--seed", str(about["seed"])] if about["seed"] else [])]
-    return " ".join(["ssad record", folder.name, *words])
+    arguments += ["--streets", recording["streets"]] if recording.get("streets", "town") != "town" else []
+    arguments += ["--device", recording["device"]] if recording.get("device", "cpu") != "cpu" else []
+    held_out = ",".join(recording["held_out"])
+    arguments += ["--held-out", held_out or '""', *(["--seed", str(recording["seed"])] if recording["seed"] else [])]
+    return " ".join(["ssad record", folder.name, *arguments])
 
 
 def command_of(plan: Plan) -> str:
-    """The command that trains this anew, with the names of the folders."""
-    words = ["ssad", "train", "detector", plan.recipe, "--data", plan.data[0].name]
+    """Return the command that repeats the training, with the names of the folders."""
+    arguments = ["ssad", "train", "detector", plan.recipe, "--data", plan.data[0].name]
     for folder in plan.data[1:]:
-        words += ["--more", folder.name]
-    for option, value, usual in (
+        arguments += ["--more", folder.name]
+    for option, value, default_value in (
         ("--val-data", plan.val_data and plan.val_data.name, None),
         ("--split", plan.split, "train"),
         ("--val", plan.val, "val"),
@@ -333,21 +347,21 @@ def command_of(plan: Plan) -> str:
         ("--gpus", plan.gpus, 1),
         ("--seconds", plan.seconds, None),
     ):
-        words += [option, str(value)] if value != usual else []
-    return shlex.join([*words, *set_words(plan.changes)])
+        arguments += [option, str(value)] if value != default_value else []
+    return shlex.join([*arguments, *set_words(plan.changes)])
 
 
 def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
     """Metrics of a detector on the validation split."""
     if three:
         root = plan.val_data or plan.data[0]
-        with NuScenes(root) as data:
-            version = data.version
-            scenes = scenes_of(data, plan.val)
-        few = scenes[:: max(len(scenes) // VAL_SCENES, 1)][:VAL_SCENES]
+        with NuScenes(root) as dataset:
+            version = dataset.version
+            scenes = scenes_of(dataset, plan.val)
+        quick_scenes = scenes[:: max(len(scenes) // VAL_SCENES, 1)][:VAL_SCENES]
 
         def check_3d(detector: Any, *, quick: bool) -> dict[str, float]:
-            return score_3d(detector, root, version, few if quick else scenes, device=device)
+            return score_3d(detector, root, version, quick_scenes if quick else scenes, device=device)
 
         return check_3d
     split = "test" if plan.val == "val" else plan.val
@@ -356,45 +370,47 @@ def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[s
     for folder in plan.data:
         if not coco_items(folder, split)[1]:
             raise ConfigError(f"{folder}: no picture to validate on in annotations/{split}.json")
-    banks: dict[str, PictureSet] = {}
+    images_by_folder: dict[str, PictureSet] = {}
 
     def check_2d(detector: Any, *, quick: bool) -> dict[str, float]:
-        found: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         for folder in plan.data:
-            if folder.name not in banks:
-                banks[folder.name] = fill(coco_items(folder, split)[1], device=device)
-            bank = banks[folder.name]
-            data = read_coco(folder / "annotations" / f"{split}.json")
-            scores = score_2d(detector, bank, classes=data.classes, device=device)
-            found |= {f"{folder.name}_{name}": value for name, value in scores.items()}
-            aimed = PictureSet(bank.pictures, tuple(coco_truth(data, target=True)))
-            found[f"{folder.name}_target_AP50"] = score_2d(detector, aimed, classes=data.classes, device=device)["AP50"]
-        return found
+            if folder.name not in images_by_folder:
+                images_by_folder[folder.name] = fill(coco_items(folder, split)[1], device=device)
+            image_set = images_by_folder[folder.name]
+            coco_set = read_coco(folder / "annotations" / f"{split}.json")
+            scores = score_2d(detector, image_set, classes=coco_set.classes, device=device)
+            metrics |= {f"{folder.name}_{name}": value for name, value in scores.items()}
+            target_set = PictureSet(image_set.pictures, tuple(coco_truth(coco_set, target=True)))
+            metrics[f"{folder.name}_target_AP50"] = score_2d(
+                detector, target_set, classes=coco_set.classes, device=device
+            )["AP50"]
+        return metrics
 
     return check_2d
 
 
 def draw_curves(out: Path) -> None:
-    """OUT/curves.png: losses and metrics over epochs."""
+    """Draw OUT/curves.png: losses and metrics over epochs."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot
 
     rows = [safeio.parse_json(line) for line in safeio.read_text(out / LOG).splitlines()]
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4))
+    figure, (loss_axes, metric_axes) = pyplot.subplots(1, 2, figsize=(11, 4))
     for name in rows[0]:
         if name.startswith("loss_"):
-            left.plot([r["epoch"] for r in rows], [r[name] for r in rows], label=name[5:])
-    names = sorted({n for r in rows for n in r if n.split("_")[-1] in ("mAP", "NDS", "AP50", "car")})
+            loss_axes.plot([row["epoch"] for row in rows], [row[name] for row in rows], label=name[5:])
+    names = sorted({column for row in rows for column in row if column.split("_")[-1] in ("mAP", "NDS", "AP50", "car")})
     for name in names:
-        points = [(r["epoch"], r[name]) for r in rows if name in r]
-        right.plot(*zip(*points, strict=True), marker="o", label=name)
-    left.set(xlabel="epoch", ylabel="loss", yscale="log")
-    right.set(xlabel="epoch", ylabel="validation", ylim=(0, 1))
-    left.legend(fontsize=7)
+        points = [(row["epoch"], row[name]) for row in rows if name in row]
+        metric_axes.plot(*zip(*points, strict=True), marker="o", label=name)
+    loss_axes.set(xlabel="epoch", ylabel="loss", yscale="log")
+    metric_axes.set(xlabel="epoch", ylabel="validation", ylim=(0, 1))
+    loss_axes.legend(fontsize=7)
     if names:
-        right.legend(fontsize=7)
+        metric_axes.legend(fontsize=7)
     figure.tight_layout()
     with safeio.atomic_path(out / "curves.png") as path:
         figure.savefig(path, dpi=110, format="png")

@@ -1,4 +1,4 @@
-"""`ssad train driver`: a driving system by reinforcement learning, from scenarios to weights with a card."""
+"""`ssad train driver`: reinforcement learning of a driving system, from scenarios to weights with a card."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 
-VALIDATION_SEED = 1_000_003  # draws of the training scenarios that no training sees
+VALIDATION_SEED = 1_000_003  # seed of validation draws, disjoint from those of training
 MOST_VALIDATION = 96
 
 
 @dataclass(frozen=True, slots=True)
 class DriverPlan:
-    """A training run.
+    """Plan of a driver training.
 
     Attributes:
         algorithm: ppo, sac or td3.
         out: Folder to write to.
-        scenarios: What to learn from, as `load_scenarios` takes it.
-        test: What the weights are measured on in the end.
+        scenarios: Training scenarios, as for `load_scenarios`.
+        test: Scenarios of the final test.
         changes: Changed values of the recipe.
         seconds: Time limit, s; None: none.
-        device: Where the networks are trained.
-        start: Folder of an earlier training with the same algorithm, whose networks are trained further.
+        device: Device of the networks.
+        start: Folder of an earlier training with the same algorithm, whose networks are the start.
     """
 
     algorithm: str
@@ -73,45 +73,47 @@ def _town(name: str) -> LaneGraph:
 
 def find_scenarios(refs: Sequence[str]) -> tuple[list[Scenario], dict[str, LaneGraph]]:
     """The scenarios of some sets and files, each once, and the lane graphs of their towns."""
-    found = list({s.name: s for ref in refs for s in load_scenarios(ref)}.values())
-    return found, {name: _town(name) for name in sorted({s.town for s in found})}
+    scenarios = list({member.name: member for reference in refs for member in load_scenarios(reference)}.values())
+    return scenarios, {town: _town(town) for town in sorted({member.town for member in scenarios})}
 
 
 def draw_episodes(
     scenarios: Sequence[Scenario], graphs: Mapping[str, LaneGraph], *, draws: int, seed: int
 ) -> list[Episode]:
-    """Episodes of scenarios: of each the nominal one, and draws of natural spread; draws without room are left out.
+    """Build nominal episodes of scenarios and random draws of natural spread; draws without room are skipped.
 
     Raises:
         RouteError: A nominal scenario cannot be built.
-        ConfigError: There are no scenarios.
+        ConfigError: There is no scenario.
     """
     if not scenarios:
         raise ConfigError("there is no scenario to learn from")
-    found = []
+    episodes = []
     for draw in range(draws):
         for scenario in scenarios:
             try:
                 spread = 1.0 if draw else 0.0
-                found.append(build_episode(scenario, graphs[scenario.town], seed=seed + draw, spread=spread))
+                episodes.append(build_episode(scenario, graphs[scenario.town], seed=seed + draw, spread=spread))
             except RouteError:
                 if draw == 0:
                     raise
-    return found
+    return episodes
 
 
 def measure(driver: Driver, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph]) -> dict[str, float]:
-    """Collision rate CR, route completion RC and share off the road OF of a driver in episodes."""
-    rows = []
-    for first in range(0, len(episodes), 64):
-        world = World(episodes[first : first + 64], graphs)
-        rows += [episode_metrics(trace) for trace in rollout(world, driver, policies=make_system)]
-    off = [row.off_road / row.driven if row.driven else 0.0 for row in rows]
-    count = len(rows)
+    """Return collision rate CR, route completion RC and off-road share OF of a driver."""
+    metrics = []
+    for start in range(0, len(episodes), 64):
+        world = World(episodes[start : start + 64], graphs)
+        metrics += [episode_metrics(trace) for trace in rollout(world, driver, policies=make_system)]
+    off_road_shares = [
+        episode_metric.off_road / episode_metric.driven if episode_metric.driven else 0.0 for episode_metric in metrics
+    ]
+    episode_count = len(metrics)
     return {
-        "CR": sum(row.collision for row in rows) / count,
-        "RC": sum(row.route_completion for row in rows) / count,
-        "OF": sum(off) / count,
+        "CR": sum(episode_metric.collision for episode_metric in metrics) / episode_count,
+        "RC": sum(episode_metric.route_completion for episode_metric in metrics) / episode_count,
+        "OF": sum(off_road_shares) / episode_count,
     }
 
 
@@ -119,29 +121,29 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     """Train a driver, and write OUT/ALGORITHM.safetensors with its card, log.jsonl and curves.png.
 
     Args:
-        plan: What to train.
-        say: Called with a line about progress.
+        plan: Plan of the training.
+        say: Called with progress messages.
 
     Yields:
         Lines about what was written.
 
     Raises:
         ConfigError: The plan is not valid, or the training diverged.
-        FormatError: An interrupted training is broken or another one.
+        FormatError: The checkpoint is broken or belongs to another training.
     """
     learning = find_learning(LEARNINGS, plan.algorithm, dict(plan.changes))
     require()
     safeio.make_folder(plan.out)
-    torch.set_num_threads(1)  # networks this small lose by a second thread
+    torch.set_num_threads(1)  # a second thread slows down networks this small
     reward = reward_of(learning.reward)
     scenarios, graphs = find_scenarios(plan.scenarios)
-    for ref in plan.test:
-        find_scenarios([ref])
+    for reference in plan.test:
+        find_scenarios([reference])
     episodes = draw_episodes(scenarios, graphs, draws=learning.draws, seed=0)
     say(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}")
     from ssad.world.sb3 import SB3VecEnv
 
-    env = VectorEnv(
+    environment = VectorEnv(
         episodes,
         graphs,
         learning.scenes,
@@ -150,17 +152,18 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
         reward=lambda state: learning.reward_scale * reward(state),
         policies=make_system,
     )
-    model = make_model(learning, SB3VecEnv(env), device=plan.device)
-    begun = "" if plan.start is None else begin_with(model, learning, plan.start)
-    held = draw_episodes(scenarios, graphs, draws=2, seed=VALIDATION_SEED)[len(scenarios) :]
-    held = held[:: max(len(held) // MOST_VALIDATION, 1)]
+    model = make_model(learning, SB3VecEnv(environment), device=plan.device)
+    start_hash = "" if plan.start is None else begin_with(model, learning, plan.start)
+    # The first draw is nominal and part of the training; only the second one is held out.
+    validation_episodes = draw_episodes(scenarios, graphs, draws=2, seed=VALIDATION_SEED)[len(scenarios) :]
+    validation_episodes = validation_episodes[:: max(len(validation_episodes) // MOST_VALIDATION, 1)]
 
     def validate(policy: Policy) -> dict[str, float]:
-        found = measure(PolicyDriver(policy, name="candidate"), held, graphs)
-        return found | {"score": found["RC"] - found["CR"] - 2.0 * found["OF"]}
+        metrics = measure(PolicyDriver(policy, name="candidate"), validation_episodes, graphs)
+        return metrics | {"score": metrics["RC"] - metrics["CR"] - 2.0 * metrics["OF"]}
 
-    keys = (safeio.dump_json([e.key, e.seed]) for e in episodes)
-    about = digest("driver training", *keys, *([begun] if begun else []))[:16]
+    episode_keys = (safeio.dump_json([member.key, member.seed]) for member in episodes)
+    fingerprint = digest("driver training", *episode_keys, *([start_hash] if start_hash else []))[:16]
     state = learn(
         model,
         learning,
@@ -168,31 +171,33 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
         validate=validate,
         say=say,
         seconds=plan.seconds,
-        about=about,
+        about=fingerprint,
     )
     if state["steps"] < learning.steps:
         say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
-    data = f"{', '.join(plan.scenarios)}: {len(scenarios)} scenarios in {', '.join(graphs)}"
+    description = f"{', '.join(plan.scenarios)}: {len(scenarios)} scenarios in {', '.join(graphs)}"
     path = plan.out / f"{plan.algorithm}.safetensors"
-    yield finish(path, learning, model, state=state, data=data, command=command_of(plan), test=measure_all(plan.test))
+    yield finish(
+        path, learning, model, state=state, data=description, command=command_of(plan), test=measure_all(plan.test)
+    )
 
 
 def measure_all(refs: Sequence[str]) -> Callable[[Driver], dict[str, float]]:
     """A function that measures a driver on the nominal episodes of some sets, as `SET_CR`, `SET_RC` and `SET_OF`."""
 
-    def found(driver: Driver) -> dict[str, float]:
+    def test_driver(driver: Driver) -> dict[str, float]:
         metrics: dict[str, float] = {}
-        for ref in refs:
-            scenarios, graphs = find_scenarios([ref])
-            measured = measure(driver, draw_episodes(scenarios, graphs, draws=1, seed=0), graphs)
-            metrics |= {f"{Path(ref).stem}_{name}": round(value, 4) for name, value in measured.items()}
+        for reference in refs:
+            scenarios, graphs = find_scenarios([reference])
+            set_metrics = measure(driver, draw_episodes(scenarios, graphs, draws=1, seed=0), graphs)
+            metrics |= {f"{Path(reference).stem}_{name}": round(value, 4) for name, value in set_metrics.items()}
         return metrics
 
-    return found
+    return test_driver
 
 
 def command_of(plan: DriverPlan) -> str:
-    """The command that trains this anew."""
+    """Return the command that repeats the training."""
     words = ["ssad", "train", "driver", plan.algorithm]
     if plan.scenarios != ("training",):
         words += ["--scenarios", ",".join(plan.scenarios)]

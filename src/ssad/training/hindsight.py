@@ -1,4 +1,4 @@
-"""Hindsight: would a careful driver have stayed clear of who touches the ego now? Of many scenes at once."""
+"""Hindsight: could a careful driver have avoided the present contact with an adversary? For many scenes at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ssad.drivers.careful.sight import BEHIND, Path, meet
 from ssad.metrics.criticality import time_to_collision
 from ssad.scenarios.dynamic.frozen import braked
 
-AHEAD = 120  # points of the ego's route, a metre apart
+AHEAD = 120  # points of the ego's route, 1 m apart
 
 
 class Hindsight:
@@ -29,12 +29,12 @@ class Hindsight:
     """
 
     def __init__(self, scenes: int, agents: int, *, dt: float = 0.1, model: CarefulModel | None = None) -> None:
-        """Nothing has happened yet.
+        """Start with an empty record.
 
         Args:
-            scenes: How many.
-            agents: Of each.
-            dt: s from one state to the next.
+            scenes: Number of scenes.
+            agents: Agents per scene.
+            dt: Time between states, s.
             model: The careful driver; None: that of UN Regulation 157.
         """
         self.dt, self.model = dt, careful_model("reg157") if model is None else model
@@ -44,7 +44,7 @@ class Hindsight:
         self._known = np.zeros(scenes, np.int64)
 
     def note(self, state: WorldState) -> None:
-        """Remember a step."""
+        """Record the state of a step."""
         for rows in (self._motion, self._point):
             rows[:-1] = rows[1:]
         self._motion[-1, ..., :3], self._motion[-1, ..., 3] = state.pose, state.speed
@@ -52,51 +52,61 @@ class Hindsight:
         self._known += 1
 
     def forget(self, scenes: npt.ArrayLike) -> None:
-        """These scenes start again."""
+        """Clear the record of restarted scenes."""
         self._known[np.asarray(scenes)] = 0
 
     def avoided(self, state: WorldState, agents: I32) -> Bool:
-        """Whether the careful driver stays clear of them until 5 s after now, [N].
+        """Return [N] True where the careful driver stays clear until 5 s after now.
 
         Args:
-            state: The last one that was noted.
-            agents: [N, 2] scene and agent of those who touch the ego.
+            state: The state recorded last.
+            agents: [N, 2] scene and agent in contact with the ego.
         """
         scene, agent = agents.T
-        begin = np.array([self._begins(state, *pair) for pair in agents.tolist()], np.int64)
-        time = np.arange(len(self._motion) + round(AFTER / self.dt))
-        row = begin[:, None] + time
-        now = len(self._motion) - 1
-        late: F64 = np.asarray((row - now) * self.dt, np.float64)
-        other = _stopping(self._motion[np.minimum(row, now), scene[:, None], agent[:, None]], late)
-        start = self._motion[begin, scene, 0]
-        frame = start[:, None, :3]
-        first, count = np.moveaxis(state.route[scene, 0], -1, 0)
-        point = np.maximum(self._point[begin, scene] - 2, 0)[:, None] + np.arange(AHEAD)
-        route = to_local(frame, state.roads.path[first[:, None] + np.minimum(point, count[:, None] - 1), :2])
-        path = Path(route)
-        place: F64 = np.asarray(to_local(frame, other[..., :2]), np.float64)
-        yaw = other[..., 2] - start[:, None, 2]
-        size = np.broadcast_to(state.size[scene, agent][:, None].astype(np.float64), (*yaw.shape, 2))
-        own = state.size[scene, 0].astype(np.float64)
-        v = np.maximum(start[:, 3], 0.0)
-        met = meet(
-            path, half=0.5 * own, place=place, yaw=yaw, speed=other[..., 3], size=size, own_speed=v, own_accel=v * 0.0
+        danger_row = np.array([self._begins(state, *pair) for pair in agents.tolist()], np.int64)
+        steps = np.arange(len(self._motion) + round(AFTER / self.dt))
+        rows = danger_row[:, None] + steps
+        last_row = len(self._motion) - 1
+        time_since_now: F64 = np.asarray((rows - last_row) * self.dt, np.float64)
+        # Rows after now do not exist yet: the last one is extrapolated.
+        other = _stopping(self._motion[np.minimum(rows, last_row), scene[:, None], agent[:, None]], time_since_now)
+        start = self._motion[danger_row, scene, 0]
+        start_pose = start[:, None, :3]
+        first_point, point_count = np.moveaxis(state.route[scene, 0], -1, 0)
+        route_point = np.maximum(self._point[danger_row, scene] - 2, 0)[:, None] + np.arange(AHEAD)
+        route = to_local(
+            start_pose, state.roads.path[first_point[:, None] + np.minimum(route_point, point_count[:, None] - 1), :2]
         )
-        way = self._drive(path, bends(route), met, 0.5 * own[:, 0])
-        ego = np.concatenate([way, np.broadcast_to(own[:, None], (*yaw.shape, 2))], -1)
-        gap = obb_distance(ego, np.concatenate([place, yaw[..., None], size], -1))
-        return np.asarray(((gap > 0.0) | (row > now + round(AFTER / self.dt))).all(1))
+        path = Path(route)
+        place: F64 = np.asarray(to_local(start_pose, other[..., :2]), np.float64)
+        yaw = other[..., 2] - start[:, None, 2]
+        other_size = np.broadcast_to(state.size[scene, agent][:, None].astype(np.float64), (*yaw.shape, 2))
+        ego_size = state.size[scene, 0].astype(np.float64)
+        speed = np.maximum(start[:, 3], 0.0)
+        encounter = meet(
+            path,
+            half=0.5 * ego_size,
+            place=place,
+            yaw=yaw,
+            speed=other[..., 3],
+            size=other_size,
+            own_speed=speed,
+            own_accel=speed * 0.0,
+        )
+        driven = self._drive(path, bends(route), encounter, 0.5 * ego_size[:, 0])
+        ego = np.concatenate([driven, np.broadcast_to(ego_size[:, None], (*yaw.shape, 2))], -1)
+        distance = obb_distance(ego, np.concatenate([place, yaw[..., None], other_size], -1))
+        return np.asarray(((distance > 0.0) | (rows > last_row + round(AFTER / self.dt))).all(1))
 
     def _begins(self, state: WorldState, scene: int, agent: int) -> int:
-        """The row in which the danger begins."""
-        known = max(len(self._motion) - int(self._known[scene]), 0)
-        motion = self._motion[known:, scene][:, [0, agent]]
+        """Return the row at which the danger begins."""
+        first_row = max(len(self._motion) - int(self._known[scene]), 0)
+        motion = self._motion[first_row:, scene][:, [0, agent]]
         size = np.broadcast_to(state.size[scene, [0, agent]], (*motion.shape[:2], 2))
-        box = np.concatenate([motion[..., :3], size], -1)
+        boxes = np.concatenate([motion[..., :3], size], -1)
         velocity = motion[..., 3:] * np.stack([np.cos(motion[..., 2]), np.sin(motion[..., 2])], -1)
-        course = time_to_collision(box[:, 0], box[:, 1], velocity[:, 0] - velocity[:, 1]) <= HORIZON
-        return known + conflict_begins(course)
+        on_course = time_to_collision(boxes[:, 0], boxes[:, 1], velocity[:, 0] - velocity[:, 1]) <= HORIZON
+        return first_row + conflict_begins(on_course)
 
     def _drive(self, path: Path, allowed: F64, met: Encounter, half: F64) -> F64:
         """Poses of the careful driver [N, T, 3]: it starts at the origin and keeps to its path.
@@ -129,5 +139,5 @@ class Hindsight:
 def _stopping(motion: F64, late: F64) -> F64:
     """Rows [N, T, 4] of x, y, yaw and speed of who brakes to a stop straight ahead from `late` = 0 s on."""
     x, y, yaw, speed = np.moveaxis(motion, -1, 0)
-    way, left = braked(speed, late)
-    return np.stack([x + way * np.cos(yaw), y + way * np.sin(yaw), yaw, left], -1)
+    distance, speed_left = braked(speed, late)
+    return np.stack([x + distance * np.cos(yaw), y + distance * np.sin(yaw), yaw, speed_left], -1)

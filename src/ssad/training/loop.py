@@ -1,4 +1,4 @@
-"""The training loop: one process a device, resumable, logged a line an epoch."""
+"""Training loop of detectors: one process per device, resumable, one log line per epoch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LAST = "last.pt"
 
 
 class Step(nn.Module):
-    """From a batch to its losses, as one module, so that gradients can be shared between devices."""
+    """Losses of a batch as one module, so that gradients can be shared between devices."""
 
     def __init__(self, detector: Any, *, amp: bool, doubt: float = 0.0) -> None:
         super().__init__()
@@ -36,12 +36,14 @@ class Step(nn.Module):
         self.amp, self.doubt = amp, doubt
 
     def forward(self, images: Tensor, truth: list[Truth]) -> dict[str, Tensor]:
-        """Losses by name."""
+        """Return losses by name."""
         with torch.autocast("cuda", torch.bfloat16) if self.amp and images.is_cuda else nullcontext():
-            lens = None
+            intrinsics = None
             if self.detector.task == "3d":
-                lens = torch.stack([t.intrinsic for t in truth if t.intrinsic is not None])
-            dense = self.detector.dense(images, lens)
+                intrinsics = torch.stack(
+                    [image_truth.intrinsic for image_truth in truth if image_truth.intrinsic is not None]
+                )
+            dense = self.detector.dense(images, intrinsics)
         assignment = self.detector.assign(dense, truth)
         if self.doubt:
             assignment = self.detector.doubted(dense, assignment, doubt=self.doubt)
@@ -50,7 +52,7 @@ class Step(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """Which of `world` processes this is."""
+    """Rank of this process among `world` processes."""
 
     rank: int = 0
     world: int = 1
@@ -93,68 +95,72 @@ def train(
         StoreError: A file cannot be written.
         ConfigError: The loss is not finite.
     """
-    where = torch.device(device)
-    detector.to(where)
-    layout = torch.channels_last if where.type == "cuda" else torch.contiguous_format
-    detector.to(memory_format=layout)
+    target_device = torch.device(device)
+    detector.to(target_device)
+    memory_format = torch.channels_last if target_device.type == "cuda" else torch.contiguous_format
+    detector.to(memory_format=memory_format)
     _unfreeze(detector, recipe)
-    for part in detector.modules():
-        if hasattr(part, "compiled"):
-            part.compiled = recipe.compile
-    step_of = Step(detector, amp=recipe.amp, doubt=recipe.doubt)
-    shared: Any = step_of
+    for module in detector.modules():
+        if hasattr(module, "compiled"):
+            module.compiled = recipe.compile
+    loss_step = Step(detector, amp=recipe.amp, doubt=recipe.doubt)
+    parallel_step: Any = loss_step
     if share.world > 1:
-        ids = [where.index or 0] if where.type == "cuda" else None
-        shared = nn.parallel.DistributedDataParallel(step_of, device_ids=ids)
+        device_ids = [target_device.index or 0] if target_device.type == "cuda" else None
+        parallel_step = nn.parallel.DistributedDataParallel(loss_step, device_ids=device_ids)
     optimizer = _optimizer(detector, recipe)
-    learning = [p for p in detector.parameters() if p.requires_grad]
+    trainable = [parameter for parameter in detector.parameters() if parameter.requires_grad]
     average = copy.deepcopy(detector).requires_grad_(False).eval() if recipe.average else None
-    follow = _follower(average, detector)
-    batch = max(recipe.batch // share.world, 1)
-    often = repeats(bank.truth, recipe.rare)
-    per_epoch = _same(len(order(len(bank), batch, seed=0, epoch=0, often=often)), share, where)
-    epoch, step, spent, quickest = _resume(out / LAST, detector, average, optimizer, recipe, about)
+    update_average = _follower(average, detector)
+    local_batch = max(recipe.batch // share.world, 1)
+    frequencies = repeats(bank.truth, recipe.rare)
+    per_epoch = _same(len(order(len(bank), local_batch, seed=0, epoch=0, often=frequencies)), share, target_device)
+    epoch, step, time_spent, fastest = _resume(out / LAST, detector, average, optimizer, recipe, about)
     start = time.monotonic()
-    while epoch < (last := _same(recipe.last_epoch(epoch, spent, quickest), share, where)):
-        total = per_epoch * last
+    while epoch < (last_epoch := _same(recipe.last_epoch(epoch, time_spent, fastest), share, target_device)):
+        total_steps = per_epoch * last_epoch
         _training_mode(detector, recipe)
-        sums: dict[str, Tensor] = {}
-        began = time.monotonic()
-        rate = recipe.lr
+        loss_sums: dict[str, Tensor] = {}
+        epoch_start = time.monotonic()
+        learning_rate = recipe.lr
         seed = recipe.seed * 1000 + share.rank
-        for number, indices in enumerate(order(len(bank), batch, seed=seed, epoch=epoch, often=often)[:per_epoch]):
-            rate = recipe.rate(step, total, per_epoch)
+        for batch_index, indices in enumerate(
+            order(len(bank), local_batch, seed=seed, epoch=epoch, often=frequencies)[:per_epoch]
+        ):
+            learning_rate = recipe.rate(step, total_steps, per_epoch)
             for group in optimizer.param_groups:
-                group["lr"] = rate
-            key = (recipe.seed, epoch, number, share.rank)
-            images, truth = make_batch(bank, indices, recipe, key=key, device=where)
-            images = images.contiguous(memory_format=layout)
+                group["lr"] = learning_rate
+            key = (recipe.seed, epoch, batch_index, share.rank)
+            images, truth = make_batch(bank, indices, recipe, key=key, device=target_device)
+            images = images.contiguous(memory_format=memory_format)
             if recipe.radius:
-                images = harden(step_of, images, truth, recipe, key=key)
-            losses = shared(images, truth)
+                images = harden(loss_step, images, truth, recipe, key=key)
+            losses = parallel_step(images, truth)
             loss = weighed(losses, recipe.weigh)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             if recipe.clip:
-                nn.utils.clip_grad_norm_(learning, recipe.clip)
+                nn.utils.clip_grad_norm_(trainable, recipe.clip)
             optimizer.step()
-            follow(min(recipe.average, (1 + step) / (10 + step)))
+            # A smaller decay at first: the average must forget the initial weights.
+            update_average(min(recipe.average, (1 + step) / (10 + step)))
             for name, value in losses.items():
-                sums[name] = sums.get(name, torch.zeros((), device=where)) + value.detach()
+                loss_sums[name] = loss_sums.get(name, torch.zeros((), device=target_device)) + value.detach()
             step += 1
         epoch += 1
-        shown, took = per_epoch * batch * share.world, time.monotonic() - began
-        spent, quickest = spent + took, min(quickest, took)
-        ends = recipe.last_epoch(epoch, spent, quickest)
+        image_count, epoch_time = per_epoch * local_batch * share.world, time.monotonic() - epoch_start
+        time_spent, fastest = time_spent + epoch_time, min(fastest, epoch_time)
+        final_epoch = recipe.last_epoch(epoch, time_spent, fastest)
         row: dict[str, Any] = {
             "epoch": epoch,
-            "of": ends,
-            "lr": rate,
-            "images_s": round(shown / took, 1),
-            **{f"loss_{name}": round(float(value) / per_epoch, 5) for name, value in sums.items()},
+            "of": final_epoch,
+            "lr": learning_rate,
+            "images_s": round(image_count / epoch_time, 1),
+            **{f"loss_{name}": round(float(value) / per_epoch, 5) for name, value in loss_sums.items()},
         }
-        if not all(math.isfinite(v) for v in row.values()):
+        if not all(math.isfinite(entry) for entry in row.values()):
             raise ConfigError(f"the loss is not finite in epoch {epoch}; use a smaller lr")
+        # All processes hold the same weights; the first one writes them.
         if share.rank == 0:
             final = average if average is not None else detector
             state = {
@@ -163,31 +169,36 @@ def train(
                 "optimizer": optimizer.state_dict(),
                 "epoch": epoch,
                 "step": step,
-                "spent": spent,
-                "quickest": quickest,
+                "spent": time_spent,
+                "quickest": fastest,
                 "about": about,
                 "recipe": safeio.dump_json(recipe_data(recipe)),
             }
             _save(out, state, row)
-            if validate is not None and epoch % recipe.validate == 0 and epoch < ends:
+            if validate is not None and epoch % recipe.validate == 0 and epoch < final_epoch:
                 row |= validate(final.eval())
                 write_row(out, row)
-            say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
-        if seconds is not None and _over(time.monotonic() - start > seconds, share, where):
+            say(
+                "  ".join(
+                    f"{column} {entry:.4g}" if isinstance(entry, float) else f"{column} {entry}"
+                    for column, entry in row.items()
+                )
+            )
+        if seconds is not None and _over(time.monotonic() - start > seconds, share, target_device):
             break
-    best = average if average is not None else detector
-    return best.requires_grad_(False).eval()
+    result = average if average is not None else detector
+    return result.requires_grad_(False).eval()
 
 
 def weighed(losses: Mapping[str, Tensor], factors: Mapping[str, float]) -> Tensor:
-    """The sum of losses times their factors, 1 where there is none.
+    """Return the sum of losses times their factors, 1 by default.
 
     Args:
-        losses: By name.
-        factors: By name.
+        losses: Losses by name.
+        factors: Factors by name.
 
     Raises:
-        ConfigError: There is a factor of a loss that the detector does not have.
+        ConfigError: A factor names a loss that the detector does not have.
     """
     for name in factors:
         if name not in losses:
@@ -196,14 +207,14 @@ def weighed(losses: Mapping[str, Tensor], factors: Mapping[str, float]) -> Tenso
 
 
 def harden(step: Step, images: Tensor, truth: list[Truth], recipe: Recipe, *, key: tuple[int, ...]) -> Tensor:
-    """Pictures that are harder to learn from: after projected ascent of the training losses from a random start.
+    """Attack images by projected gradient ascent of the training losses from a random start.
 
     Args:
-        step: From pictures to losses; its parameters get no gradient from this, its norms keep their statistics.
+        step: Losses of images; parameters get no gradients, and norms keep their statistics.
         images: [B, 3, H, W] in [0, 1].
-        truth: What is in each.
+        truth: Truth of each image.
         recipe: `radius` and `attack_steps`; one step is 1.25 radii long, several are 2.5 / steps of it.
-        key: What the random start comes from.
+        key: Key of the random start.
 
     Returns:
         [B, 3, H, W] within the radius.
@@ -211,29 +222,30 @@ def harden(step: Step, images: Tensor, truth: list[Truth], recipe: Recipe, *, ke
     Source: Madry et al. (ICLR 2018); one step: Wong et al., Fast is Better than Free (ICLR 2020).
     """
     detector, budget = step.detector, Budget(px(recipe.radius))
-    chance = torch.Generator(images.device).manual_seed(seed32("adversarial training", *key))
-    draws = 2 * torch.rand(images.shape, generator=chance, device=images.device) - 1
-    found = budget.project(images + budget.start(draws, "uniform"), images)
-    length = budget.radius * min(1.25, 2.5 / recipe.attack_steps)
-    modes = [(part, part.training) for part in detector.modules()]
-    for part, _ in modes:
-        part.training = part.training and not isinstance(part, nn.modules.batchnorm._BatchNorm)
+    generator = torch.Generator(images.device).manual_seed(seed32("adversarial training", *key))
+    noise = 2 * torch.rand(images.shape, generator=generator, device=images.device) - 1
+    attacked = budget.project(images + budget.start(noise, "uniform"), images)
+    step_length = budget.radius * min(1.25, 2.5 / recipe.attack_steps)
+    modes = [(module, module.training) for module in detector.modules()]
+    for module, _ in modes:
+        # Attack steps must not update running statistics.
+        module.training = module.training and not isinstance(module, nn.modules.batchnorm._BatchNorm)
     for _ in range(recipe.attack_steps):
-        asked = found.detach().requires_grad_()
-        (gradient,) = torch.autograd.grad(torch.stack(list(step(asked, truth).values())).sum(), asked)
-        found = budget.project(found + length * budget.steepest(gradient), images)
-    for part, mode in modes:
-        part.training = mode
-    return found
+        variable = attacked.detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(torch.stack(list(step(variable, truth).values())).sum(), variable)
+        attacked = budget.project(attacked + step_length * budget.steepest(gradient), images)
+    for module, mode in modes:
+        module.training = mode
+    return attacked
 
 
 def _same(count: int, share: Share, where: torch.device) -> int:
     """The least of all processes' counts: their shares of the data differ, their numbers of steps must not."""
     if share.world == 1:
         return count
-    least = torch.tensor(float(count), device=where)
-    distributed.all_reduce(least, distributed.ReduceOp.MIN)
-    return int(least)
+    smallest = torch.tensor(float(count), device=where)
+    distributed.all_reduce(smallest, distributed.ReduceOp.MIN)
+    return int(smallest)
 
 
 def _over(mine: bool, share: Share, where: torch.device) -> bool:
@@ -246,7 +258,7 @@ def _over(mine: bool, share: Share, where: torch.device) -> bool:
 
 
 def _unfreeze(detector: Any, recipe: Recipe) -> None:
-    """Everything learns but what the recipe holds. ConfigError: it holds what there is not."""
+    """Unfreeze all parameters except those that the recipe freezes. ConfigError for an unknown prefix."""
     names = [name for name, _ in detector.named_parameters()]
     for prefix in recipe.freeze:
         if not any(name.startswith(prefix) for name in names):
@@ -258,41 +270,47 @@ def _unfreeze(detector: Any, recipe: Recipe) -> None:
 def _training_mode(detector: Any, recipe: Recipe) -> None:
     detector.train()
     if recipe.norm_eval:
-        for part in detector.modules():
-            if isinstance(part, nn.modules.batchnorm._BatchNorm):
-                part.eval()
+        for module in detector.modules():
+            if isinstance(module, nn.modules.batchnorm._BatchNorm):
+                module.eval()
 
 
 def _optimizer(detector: Any, recipe: Recipe) -> torch.optim.Optimizer:
-    """Weight decay on matrices and kernels only."""
-    learning = [p for p in detector.parameters() if p.requires_grad]
+    """Return the optimizer, with weight decay on matrices and kernels only."""
+    trainable = [parameter for parameter in detector.parameters() if parameter.requires_grad]
     groups = [
-        {"params": [p for p in learning if p.ndim > 1], "weight_decay": recipe.weight_decay},
-        {"params": [p for p in learning if p.ndim <= 1], "weight_decay": 0.0},
+        {"params": [parameter for parameter in trainable if parameter.ndim > 1], "weight_decay": recipe.weight_decay},
+        {"params": [parameter for parameter in trainable if parameter.ndim <= 1], "weight_decay": 0.0},
     ]
     if recipe.optimizer == "sgd":
         return torch.optim.SGD(groups, lr=recipe.lr, momentum=recipe.momentum)
-    fused = all(p.is_cuda for p in learning)
+    fused = all(parameter.is_cuda for parameter in trainable)
     return torch.optim.AdamW(groups, lr=recipe.lr, betas=(recipe.momentum, 0.999), fused=fused)
 
 
 def _follower(average: Any, detector: Any) -> Callable[[float], None]:
-    """A function of a decay that moves an average of weights and statistics, and copies counters."""
+    """Return a function of a decay that updates the average of weights and statistics, and copies counters."""
     if average is None:
         return lambda decay: None
-    kept, fresh = average.state_dict(), detector.state_dict()
-    floats = [name for name, value in kept.items() if value.is_floating_point()]
-    counters = [name for name in kept if name not in set(floats)]
-    mean, new = [kept[n] for n in floats], [fresh[n] for n in floats]
-    old, counts = [kept[n] for n in counters], [fresh[n] for n in counters]
+    average_state, current_state = average.state_dict(), detector.state_dict()
+    float_names = [name for name, value in average_state.items() if value.is_floating_point()]
+    counter_names = [name for name in average_state if name not in set(float_names)]
+    averages, current_values = (
+        [average_state[entry] for entry in float_names],
+        [current_state[entry] for entry in float_names],
+    )
+    average_counters, current_counters = (
+        [average_state[entry] for entry in counter_names],
+        [current_state[entry] for entry in counter_names],
+    )
 
     @torch.no_grad()
-    def follow(decay: float) -> None:
-        torch._foreach_lerp_(mean, new, 1.0 - decay)
-        if counts:
-            torch._foreach_copy_(old, counts)
+    def update_average(decay: float) -> None:
+        torch._foreach_lerp_(averages, current_values, 1.0 - decay)
+        if current_counters:
+            torch._foreach_copy_(average_counters, current_counters)
 
-    return follow
+    return update_average
 
 
 def _save(out: Path, state: dict[str, Any], row: dict[str, Any]) -> None:
@@ -306,20 +324,20 @@ def _save(out: Path, state: dict[str, Any], row: dict[str, Any]) -> None:
 
 
 def read_rows(out: Path) -> list[dict[str, Any]]:
-    """The lines of OUT/log.jsonl, an epoch each."""
+    """Return the lines of OUT/log.jsonl, one per epoch."""
     return [safeio.parse_json(line) for line in safeio.read_text(out / LOG).splitlines()]
 
 
 def write_row(out: Path, row: dict[str, Any]) -> None:
-    """Write the line of an epoch; lines of this epoch and of later ones are removed.
+    """Write the log line of an epoch, replacing lines of this and later epochs.
 
     Raises:
         StoreError: The file cannot be written.
     """
     try:
         rows = read_rows(out) if (out / LOG).is_file() else []
-        kept = [one for one in rows if one["epoch"] < row["epoch"]]
-        safeio.write_atomic(out / LOG, "".join(safeio.dump_json(one) + "\n" for one in [*kept, row]))
+        earlier_rows = [earlier for earlier in rows if earlier["epoch"] < row["epoch"]]
+        safeio.write_atomic(out / LOG, "".join(safeio.dump_json(earlier) + "\n" for earlier in [*earlier_rows, row]))
     except OSError as error:
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
 
@@ -366,7 +384,7 @@ def _resume(  # noqa: PLR0917
         times = float(state.get("spent", 0.0)), float(state.get("quickest", math.inf))
         return int(state["epoch"]), int(state["step"]), *times
     except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        why = type(error).__name__
+        error_name = type(error).__name__
         raise FormatError(
-            f"{path}: of another detector or data set, or broken ({why}); choose another folder"
+            f"{path}: of another detector or data set, or broken ({error_name}); choose another folder"
         ) from None

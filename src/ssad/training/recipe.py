@@ -1,4 +1,4 @@
-"""How a detector is trained: everything that decides the result but the data."""
+"""Training recipes of detectors: all settings that decide the result except the data."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Recipe:
 
     @property
     def three(self) -> bool:
-        """Whether the detector is a 3D one."""
+        """True for 3D detectors."""
         return self.detector.startswith(("fcos3d", "pgd"))
 
     def last_epoch(self, done: int, spent: float, quickest: float) -> int:
@@ -125,21 +125,21 @@ class Recipe:
         return min(self.epochs, done + max(0, int((self.within - spent) / max(quickest, 1e-9))))
 
     def rate(self, step: int, total: int, per_epoch: int) -> float:
-        """Learning rate of a step out of `total`."""
+        """Return the learning rate of a step out of `total`."""
         if self.schedule == "step":
-            factor = 0.1 ** sum(step // max(per_epoch, 1) >= s for s in self.steps)
+            factor = 0.1 ** sum(step // max(per_epoch, 1) >= milestone for milestone in self.steps)
         else:
-            done = min(step / max(total - 1, 1), 1.0)
-            falls = done if self.schedule == "linear" else 0.5 - 0.5 * math.cos(math.pi * done)
-            factor = 1.0 - (1.0 - self.last) * falls
+            progress = min(step / max(total - 1, 1), 1.0)
+            decay = progress if self.schedule == "linear" else 0.5 - 0.5 * math.cos(math.pi * progress)
+            factor = 1.0 - (1.0 - self.last) * decay
         if step < self.warmup:
             factor *= 1 / 3 + 2 / 3 * step / self.warmup
         return self.lr * factor
 
 
 def _official(detector: str, lr: float, **changes: Any) -> Recipe:
-    """As mmdetection3d 1.4 trains its nuScenes models, 1x: SGD, 12 epochs, a tenth after 8 and 11."""
-    base = Recipe(
+    """Return a recipe of mmdetection3d 1.4 for nuScenes, 1x: SGD, 12 epochs, a tenth after 8 and 11."""
+    official = Recipe(
         detector,
         12,
         16,
@@ -157,7 +157,7 @@ def _official(detector: str, lr: float, **changes: Any) -> Recipe:
         jitter=0.0,
         noise=0.0,
     )
-    return replace(base, **changes)
+    return replace(official, **changes)
 
 
 # The paper: SGD, momentum 0.99, weight decay 4e-4, from 0.01 to 0.001, from COCO weights
@@ -192,11 +192,11 @@ RECIPES: dict[str, Recipe] = {
 
 
 def find_recipe(name: str, **changes: Any) -> Recipe:
-    """A recipe by name, with some of its values changed.
+    """Return a recipe by name, with changed values.
 
     Raises:
-        UnknownNameError: There is no such recipe.
-        ConfigError: A value does not fit.
+        UnknownNameError: No recipe has that name.
+        ConfigError: A value is not valid.
     """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
@@ -204,19 +204,19 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
 
 
 def set_words(changes: Iterable[tuple[str, Any]]) -> list[str]:
-    """Changed values as words of the command line."""
+    """Return changed values as command line arguments."""
     return [word for key, value in changes for word in ("--set", f"{key}={_written(value)}")]
 
 
 def _written(value: Any) -> str:
-    """A value in YAML, as short as it goes."""
+    """Return a value as compact YAML."""
     if isinstance(value, tuple):
         return "[" + ",".join(map(str, value)) + "]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {one}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {entry}" for key, entry in value.items()) + "}"
     return str(value)
 
 
 def recipe_data(recipe: Recipe) -> dict[str, Any]:
-    """A recipe as plain data."""
+    """Return a recipe as plain data."""
     return asdict(recipe)

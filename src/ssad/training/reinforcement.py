@@ -1,6 +1,6 @@
-"""Reinforcement learning with stable-baselines3: recipes, the loop with its checkpoints, and what is exported.
+"""Reinforcement learning with stable-baselines3: recipes, training loop with checkpoints, and export of policies.
 
-stable-baselines3 is needed for training alone: what comes out is a `ssad.world.policy.Policy`.
+stable-baselines3 is needed for training only: the result is a `ssad.world.policy.Policy`.
 """
 
 from __future__ import annotations
@@ -94,11 +94,11 @@ LEARNINGS: dict[str, Learning] = {
 
 
 def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str, Any]) -> Learning:
-    """A recipe of a table by name, with some of its values changed.
+    """Return a recipe of a table by name, with changed values.
 
     Raises:
-        UnknownNameError: There is no such recipe.
-        ConfigError: A value does not fit.
+        UnknownNameError: No recipe has that name.
+        ConfigError: A value is not valid.
     """
     if name not in table:
         raise unknown_name("algorithm", name, table)
@@ -106,7 +106,7 @@ def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str
 
 
 def require() -> Any:
-    """stable-baselines3; ConfigError without it."""
+    """Import stable-baselines3. ConfigError if it is not installed."""
     try:
         import stable_baselines3
     except ImportError as error:
@@ -115,29 +115,29 @@ def require() -> Any:
 
 
 def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
-    """A fresh model of stable-baselines3 on a `VecEnv`.
+    """Make a new stable-baselines3 model on a `VecEnv`.
 
     Args:
         learning: The recipe.
-        env: The scenes.
-        device: Where the networks are.
+        env: The vector environment.
+        device: Device of the networks.
     """
     sb3 = require()
-    first, last = learning.lr, learning.lr / 20.0
+    initial_rate, final_rate = learning.lr, learning.lr / 20.0
 
-    def rate(left: float) -> float:
-        return last + (first - last) * left
+    def rate_schedule(left: float) -> float:
+        return final_rate + (initial_rate - final_rate) * left
 
     common: dict[str, Any] = {
-        "learning_rate": rate,
+        "learning_rate": rate_schedule,
         "gamma": learning.gamma,
         "batch_size": learning.batch,
         "seed": learning.seed,
         "device": device,
     }
-    nets: dict[str, Any] = {"net_arch": list(learning.hidden), "activation_fn": torch.nn.ReLU}
+    policy_options: dict[str, Any] = {"net_arch": list(learning.hidden), "activation_fn": torch.nn.ReLU}
     if learning.algorithm == "ppo":
-        nets["log_std_init"] = math.log(learning.noise)
+        policy_options["log_std_init"] = math.log(learning.noise)
         return sb3.PPO(
             "MlpPolicy",
             env,
@@ -145,47 +145,49 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
             n_epochs=learning.epochs,
             gae_lambda=learning.gae,
             ent_coef=learning.entropy,
-            policy_kwargs=nets,
+            policy_kwargs=policy_options,
             **common,
         )
-    more: dict[str, Any] = {
+    off_policy_options: dict[str, Any] = {
         "buffer_size": learning.buffer,
         "learning_starts": learning.first,
         "train_freq": 1,
         "gradient_steps": learning.updates,
-        "policy_kwargs": nets,
+        "policy_kwargs": policy_options,
     }
     if learning.algorithm in ("td3", "ddpg"):
-        size = env.action_space.shape
-        more["action_noise"] = sb3.common.noise.NormalActionNoise(np.zeros(size), np.full(size, learning.noise))
+        action_shape = env.action_space.shape
+        off_policy_options["action_noise"] = sb3.common.noise.NormalActionNoise(
+            np.zeros(action_shape), np.full(action_shape, learning.noise)
+        )
     if learning.algorithm == "dqn":
         if ACTIONS[learning.action] != CHOICES.shape[1]:
             raise ConfigError(f"dqn chooses between actions of two numbers; '{learning.action}' has another number")
         from ssad.world.sb3 import Choosing
 
         env = Choosing(env)
-        more |= {
+        off_policy_options |= {
             "exploration_fraction": 1 / 3,
             "exploration_final_eps": learning.noise,
             "target_update_interval": 1_000,
         }
-    return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **more, **common)
+    return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **off_policy_options, **common)
 
 
 def begin_with(model: Any, learning: Learning, folder: Path) -> str:
-    """Give a fresh model the networks of an earlier training, as its last checkpoint has them.
+    """Load the networks of the last checkpoint of an earlier training into a new model.
 
     Args:
-        model: As `make_model` gives it.
+        model: A model from `make_model`.
         learning: Its recipe.
-        folder: Where the earlier training wrote to.
+        folder: Output folder of the earlier training.
 
     Returns:
-        A hash of the checkpoint.
+        Hash of the checkpoint.
 
     Raises:
-        ConfigError: There is no checkpoint in the folder.
-        FormatError: It is broken, or its networks are of other sizes.
+        ConfigError: The folder has no checkpoint.
+        FormatError: The checkpoint is broken, or its networks have other sizes.
     """
     path = folder / LAST
     state = read_state(path, "key")
@@ -202,7 +204,7 @@ def begin_with(model: Any, learning: Learning, folder: Path) -> str:
 
 
 def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """The policy of a model: its tensors as `ssad.world.policy` reads them, and what its card must say.
+    """Export the policy of a model: its tensors in the format of `ssad.world.policy`, and its config.
 
     Returns:
         Tensors by name, and the part of the card's config that a policy needs.
@@ -215,15 +217,15 @@ def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dic
         body, head, squash = model.q_net.q_net, None, "best"
     else:
         body, head, squash = model.actor.mu, None, "tanh"
-    layers = [part for part in [*body, head] if isinstance(part, torch.nn.Linear)]
-    about = {"observation": learning.observation, "action": learning.action, "squash": squash}
-    return tensors_of(layers), about
+    layers = [layer for layer in [*body, head] if isinstance(layer, torch.nn.Linear)]
+    policy_config = {"observation": learning.observation, "action": learning.action, "squash": squash}
+    return tensors_of(layers), policy_config
 
 
 def policy_now(model: Any, learning: Learning) -> Policy:
-    """The policy of a model as it is now."""
-    tensors, about = export(model, learning)
-    return policy_of(Card("", "", learning.seed, (), config=about), tensors, "training")
+    """Return the current policy of a model."""
+    tensors, policy_config = export(model, learning)
+    return policy_of(Card("", "", learning.seed, (), config=policy_config), tensors, "training")
 
 
 def learn(
@@ -266,20 +268,20 @@ def learn(
         _put_back(model, state, out / LAST)
     if model.num_timesteps >= learning.steps and state is not None:
         return state
-    keeper = _keeper(model, learning, out, key=key, state=state, validate=validate, say=say, seconds=seconds)
+    callback = _keeper(model, learning, out, key=key, state=state, validate=validate, say=say, seconds=seconds)
     try:
-        model.learn(learning.steps - model.num_timesteps, callback=keeper, reset_num_timesteps=False)
-    except ValueError as error:  # torch's distributions refuse what is not a number
+        model.learn(learning.steps - model.num_timesteps, callback=callback, reset_num_timesteps=False)
+    except ValueError as error:  # torch's distributions reject NaN
         if "Expected parameter" not in str(error):
             raise
-        keeper.diverged()
-    keeper.keep()
-    found: dict[str, Any] = keeper.state
-    return found
+        callback.diverged()
+    callback.keep()
+    final_state: dict[str, Any] = callback.state
+    return final_state
 
 
 def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
-    """The callback that validates and keeps checkpoints; its base class is stable-baselines3's."""
+    """Return the callback that validates and writes checkpoints; its base class is imported late."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Keeper(BaseCallback):  # type: ignore[misc]  # stable-baselines3 may not be installed
@@ -299,9 +301,12 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
             return limit is None or time.monotonic() - self.began < limit
 
         def diverged(self) -> None:
-            kept = f"{out / LAST} is of step {self.state['steps']}" if self.state["steps"] else "there is no checkpoint"
+            checkpoint_info = (
+                f"{out / LAST} is of step {self.state['steps']}" if self.state["steps"] else "there is no checkpoint"
+            )
             raise ConfigError(
-                f"the training diverged before step {self.num_timesteps}: weights are not finite; {kept}; use a "
+                f"the training diverged before step {self.num_timesteps}: weights are not "
+                f"finite; {checkpoint_info}; use a "
                 "smaller lr in another folder"
             )
 
@@ -313,21 +318,26 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
             if steps == self.state["steps"]:
                 return
             tensors, _ = export(model, learning)
-            passed = max(time.monotonic() - self.began, 1e-9)
-            row: dict[str, Any] = {"step": steps, "steps_s": round((steps - self.start) / passed, 1)}
-            recent = [episode["r"] for episode in model.ep_info_buffer or ()]
-            if recent:
-                row["return"] = round(float(np.mean(recent)) / learning.reward_scale, 3)
+            elapsed = max(time.monotonic() - self.began, 1e-9)
+            row: dict[str, Any] = {"step": steps, "steps_s": round((steps - self.start) / elapsed, 1)}
+            recent_returns = [episode["r"] for episode in model.ep_info_buffer or ()]
+            if recent_returns:
+                row["return"] = round(float(np.mean(recent_returns)) / learning.reward_scale, 3)
             if options["validate"] is not None:
                 row |= {
                     name: round(value, 5) for name, value in options["validate"](policy_now(model, learning)).items()
                 }
-            best = self.state["best_row"]
-            if self.state["best"] is None or row.get("score", 0.0) >= best.get("score", 0.0):
+            best_row = self.state["best_row"]
+            if self.state["best"] is None or row.get("score", 0.0) >= best_row.get("score", 0.0):
                 self.state |= {"best": tensors, "best_row": row}
             self.state |= {"steps": steps, "key": options["key"]} | _taken(model)
             _write(out, self.state, row)
-            options["say"]("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
+            options["say"](
+                "  ".join(
+                    f"{column} {entry:.4g}" if isinstance(entry, float) else f"{column} {entry}"
+                    for column, entry in row.items()
+                )
+            )
 
     return Keeper()
 
@@ -336,43 +346,47 @@ _MEMORY = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 def _taken(model: Any) -> dict[str, Any]:
-    """All that changes in a model."""
+    """Return the complete state of a model."""
     policy = model.policy
-    parts = {"policy": policy.state_dict(), "optimizers": [one.state_dict() for one in _optimizers(model)]}
-    memory = getattr(model, "replay_buffer", None)
-    if memory is not None:
-        rows = memory.buffer_size if memory.full else memory.pos
-        parts["memory"] = {name: torch.from_numpy(getattr(memory, name)[:rows].copy()) for name in _MEMORY}
-        parts["place"] = (memory.pos, memory.full)
+    state = {"policy": policy.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in _optimizers(model)]}
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is not None:
+        rows = buffer.buffer_size if buffer.full else buffer.pos
+        state["memory"] = {name: torch.from_numpy(getattr(buffer, name)[:rows].copy()) for name in _MEMORY}
+        state["place"] = (buffer.pos, buffer.full)
     if getattr(model, "log_ent_coef", None) is not None:
-        parts["log_ent_coef"] = model.log_ent_coef.detach().clone()
-    return parts
+        state["log_ent_coef"] = model.log_ent_coef.detach().clone()
+    return state
 
 
 def _optimizers(model: Any) -> list[Any]:
     if hasattr(model, "actor"):
-        own = [model.actor.optimizer, model.critic.optimizer]
-        return [*own, model.ent_coef_optimizer] if getattr(model, "ent_coef_optimizer", None) is not None else own
+        optimizers = [model.actor.optimizer, model.critic.optimizer]
+        return (
+            [*optimizers, model.ent_coef_optimizer]
+            if getattr(model, "ent_coef_optimizer", None) is not None
+            else optimizers
+        )
     return [model.policy.optimizer]
 
 
 def _put_back(model: Any, state: Mapping[str, Any], path: Path) -> None:
-    """A model as it was at its checkpoint; FormatError if it does not fit."""
+    """Restore a model from its checkpoint. FormatError if it does not fit."""
     try:
         model.policy.load_state_dict(state["policy"])
-        for optimizer, kept in zip(_optimizers(model), state["optimizers"], strict=True):
-            optimizer.load_state_dict(kept)
-        memory = getattr(model, "replay_buffer", None)
-        if memory is not None:
+        for optimizer, optimizer_state in zip(_optimizers(model), state["optimizers"], strict=True):
+            optimizer.load_state_dict(optimizer_state)
+        buffer = getattr(model, "replay_buffer", None)
+        if buffer is not None:
             for name, rows in state["memory"].items():
-                getattr(memory, name)[: len(rows)] = rows.numpy()
-            memory.pos, memory.full = state["place"]
+                getattr(buffer, name)[: len(rows)] = rows.numpy()
+            buffer.pos, buffer.full = state["place"]
         if "log_ent_coef" in state:
             model.log_ent_coef.data.copy_(state["log_ent_coef"])
         model.num_timesteps = int(state["steps"])
     except (KeyError, RuntimeError, ValueError, TypeError) as error:
         raise FormatError(f"{path}: of another training, or broken ({type(error).__name__}); delete it") from None
-    # scenes start anew: other episodes than at the very beginning
+    # a new seed: resumed scenes must not repeat the first episodes
     model.set_random_seed(model.seed + 1 + model.num_timesteps)
 
 
@@ -388,34 +402,34 @@ def _write(out: Path, state: Mapping[str, Any], row: Mapping[str, Any]) -> None:
     try:
         with safeio.atomic_path(out / LAST) as path:
             torch.save(dict(state), path)
-        kept = [one for one in read_log(out) if one["step"] < row["step"]]
-        safeio.write_atomic(out / LOG, "".join(safeio.dump_json(one) + "\n" for one in [*kept, row]))
+        earlier_rows = [earlier for earlier in read_log(out) if earlier["step"] < row["step"]]
+        safeio.write_atomic(out / LOG, "".join(safeio.dump_json(earlier) + "\n" for earlier in [*earlier_rows, row]))
     except OSError as error:
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
 
 
 def read_log(out: Path) -> list[dict[str, Any]]:
-    """The lines of OUT/log.jsonl, a validation each; none if there is no such file."""
+    """Return the lines of OUT/log.jsonl, one per validation; empty without the file."""
     path = out / LOG
     return [safeio.parse_json(line) for line in safeio.read_text(path).splitlines()] if path.is_file() else []
 
 
 def draw_curves(out: Path) -> None:
-    """OUT/curves.png: the return of training episodes, and what the validations found, over steps."""
+    """Draw OUT/curves.png: returns of training episodes and validation metrics over steps."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot
 
     rows = read_log(out)
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4))
-    left.plot(*zip(*((r["step"], r["return"]) for r in rows if "return" in r), strict=True), marker="o")
-    left.set(xlabel="step", ylabel="return of an episode")
-    for name in sorted({n for r in rows for n in r} - {"step", "steps_s", "return", "score"}):
-        points = [(r["step"], r[name]) for r in rows if name in r]
-        right.plot(*zip(*points, strict=True), marker="o", label=name)
-    right.set(xlabel="step", ylabel="validation", ylim=(0, 1.02))
-    right.legend(fontsize=7)
+    figure, (return_axes, metric_axes) = pyplot.subplots(1, 2, figsize=(11, 4))
+    return_axes.plot(*zip(*((row["step"], row["return"]) for row in rows if "return" in row), strict=True), marker="o")
+    return_axes.set(xlabel="step", ylabel="return of an episode")
+    for name in sorted({column for row in rows for column in row} - {"step", "steps_s", "return", "score"}):
+        points = [(row["step"], row[name]) for row in rows if name in row]
+        metric_axes.plot(*zip(*points, strict=True), marker="o", label=name)
+    metric_axes.set(xlabel="step", ylabel="validation", ylim=(0, 1.02))
+    metric_axes.legend(fontsize=7)
     figure.tight_layout()
     with safeio.atomic_path(out / "curves.png") as path:
         figure.savefig(path, dpi=110, format="png")
@@ -445,13 +459,13 @@ def finish(
         test: Measures a driver.
         about: What else the card says of the training.
     """
-    best = state["best_row"]
-    own = {f.name: getattr(learning, f.name) for f in fields(learning)}
-    config = export(model, learning)[1] | own | {"steps_done": best["step"], **(about or {})}
-    draft = Card("", "", learning.seed, (), config=config)
-    metrics = test(PolicyDriver(policy_of(draft, state["best"], str(path.parent)), name=path.stem))
+    best_row = state["best_row"]
+    recipe_values = {recipe_field.name: getattr(learning, recipe_field.name) for recipe_field in fields(learning)}
+    config = export(model, learning)[1] | recipe_values | {"steps_done": best_row["step"], **(about or {})}
+    draft_card = Card("", "", learning.seed, (), config=config)
+    metrics = test(PolicyDriver(policy_of(draft_card, state["best"], str(path.parent)), name=path.stem))
     card = Card(data=data, command=command, seed=learning.seed, classes=(), metrics=metrics, config=config)
     save_weights(path, state["best"], card=card)
     draw_curves(path.parent)
-    numbers = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())
-    return f"{path}: best at step {best['step']}: {numbers}; card, log.jsonl and curves.png beside it"
+    summary = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())
+    return f"{path}: best at step {best_row['step']}: {summary}; card, log.jsonl and curves.png beside it"

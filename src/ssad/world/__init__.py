@@ -1,1 +1,1 @@
-"""The embedded world: batched, headless, deterministic, one source for CPU and CUDA."""
+"""Embedded world: batched, headless and deterministic, with one source for CPU and CUDA."""

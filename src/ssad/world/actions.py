@@ -1,4 +1,4 @@
-"""What a policy can look at and do: widths of sensors and actions, and what an action means for the car."""
+"""Observations and actions of a policy: their widths, and the conversion of actions to controls."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ CHOICES: F32 = np.array(np.meshgrid([-1, 0, 1], [-1, -0.5, 0, 0.5, 1], indexing=
 
 
 def to_controls(kind: str, action: F32) -> F32:
-    """Policy actions [N, n] to throttle, brake, steer and reverse [N, 4].
+    """Convert policy actions [N, n] to throttle, brake, steer and reverse [N, 4].
 
     `safebench`: acceleration / 3 m/s^2 and steer / 0.3, with at most 3 of 8 m/s^2 of brake. `frea`: throttle,
     steer / 0.3 and brake. `pedals`: throttle, or below 0 the whole brake, and steer / 0.3. `adversary`: throttle,
-    below 0 in reverse, and steer / 0.3; no brake. All of them in [-1, 1]; beyond that they are cut.
+    below 0 in reverse, and steer / 0.3; no brake. All are clipped to [-1, 1].
 
     Source: SafeBench (Xu et al. 2022) and FREA (Chen et al. 2024), their environments.
     """
-    a = np.minimum(np.maximum(np.asarray(action, np.float32), -1.0), 1.0)
-    out = np.zeros((len(a), 4), np.float32)
-    first = a[:, 0]
+    clipped = np.minimum(np.maximum(np.asarray(action, np.float32), -1.0), 1.0)
+    controls = np.zeros((len(clipped), 4), np.float32)
+    first = clipped[:, 0]
     if kind == "frea":
-        throttle, brake = first * 0.5 + 0.5, a[:, 2] * 0.5 + 0.5
-        out[:, 0] = throttle
-        out[:, 1] = np.where((brake < 0.05) | (throttle > brake), 0.0, brake)
+        throttle, brake = first * 0.5 + 0.5, clipped[:, 2] * 0.5 + 0.5
+        controls[:, 0] = throttle
+        controls[:, 1] = np.where((brake < 0.05) | (throttle > brake), 0.0, brake)
     else:
-        out[:, 0] = np.abs(first) if kind == "adversary" else np.maximum(first, 0.0)
+        controls[:, 0] = np.abs(first) if kind == "adversary" else np.maximum(first, 0.0)
         if kind != "adversary":
-            out[:, 1] = np.maximum(-first, 0.0) * (3.0 / 8.0 if kind == "safebench" else 1.0)
+            controls[:, 1] = np.maximum(-first, 0.0) * (3.0 / 8.0 if kind == "safebench" else 1.0)
         else:
-            out[:, 3] = first <= 0.0
-    out[:, 2] = a[:, 1] * 0.3
-    return out
+            controls[:, 3] = first <= 0.0
+    controls[:, 2] = clipped[:, 1] * 0.3
+    return controls

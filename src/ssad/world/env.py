@@ -1,4 +1,4 @@
-"""The world as Gymnasium environments: one vector environment over a whole batch, and its single-scene form."""
+"""Gymnasium environments of the world: a vector environment over a whole batch, and its single-scene form."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ from ssad.world.world import World
 
 Observation = Literal["safebench", "frea", "traffic"]
 Action = Literal["safebench", "frea", "pedals", "controls"]
+# Observations are clipped to this, so that the spaces have finite bounds.
 _BOUND = np.float32(1.0e4)
 
 
 def observation_space(kind: Observation) -> gym.spaces.Box:
-    """`safebench` [4], `frea` [24] and `traffic` [69]: the sensors of that name, see `ssad.world.sensors.SENSORS`."""
+    """Return the space of `safebench` [4], `frea` [24] or `traffic` [69]; see `ssad.world.sensors.SENSORS`."""
     if kind not in get_args(Observation):
         raise ConfigError(f"unknown observation '{kind}'; known: {', '.join(get_args(Observation))}")
     return gym.spaces.Box(-_BOUND, _BOUND, (WIDTHS[kind],), np.float32)
 
 
 def reward_of(reward: str | Reward) -> Reward:
-    """A reward by its name in `ssad.world.rewards.REWARDS`, or a function from a state to [B] as it is."""
+    """Return a reward by its name in `ssad.world.rewards.REWARDS`; functions are returned unchanged."""
     if callable(reward):
         return reward
     if reward not in REWARDS:
@@ -43,7 +44,7 @@ def reward_of(reward: str | Reward) -> Reward:
 
 
 def action_space(kind: Action) -> gym.spaces.Box:
-    """Ranges of the actions.
+    """Return the range of an action.
 
     `safebench` [2], `frea` [3] and `pedals` [2] in [-1, 1]: see `ssad.world.actions.to_controls`. `controls`: [3]
     throttle, brake in [0, 1] and steer in [-1, 1].
@@ -56,12 +57,23 @@ def action_space(kind: Action) -> gym.spaces.Box:
 
 
 class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
-    """`num_envs` scenes, each an episode drawn from the bank; an ended scene starts another one in the same step.
+    """Vector environment of `num_envs` scenes, each an episode sampled from the bank.
 
-    Observations [num_envs, 4 | 24] float32, actions as `action_space`, `reward` "safebench", "frea" or a function of
-    the state. `drivers` act for other agents than the ego, and `policies` makes those that episodes name, as in
-    `rollout`. Without `restart` ended scenes stand still.
-    Terminated by collision or completion, truncated by the episode's limits. `info["end"]` names why.
+    Observations are [num_envs, 4 | 24 | 69] float32, actions as `action_space`. An episode is terminated by collision
+    or completion and truncated by its limits; `info["end"]` names the reason.
+
+    Args:
+        episodes: The bank.
+        graphs: Lane graphs by town.
+        num_envs: Number of scenes.
+        observation: Sensor that is observed.
+        action: Kind of action.
+        reward: Name of a reward, or a function of the state.
+        drivers: Drivers of other agents than the ego, as in `rollout`.
+        policies: Makes the drivers that episodes name, as in `rollout`.
+        device: Warp device.
+        restart: Whether an ended scene starts another episode in the same step; else it stands still.
+        render_mode: "rgb_array" or None.
     """
 
     metadata = {  # noqa: RUF012
@@ -108,15 +120,16 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             ego=Controller.EXTERNAL,
         )
         self._loop = Loop(self.world, drivers or {}, policies=policies)
+        # Agent 0 of each scene is the ego.
         self._egos = np.stack([np.arange(num_envs), np.zeros(num_envs)], 1).astype(np.int32)
         self._controls = np.zeros((num_envs, self.world.agents, 3), np.float32)
         self.views = SceneViews(self.world)
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:
-        """Each scene from above, RGB uint8 [540, 960, 3], with `render_mode="rgb_array"`."""
+        """Return each scene from above, RGB uint8 [540, 960, 3], with `render_mode="rgb_array"`."""
         if self.render_mode is None:
             return None
-        return tuple(self.views.draw(b) for b in range(self.num_envs))
+        return tuple(self.views.draw(scene) for scene in range(self.num_envs))
 
     def _observe(self) -> npt.NDArray[np.float32]:
         rows: npt.NDArray[np.float32] = self._sensor(self.world, self._egos)
@@ -128,13 +141,13 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start all scenes; `options={"episodes": [...]}` says which episode of the bank each one runs."""
-        one = seed[0] if isinstance(seed, list) else seed
-        super().reset(seed=one)
-        chosen = (options or {}).get("episodes")
-        order = self._draw(self.num_envs) if chosen is None else np.asarray(chosen, np.int32)
-        self._loop.reset(episodes=order)
-        return self._observe(), {"episode": order.copy()}
+        """Start all scenes; `options={"episodes": [...]}` gives the episode of the bank that each one runs."""
+        scalar_seed = seed[0] if isinstance(seed, list) else seed
+        super().reset(seed=scalar_seed)
+        requested = (options or {}).get("episodes")
+        assignment = self._draw(self.num_envs) if requested is None else np.asarray(requested, np.int32)
+        self._loop.reset(episodes=assignment)
+        return self._observe(), {"episode": assignment.copy()}
 
     def step(
         self, actions: npt.NDArray[np.floating[Any]]
@@ -145,29 +158,30 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         npt.NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """One step of 0.1 s in every scene."""
-        given = np.asarray(actions, np.float32)
-        self._controls[:, 0] = given if self._action == "controls" else to_controls(self._action, given)[:, :3]
+        """Advance every scene by one step of 0.1 s."""
+        values = np.asarray(actions, np.float32)
+        self._controls[:, 0] = values if self._action == "controls" else to_controls(self._action, values)[:, :3]
         self._loop.step(self._controls)
+        # On CPU it is a view that the restart below overwrites.
         end = self.world.ended().copy()
         reward = self._reward(self.world.state())
         terminated = (end == End.COLLISION) | (end == End.COMPLETE)
         truncated = (end != 0) & ~terminated
         info: dict[str, Any] = {}
-        done = np.flatnonzero(end != 0)
+        ended = np.flatnonzero(end != 0)
         observation = self._observe()
-        if len(done):
-            final = np.full(self.num_envs, None, dtype=object)
-            for b in done:
-                final[b] = observation[b].copy()
+        if len(ended):
+            final_observations = np.full(self.num_envs, None, dtype=object)
+            for scene in ended:
+                final_observations[scene] = observation[scene].copy()
             info = {
-                "final_obs": final,
+                "final_obs": final_observations,
                 "_final_obs": end != 0,
-                "end": np.array([ENDS[k] for k in end], dtype=object),
+                "end": np.array([ENDS[code] for code in end], dtype=object),
                 "_end": end != 0,
             }
             if self._restart:
-                self._loop.reset(done, episodes=self._draw(len(done)))
+                self._loop.reset(ended, episodes=self._draw(len(ended)))
                 observation = self._observe()
         return observation, reward, terminated, truncated, info
 
@@ -201,29 +215,29 @@ class SingleEnv(gym.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; `options={"episode": k}` chooses it."""
+        """Start an episode; `options={"episode": k}` selects it."""
         super().reset(seed=seed)
-        chosen = (options or {}).get("episode")
-        k = int(self.np_random.integers(len(self.world.episodes))) if chosen is None else int(chosen)
-        observation, _ = self._many.reset(options={"episodes": [k]})
+        requested = (options or {}).get("episode")
+        episode_index = int(self.np_random.integers(len(self.world.episodes))) if requested is None else int(requested)
+        observation, _ = self._many.reset(options={"episodes": [episode_index]})
         self._show()
-        return observation[0], {"episode": k}
+        return observation[0], {"episode": episode_index}
 
     def step(
         self, action: npt.NDArray[np.float32]
     ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """One step of 0.1 s."""
+        """Advance the scene by one step of 0.1 s."""
         observation, reward, terminated, truncated, info = self._many.step(np.asarray(action)[None])
-        about = {"end": info["end"][0]} if "end" in info else {}
+        step_info = {"end": info["end"][0]} if "end" in info else {}
         self._show()
-        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), about
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), step_info
 
     def _show(self) -> None:
         if self._window is not None:
             self._window.show(self._many.views.draw(0))
 
     def render(self) -> Any:
-        """The scene from above, RGB uint8 [540, 960, 3]; None where a window shows it, or nothing was asked for."""
+        """Return the scene from above, RGB uint8 [540, 960, 3]; None with "human" or without a render mode."""
         return self._many.views.draw(0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""From episodes and lane graphs to the arrays that the kernels read."""
+"""Conversion of episodes and lane graphs into the arrays that the kernels read."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 
 @dataclass(frozen=True)
 class PathTable:
-    """A route as the kernels want it.
+    """Arrays of one route, as the kernels read them.
 
     Attributes:
         path: [N, 4] x, y, yaw, curvature.
         rule: [N, 4] speed cap m/s, m to the next stop line, m to the next junction (0 inside), TurnRank there.
-        signal: [N] of the next stop line, -1 none.
-        bend: [N] m that the next 64 m leave the straight line along the point's heading.
+        signal: [N] signal of the next stop line, -1: none.
+        bend: [N] m by which the next 64 m leave the straight line along the point's heading.
         ahead: [N, 3] m to the line of the next stop sign and the route point there (FAR: none), m to the end of the
             next junction.
         height: [N] m.
-        lane: [N] of the town, -1 none.
+        lane: [N] lane of the town, -1: none.
         beside: [N, 4] as in `Roads`.
         town: Name of the town.
     """
@@ -57,44 +57,58 @@ class PathTable:
 
 
 def _bend(route: Route) -> F32:
-    """[N] greatest lateral distance of the next 64 m of path from the line through each point along its heading."""
+    """Return the largest lateral distance [N] of the next 64 m of path from the tangent at each point."""
     x, y = np.pad(route.xy, ((0, 64), (0, 0)), mode="edge").T
-    n, c, s = len(route.xy), np.cos(route.yaw), np.sin(route.yaw)
-    out = np.zeros(n, np.float32)
-    for k in range(1, 65):
-        np.maximum(out, np.abs((y[k : n + k] - y[:n]) * c - (x[k : n + k] - x[:n]) * s), out=out)
-    return out
+    count, cos, sin = len(route.xy), np.cos(route.yaw), np.sin(route.yaw)
+    deviation = np.zeros(count, np.float32)
+    for shift in range(1, 65):
+        np.maximum(
+            deviation,
+            np.abs((y[shift : count + shift] - y[:count]) * cos - (x[shift : count + shift] - x[:count]) * sin),
+            out=deviation,
+        )
+    return deviation
 
 
 def path_table(route: Route, graph: LaneGraph) -> PathTable:
-    """Curvature, speed profile, stop lines and junctions along a route of at least two points."""
-    n = len(route.xy)
+    """Compute curvature, speed profile, stop lines and junctions along a route of at least two points."""
+    count = len(route.xy)
     yaw = np.unwrap(route.yaw.astype(np.float64))
-    kappa = np.gradient(yaw, route.spacing) if n > 2 else np.zeros(n)
+    curvature = np.gradient(yaw, route.spacing) if count > 2 else np.zeros(count)
     kernel = np.ones(3) / 3.0
-    smooth = np.convolve(np.pad(kappa, 1, mode="edge"), kernel, mode="valid")
-    cap = np.minimum(route.speed_limit, np.sqrt(LATERAL_COMFORT / np.maximum(np.abs(smooth), 1e-4)))
-    entry, leave, rank = _junctions(route, graph, yaw)
-    stop, signal = _next_line(route, graph, graph.stop_lane, graph.stop_s, graph.stop_signal)
-    # who turns where no signal tells when comes slowly
-    lit = np.append(~graph.signal_virtual, False)[signal]
-    enters = np.flatnonzero((entry[1:] == 0.0) & (entry[:-1] > 0.0) & (rank[:-1] % TurnRank.YIELD != TurnRank.STRAIGHT))
-    before = np.maximum(enters - BEFORE, 0)
-    free = enters[~lit[before] | (stop[before] > entry[before] + 3.0)]
-    cap[free] = np.minimum(cap[free], CAREFUL)
-    # v^2 may fall by 2 a a metre: the least over all points ahead, in one sweep
-    fall = 2.0 * SLOW_DOWN * route.spacing * np.arange(n)
-    cap = np.sqrt(np.minimum.accumulate((cap.astype(np.float64) ** 2 + fall)[::-1])[::-1] - fall)
-    signs = graph.sign_kind[graph.rule_sign] == SignKind.STOP
-    distance, _ = _next_line(route, graph, graph.rule_lane[signs], graph.rule_s[signs], graph.rule_sign[signs])
-    line = np.floor(np.arange(n) * route.spacing + distance + 0.5)
-    path = np.stack([route.xy[:, 0], route.xy[:, 1], route.yaw, smooth], 1)
+    smooth_curvature = np.convolve(np.pad(curvature, 1, mode="edge"), kernel, mode="valid")
+    speed_cap = np.minimum(route.speed_limit, np.sqrt(LATERAL_COMFORT / np.maximum(np.abs(smooth_curvature), 1e-4)))
+    entry_distance, exit_distance, turn_rank = _junctions(route, graph, yaw)
+    line_distance, signal = _next_line(route, graph, graph.stop_lane, graph.stop_s, graph.stop_signal)
+    # Turns without a signal are approached slowly, because nothing else grants the right of way.
+    signalled = np.append(~graph.signal_virtual, False)[signal]
+    entry_points = np.flatnonzero(
+        (entry_distance[1:] == 0.0)
+        & (entry_distance[:-1] > 0.0)
+        & (turn_rank[:-1] % TurnRank.YIELD != TurnRank.STRAIGHT)
+    )
+    approach_points = np.maximum(entry_points - BEFORE, 0)
+    unsignalled = entry_points[
+        ~signalled[approach_points] | (line_distance[approach_points] > entry_distance[approach_points] + 3.0)
+    ]
+    speed_cap[unsignalled] = np.minimum(speed_cap[unsignalled], CAREFUL)
+    # v^2 falls by at most 2 a per metre, so a running minimum from the end gives the profile in one sweep.
+    square_drop = 2.0 * SLOW_DOWN * route.spacing * np.arange(count)
+    speed_cap = np.sqrt(
+        np.minimum.accumulate((speed_cap.astype(np.float64) ** 2 + square_drop)[::-1])[::-1] - square_drop
+    )
+    is_stop_sign = graph.sign_kind[graph.rule_sign] == SignKind.STOP
+    sign_distance, _ = _next_line(
+        route, graph, graph.rule_lane[is_stop_sign], graph.rule_s[is_stop_sign], graph.rule_sign[is_stop_sign]
+    )
+    sign_point = np.floor(np.arange(count) * route.spacing + sign_distance + 0.5)
+    path = np.stack([route.xy[:, 0], route.xy[:, 1], route.yaw, smooth_curvature], 1)
     return PathTable(
         path.astype(np.float32),
-        np.stack([cap, stop, entry, rank], 1).astype(np.float32),
+        np.stack([speed_cap, line_distance, entry_distance, turn_rank], 1).astype(np.float32),
         signal,
         _bend(route),
-        np.stack([distance, line, leave], 1).astype(np.float32),
+        np.stack([sign_distance, sign_point, exit_distance], 1).astype(np.float32),
         _height(route, graph),
         route.lane.astype(np.int32),
         _beside(route, graph),
@@ -109,144 +123,161 @@ def _next_line(
 
     Lines lie across `lanes` at the arc lengths `along`; a route may come past one more than once.
     """
-    distance, found = np.full(len(route.xy), FAR), np.full(len(route.xy), -1, np.int32)
-    marks: list[tuple[float, int]] = []
-    for k in np.flatnonzero(np.isin(lanes, route.lane)).tolist():
-        lane = int(lanes[k])
-        on = np.flatnonzero(route.lane == lane)
-        a, b = int(graph.offset[lane]), int(graph.offset[lane + 1])
-        at = [np.interp(along[k], graph.s[a:b], graph.xy[a:b, d]) for d in (0, 1)]
-        for visit in np.split(on, np.flatnonzero(np.diff(on) > 1) + 1):
-            i = int(visit[np.argmin(np.hypot(*(route.xy[visit] - at).T))])
-            c, s = np.cos(route.yaw[i]), np.sin(route.yaw[i])
-            ahead = (at[0] - route.xy[i, 0]) * c + (at[1] - route.xy[i, 1]) * s
-            marks.append((i * route.spacing + float(ahead), int(what[k])))
-    u = np.arange(len(route.xy)) * route.spacing
-    for position, index in sorted(marks, reverse=True):
-        before = u <= position + 0.75
-        distance[before] = position - u[before]
-        found[before] = index
-    return distance, found
+    distance, indices = np.full(len(route.xy), FAR), np.full(len(route.xy), -1, np.int32)
+    crossings: list[tuple[float, int]] = []
+    for row in np.flatnonzero(np.isin(lanes, route.lane)).tolist():
+        lane = int(lanes[row])
+        lane_points = np.flatnonzero(route.lane == lane)
+        start, stop = int(graph.offset[lane]), int(graph.offset[lane + 1])
+        line_point = [np.interp(along[row], graph.s[start:stop], graph.xy[start:stop, axis]) for axis in (0, 1)]
+        # Each consecutive run of points is one visit of the lane; a loop may visit it again.
+        for visit in np.split(lane_points, np.flatnonzero(np.diff(lane_points) > 1) + 1):
+            nearest = int(visit[np.argmin(np.hypot(*(route.xy[visit] - line_point).T))])
+            cos, sin = np.cos(route.yaw[nearest]), np.sin(route.yaw[nearest])
+            ahead = (line_point[0] - route.xy[nearest, 0]) * cos + (line_point[1] - route.xy[nearest, 1]) * sin
+            crossings.append((nearest * route.spacing + float(ahead), int(what[row])))
+    positions = np.arange(len(route.xy)) * route.spacing
+    # From the last line backwards, so that the nearest line ahead is written last.
+    for position, index in sorted(crossings, reverse=True):
+        upstream = positions <= position + 0.75
+        distance[upstream] = position - positions[upstream]
+        indices[upstream] = index
+    return distance, indices
 
 
 def _junctions(
     route: Route, graph: LaneGraph, yaw: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Distances to the next junction and to its end, and turn rank there, for every route point."""
-    ruled = set(graph.rule_lane.tolist())
-    n = len(route.xy)
-    inside = np.zeros(n, bool)
-    known = route.lane >= 0
-    inside[known] = graph.junction[route.lane[known]] >= 0
-    entry, leave = np.full(n, FAR), np.full(n, FAR)
-    rank = np.zeros(n)
-    edge = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
-    runs = zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True)
-    for start, stop in reversed(list(runs)):
-        turn = yaw[min(stop, n - 1)] - yaw[max(start - 1, 0)]
-        kind = int(TurnRank.STRAIGHT) if abs(turn) < TURN else (TurnRank.LEFT if turn > 0 else TurnRank.RIGHT)
-        if start > 0 and int(route.lane[start - 1]) in ruled:
-            kind += TurnRank.YIELD
-        entry[: start + 1] = (start - np.arange(start + 1)) * route.spacing
-        leave[:stop] = (stop - np.arange(stop)) * route.spacing
-        rank[: start + 1] = kind
-        entry[start:stop] = 0.0
-        rank[start:stop] = kind
-    return entry, leave, rank
+    """Return the distances to the next junction and to its end, and the turn rank there, for every route point."""
+    signed_lanes = set(graph.rule_lane.tolist())
+    count = len(route.xy)
+    inside = np.zeros(count, bool)
+    on_lane = route.lane >= 0
+    inside[on_lane] = graph.junction[route.lane[on_lane]] >= 0
+    entry_distance, exit_distance = np.full(count, FAR), np.full(count, FAR)
+    turn_rank = np.zeros(count)
+    edges = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
+    runs = zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True)
+    # From the last junction backwards, so that nearer junctions overwrite farther ones.
+    for first_inside, first_outside in reversed(list(runs)):
+        heading_change = yaw[min(first_outside, count - 1)] - yaw[max(first_inside - 1, 0)]
+        turn_kind = (
+            int(TurnRank.STRAIGHT)
+            if abs(heading_change) < TURN
+            else (TurnRank.LEFT if heading_change > 0 else TurnRank.RIGHT)
+        )
+        if first_inside > 0 and int(route.lane[first_inside - 1]) in signed_lanes:
+            turn_kind += TurnRank.YIELD
+        entry_distance[: first_inside + 1] = (first_inside - np.arange(first_inside + 1)) * route.spacing
+        exit_distance[:first_outside] = (first_outside - np.arange(first_outside)) * route.spacing
+        turn_rank[: first_inside + 1] = turn_kind
+        entry_distance[first_inside:first_outside] = 0.0
+        turn_rank[first_inside:first_outside] = turn_kind
+    return entry_distance, exit_distance, turn_rank
 
 
 def _height(route: Route, graph: LaneGraph) -> F32:
-    """[N] height of the lane under each point of a route; 0 where the town has no bridge."""
-    out = np.zeros(len(route.xy), np.float32)
+    """Return the height [N] of the lane under each route point; 0 where the town has no bridge."""
+    heights = np.zeros(len(route.xy), np.float32)
     if np.ptp(graph.z) > BRIDGE:
         for lane in np.unique(route.lane[route.lane >= 0]).tolist():
-            part, span = np.flatnonzero(route.lane == lane), graph.points(lane)
-            away = route.xy[part, None] - graph.xy[span]
-            out[part] = graph.z[span][(away**2).sum(-1).argmin(1)]
-        out[route.lane < 0] = np.nan
-    return out
+            points, lane_points = np.flatnonzero(route.lane == lane), graph.points(lane)
+            offsets = route.xy[points, None] - graph.xy[lane_points]
+            heights[points] = graph.z[lane_points][(offsets**2).sum(-1).argmin(1)]
+        # Off the lanes the height is unknown, and NaN never counts as being on another level.
+        heights[route.lane < 0] = np.nan
+    return heights
 
 
 def _lane_left(
     route: Route, part: npt.NDArray[np.intp], graph: LaneGraph, lane: int
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """How far the centre of a lane is to the left of some points of a route (negative: right), and its width there."""
-    span = graph.points(lane)
-    x, y = graph.xy[span].astype(np.float64).T
+    lane_points = graph.points(lane)
+    x, y = graph.xy[lane_points].astype(np.float64).T
     step_x, step_y = np.diff(x), np.diff(y)
-    from_x, from_y = (route.xy[part, d, None].astype(np.float64) - v[:-1] for d, v in enumerate((x, y)))
-    t = np.clip((from_x * step_x + from_y * step_y) / np.maximum(step_x**2 + step_y**2, 1e-12), 0.0, 1.0)
-    off_x, off_y = from_x - t * step_x, from_y - t * step_y
-    rows, best = np.arange(len(part)), (off_x**2 + off_y**2).argmin(1)
-    t, off_x, off_y = t[rows, best], off_x[rows, best], off_y[rows, best]
-    width = graph.width[span].astype(np.float64)
+    from_x, from_y = (route.xy[part, axis, None].astype(np.float64) - values[:-1] for axis, values in enumerate((x, y)))
+    share = np.clip((from_x * step_x + from_y * step_y) / np.maximum(step_x**2 + step_y**2, 1e-12), 0.0, 1.0)
+    off_x, off_y = from_x - share * step_x, from_y - share * step_y
+    point_index, nearest = np.arange(len(part)), (off_x**2 + off_y**2).argmin(1)
+    share, off_x, off_y = share[point_index, nearest], off_x[point_index, nearest], off_y[point_index, nearest]
+    lane_width = graph.width[lane_points].astype(np.float64)
     yaw = route.yaw[part].astype(np.float64)
-    left = off_x * np.sin(yaw) - off_y * np.cos(yaw)
-    return np.copysign(np.hypot(off_x, off_y), left), width[best] + t * (width[best + 1] - width[best])
+    lateral = off_x * np.sin(yaw) - off_y * np.cos(yaw)
+    return np.copysign(np.hypot(off_x, off_y), lateral), lane_width[nearest] + share * (
+        lane_width[nearest + 1] - lane_width[nearest]
+    )
 
 
 def _beside(route: Route, graph: LaneGraph) -> F32:
-    """Lanes to both sides that a vehicle may use: `Roads.beside`.
+    """Return the usable lanes on both sides of a route: `Roads.beside`.
 
-    To the left a lane of the same direction or, where the line may be crossed, an oncoming one; to the right only one
-    of the same direction. A lane is given up where a junction begins. Where the route ends, a lane of the same
-    direction goes on.
+    To the left a lane of the same direction or, where the marking may be crossed, an oncoming one; to the right only
+    one of the same direction. A lane ends where a junction begins. At the end of the route, a lane of the same
+    direction continues.
     """
-    n = len(route.xy)
-    out = np.zeros((n, 4))
+    count = len(route.xy)
+    table = np.zeros((count, 4))
     edges = np.flatnonzero(np.diff(route.lane)) + 1
-    for part in np.split(np.arange(n), edges):
-        lane = int(route.lane[part[0]])
+    for points in np.split(np.arange(count), edges):
+        lane = int(route.lane[points[0]])
         if lane < 0 or graph.junction[lane] >= 0 or graph.kind[lane] != LaneType.DRIVING:
             continue
-        for column, other, marking in (
+        for column, neighbour, marking in (
             (0, int(graph.left[lane]), int(graph.left_marking[lane])),
             (2, int(graph.right[lane]), int(graph.right_marking[lane])),
         ):
-            if other < 0 or graph.kind[other] != LaneType.DRIVING or marking not in (Marking.NONE, Marking.BROKEN):
+            if (
+                neighbour < 0
+                or graph.kind[neighbour] != LaneType.DRIVING
+                or marking not in (Marking.NONE, Marking.BROKEN)
+            ):
                 continue
-            same = graph.same_direction(lane, other)
-            if column == 2 and not same:
+            same_direction = graph.same_direction(lane, neighbour)
+            if column == 2 and not same_direction:
                 continue
-            away, width = _lane_left(route, part, graph, other)
+            distance, width = _lane_left(route, points, graph, neighbour)
             # not where the route itself changes lane
-            there = np.abs(np.abs(away) - 0.5 * (route.width[part] + width)) < 0.4
-            out[part, column] = np.where(there, np.abs(away), 0.0)
-            out[part, column + 1] = 1.0 if same else -1.0
+            adjacent = np.abs(np.abs(distance) - 0.5 * (route.width[points] + width)) < 0.4
+            table[points, column] = np.where(adjacent, np.abs(distance), 0.0)
+            table[points, column + 1] = 1.0 if same_direction else -1.0
     for column in (0, 2):
-        away, way = out[:, column].copy(), out[:, column + 1].copy()
-        goes_on = (away[1:] != 0.0) & (np.abs(np.diff(away)) < 0.3) & (way[:-1] == way[1:])
-        run = ON_AND_ON if way[-1] > 0.0 else 0.0
-        runs = [run if away[-1] != 0.0 else 0.0]
-        for there, on in zip((away[-2::-1] != 0.0).tolist(), goes_on[::-1].tolist(), strict=True):
-            runs.append(runs[-1] + route.spacing if there and on else 0.0)
-        out[:, column + 1] = way * runs[::-1]
-        # who has not come back in time is led back to the route
-        for k in np.flatnonzero((away[:-1] != 0.0) & (away[1:] == 0.0)).tolist():
-            fade = np.arange(1, min(FADE, n - 1 - k) + 1)
-            rest = away[k + 1 : k + 1 + len(fade)] == 0.0
-            stop = len(fade) if rest.all() else int(np.argmin(rest))
-            out[k + 1 : k + 1 + stop, column] = away[k] * (1.0 - fade[:stop] / FADE)
-    return out.astype(np.float32)
+        distance, direction = table[:, column].copy(), table[:, column + 1].copy()
+        persists = (distance[1:] != 0.0) & (np.abs(np.diff(distance)) < 0.3) & (direction[:-1] == direction[1:])
+        continuation = ON_AND_ON if direction[-1] > 0.0 else 0.0
+        lengths = [continuation if distance[-1] != 0.0 else 0.0]
+        for adjacent, continues in zip((distance[-2::-1] != 0.0).tolist(), persists[::-1].tolist(), strict=True):
+            lengths.append(lengths[-1] + route.spacing if adjacent and continues else 0.0)
+        table[:, column + 1] = direction * lengths[::-1]
+        # An agent that is still on a lane that ends is led back to the route.
+        for index in np.flatnonzero((distance[:-1] != 0.0) & (distance[1:] == 0.0)).tolist():
+            fade_steps = np.arange(1, min(FADE, count - 1 - index) + 1)
+            is_free = distance[index + 1 : index + 1 + len(fade_steps)] == 0.0
+            stop = len(fade_steps) if is_free.all() else int(np.argmin(is_free))
+            table[index + 1 : index + 1 + stop, column] = distance[index] * (1.0 - fade_steps[:stop] / FADE)
+    return table.astype(np.float32)
 
 
 def signal_programs(graph: LaneGraph) -> F32:
-    """[S, 4] cycle, start of green, green, yellow in s: a junction's phases take turns; virtual signals are off."""
-    out = np.zeros((len(graph.signal_phase), 4), np.float32)
+    """Return cycle, start of green, green and yellow [S, 4], s. Phases of a junction alternate."""
+    programs = np.zeros((len(graph.signal_phase), 4), np.float32)
     for order, junction in enumerate(np.unique(graph.signal_junction)):
-        mine = np.flatnonzero((graph.signal_junction == junction) & ~graph.signal_virtual)
-        phases = {int(p): k for k, p in enumerate(np.unique(graph.signal_phase[mine]).tolist())}
-        one = GREEN + YELLOW + ALL_RED
-        cycle = one * max(len(phases), 2)  # a lone phase still shows red now and then
-        for s in mine:
-            begin = (phases[int(graph.signal_phase[s])] * one + 5.0 * order) % cycle
-            out[s] = cycle, begin, GREEN, YELLOW
-    return out
+        junction_signals = np.flatnonzero((graph.signal_junction == junction) & ~graph.signal_virtual)
+        phases = {
+            int(phase): index for index, phase in enumerate(np.unique(graph.signal_phase[junction_signals]).tolist())
+        }
+        phase_length = GREEN + YELLOW + ALL_RED
+        cycle = phase_length * max(len(phases), 2)  # a lone phase still shows red now and then
+        for signal in junction_signals:
+            # Neighbouring junctions are offset, so that they do not all switch at once.
+            green_start = (phases[int(graph.signal_phase[signal])] * phase_length + 5.0 * order) % cycle
+            programs[signal] = cycle, green_start, GREEN, YELLOW
+    return programs
 
 
 @dataclass
 class _Pool:
-    """Routes of all agents, each stored once."""
+    """Routes and trajectories of all agents; a route that several agents share is stored once."""
 
     tables: list[PathTable] = field(default_factory=list)
     size: int = 0
@@ -263,7 +294,7 @@ class _Pool:
         return self.where[key]
 
     def follow(self, agent: EpisodeAgent) -> tuple[int, int]:
-        """First row and number of rows of an agent's trajectory."""
+        """Add an agent's trajectory; return its first row and number of rows."""
         first = len(self.tracks)
         self.tracks += agent.trajectory
         return first, len(agent.trajectory)
@@ -297,17 +328,26 @@ def _put_agent(  # noqa: PLR0917
     a["route"][e, i] = route
     a["track"][e, i] = track
     a["phase_count"][e, i] = len(agent.phases)
-    for k, phase in enumerate(agent.phases):
-        a["phase_when"][e, i, k] = When[phase.when.kind.upper()], phase.when.value, phase.when.actor + 1
-        a["phase_speed"][e, i, k] = phase.speed
+    for phase_index, phase in enumerate(agent.phases):
+        a["phase_when"][e, i, phase_index] = When[phase.when.kind.upper()], phase.when.value, phase.when.actor + 1
+        a["phase_speed"][e, i, phase_index] = phase.speed
 
 
 @dataclass(frozen=True)
 class Bank:
-    """What does not change while a world runs: for the kernels, and for `WorldState`.
+    """Arrays that do not change while a world runs, for the kernels and for `WorldState`.
 
-    kind [E, A] AgentKind of every slot, size [E, A, 2] length and width m, route [E, A, 2] as in `EpisodeArrays`;
-    program [E, S, 4] of the town's signals and forced [E, S] states (-1 none) until [E] s.
+    Attributes:
+        episodes: Arrays of the episodes on the device.
+        roads: Arrays of the roads on the device.
+        tables: The same routes for the host.
+        agents: A, slots per scene.
+        kind: [E, A] AgentKind of every slot.
+        size: [E, A, 2] length and width, m.
+        route: [E, A, 2] first point and number of points, as in `EpisodeArrays`.
+        program: [E, S, 4] programmes of the town's signals, see `signal_programs`.
+        forced: [E, S] forced signal states, -1: none.
+        until: [E] time until which they are forced, s.
     """
 
     episodes: EpisodeArrays
@@ -329,21 +369,29 @@ def build(
     ego: Controller | None,
     models: Mapping[str, Model],
 ) -> Bank:
-    """Arrays of all episodes on `device`.
+    """Build the arrays of all episodes on a device.
 
-    `ego` replaces the egos' controller.
+    Args:
+        episodes: The bank.
+        graphs: Lane graphs by town.
+        device: Warp device.
+        ego: Controller that replaces the egos'; None: as the episodes say.
+        models: Bodies by name.
+
+    Raises:
+        ConfigError: There is no episode, or one of them cannot be built.
     """
     if not episodes:
         raise ConfigError("a world needs at least one episode")
     for episode in episodes:
         _check(episode)
-    towns = sorted({e.town for e in episodes})
-    count = max(len(e.agents) for e in episodes)
-    phases = max(1, *(len(a.phases) for e in episodes for a in e.agents))
-    signals = max(1, *(len(graphs[t].signal_phase) for t in towns))
-    names = {name: k for k, name in enumerate(models)}
-    shape = (len(episodes), count)
-    a: dict[str, npt.NDArray[np.generic]] = {
+    towns = sorted({episode_index.town for episode_index in episodes})
+    agent_count = max(len(episode_index.agents) for episode_index in episodes)
+    phase_count = max(1, *(len(arrays.phases) for episode_index in episodes for arrays in episode_index.agents))
+    signal_count = max(1, *(len(graphs[town].signal_phase) for town in towns))
+    model_rows = {name: k for k, name in enumerate(models)}
+    shape = (len(episodes), agent_count)
+    arrays: dict[str, npt.NDArray[np.generic]] = {
         "model": np.full(shape, -1, np.int32),
         "controller": np.zeros(shape, np.int32),
         "start": np.zeros((*shape, 4), np.float32),
@@ -351,72 +399,78 @@ def build(
         "route": np.zeros((*shape, 2), np.int32),
         "track": np.zeros((*shape, 2), np.int32),
         "phase_count": np.zeros(shape, np.int32),
-        "phase_when": np.zeros((*shape, phases, 3), np.float32),
-        "phase_speed": np.zeros((*shape, phases), np.float32),
+        "phase_when": np.zeros((*shape, phase_count, 3), np.float32),
+        "phase_speed": np.zeros((*shape, phase_count), np.float32),
         "town": np.zeros(len(episodes), np.int32),
-        "signal": np.full((len(episodes), signals), -1, np.int32),
+        "signal": np.full((len(episodes), signal_count), -1, np.int32),
         "limits": np.zeros((len(episodes), 4), np.float32),
         "contact": np.zeros(len(episodes), np.int32),
     }
     pool = _Pool()
-    for e, episode in enumerate(episodes):
+    for episode_index, episode in enumerate(episodes):
         graph = graphs[episode.town]
-        for i, agent in enumerate(episode.agents):
+        for agent_index, agent in enumerate(episode.agents):
             route = (0, 0)
             if agent.route is not None and len(agent.route.xy) > 1:
                 route = pool.add(agent.route, graph)
-            _put_agent(a, e, i, agent, names, route, pool.follow(agent))
+            _put_agent(arrays, episode_index, agent_index, agent, model_rows, route, pool.follow(agent))
         if ego is not None:
-            a["controller"][e, 0] = int(ego)
-        a["town"][e] = towns.index(episode.town)
-        for index, state in episode.signal_override.items():
-            a["signal"][e, index] = int(state)
+            arrays["controller"][episode_index, 0] = int(ego)
+        arrays["town"][episode_index] = towns.index(episode.town)
+        for signal_index, state in episode.signal_override.items():
+            arrays["signal"][episode_index, signal_index] = int(state)
         limits = episode.limits
-        a["contact"][e] = ContactPolicy[limits.contact.upper()]
-        a["limits"][e] = limits.max_steps, limits.max_time, limits.max_distance, episode.override_until
-    body = [(m.length / 2, m.width / 2, max(m.wheelbase, 0.1), m.max_steer) for m in models.values()]
-    power = [(m.max_accel, m.max_brake, m.max_speed, 0.0) for m in models.values()]
-    a["kind"] = np.array([int(m.kind) for m in models.values()], np.int32)
-    a["body"] = np.array(body, np.float32)
-    a["power"] = np.array(power, np.float32)
+        arrays["contact"][episode_index] = ContactPolicy[limits.contact.upper()]
+        arrays["limits"][episode_index] = limits.max_steps, limits.max_time, limits.max_distance, episode.override_until
+    body = [
+        (model.length / 2, model.width / 2, max(model.wheelbase, 0.1), model.max_steer) for model in models.values()
+    ]
+    power = [(model.max_accel, model.max_brake, model.max_speed, 0.0) for model in models.values()]
+    arrays["kind"] = np.array([int(model.kind) for model in models.values()], np.int32)
+    arrays["body"] = np.array(body, np.float32)
+    arrays["power"] = np.array(power, np.float32)
     bank = EpisodeArrays()
-    for name, array in array_types(EpisodeArrays).items():
-        setattr(bank, name, wp.array(a[name], dtype=array.dtype, device=device))
-    found = [graphs[t] for t in towns]
-    program = np.zeros((len(towns), signals, 4))
-    for k, graph in enumerate(found):
-        program[k, : len(graph.signal_phase)] = signal_programs(graph)
-    rows = np.asarray(a["model"])
+    for name, array_type in array_types(EpisodeArrays).items():
+        setattr(bank, name, wp.array(arrays[name], dtype=array_type.dtype, device=device))
+    town_graphs = [graphs[town] for town in towns]
+    programs = np.zeros((len(towns), signal_count, 4))
+    for k, graph in enumerate(town_graphs):
+        programs[k, : len(graph.signal_phase)] = signal_programs(graph)
+    model_indices = np.asarray(arrays["model"])
     return Bank(
         bank,
-        _roads(found, pool, device),
-        _tables(found, pool),
-        count,
-        np.where(rows < 0, int(AgentKind.NONE), np.asarray(a["kind"])[np.maximum(rows, 0)]).astype(np.int32),
-        (2 * np.asarray(a["body"])[np.maximum(rows, 0), :2]).astype(np.float32),
-        np.asarray(a["route"]),
-        program[np.asarray(a["town"])],
-        np.asarray(a["signal"]),
-        np.asarray(a["limits"])[:, 3],
+        _roads(town_graphs, pool, device),
+        _tables(town_graphs, pool),
+        agent_count,
+        np.where(
+            model_indices < 0, int(AgentKind.NONE), np.asarray(arrays["kind"])[np.maximum(model_indices, 0)]
+        ).astype(np.int32),
+        (2 * np.asarray(arrays["body"])[np.maximum(model_indices, 0), :2]).astype(np.float32),
+        np.asarray(arrays["route"]),
+        programs[np.asarray(arrays["town"])],
+        np.asarray(arrays["signal"]),
+        np.asarray(arrays["limits"])[:, 3],
     )
 
 
 def _tables(graphs: Sequence[LaneGraph], pool: _Pool) -> RoadTables:
-    """The same routes for the host; lanes are counted over all towns, as in `Roads`."""
-    first = dict(zip([g.name for g in graphs], np.cumsum([0, *(len(g.kind) for g in graphs)]), strict=False))
+    """Return the routes for the host; lanes are numbered over all towns, as in `Roads`."""
+    first_lane = dict(
+        zip([graph.name for graph in graphs], np.cumsum([0, *(len(graph.kind) for graph in graphs)]), strict=False)
+    )
 
     def shifted(lanes: npt.NDArray[np.int32], town: str) -> npt.NDArray[np.int32]:
-        return np.where(lanes >= 0, lanes + first[town], -1).astype(np.int32)
+        return np.where(lanes >= 0, lanes + first_lane[town], -1).astype(np.int32)
 
     return RoadTables(
-        path=np.concatenate([t.path for t in pool.tables]),
-        rule=np.concatenate([t.rule for t in pool.tables]),
-        signal=np.concatenate([t.signal for t in pool.tables]),
-        lane=np.concatenate([shifted(t.lane, t.town) for t in pool.tables]),
-        left=np.concatenate([shifted(g.left, g.name) for g in graphs]),
-        right=np.concatenate([shifted(g.right, g.name) for g in graphs]),
-        side=np.concatenate([np.sign(g.lane_id).astype(np.int32) for g in graphs]),
-        junction=np.concatenate([g.junction >= 0 for g in graphs]),
+        path=np.concatenate([table.path for table in pool.tables]),
+        rule=np.concatenate([table.rule for table in pool.tables]),
+        signal=np.concatenate([table.signal for table in pool.tables]),
+        lane=np.concatenate([shifted(table.lane, table.town) for table in pool.tables]),
+        left=np.concatenate([shifted(graph.left, graph.name) for graph in graphs]),
+        right=np.concatenate([shifted(graph.right, graph.name) for graph in graphs]),
+        side=np.concatenate([np.sign(graph.lane_id).astype(np.int32) for graph in graphs]),
+        junction=np.concatenate([graph.junction >= 0 for graph in graphs]),
     )
 
 
@@ -441,17 +495,17 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
         entries += len(grid.cell_seg)
         signals += len(graph.signal_phase)
     roads = Roads()
-    parts["path"] = [t.path for t in pool.tables]
-    parts["rule"] = [t.rule for t in pool.tables]
-    parts["height"] = [t.height for t in pool.tables]
-    parts["path_signal"] = [t.signal for t in pool.tables]
-    parts["bend"] = [t.bend for t in pool.tables]
+    parts["path"] = [table.path for table in pool.tables]
+    parts["rule"] = [table.rule for table in pool.tables]
+    parts["height"] = [table.height for table in pool.tables]
+    parts["path_signal"] = [table.signal for table in pool.tables]
+    parts["bend"] = [table.bend for table in pool.tables]
     parts["track"] = [np.array(pool.tracks or [(0.0,) * 4])]
-    parts["beside"] = [t.beside for t in pool.tables]
-    parts["ahead"] = [t.ahead for t in pool.tables]
-    for name, array in array_types(Roads).items():
+    parts["beside"] = [table.beside for table in pool.tables]
+    parts["ahead"] = [table.ahead for table in pool.tables]
+    for name, array_type in array_types(Roads).items():
         joined = np.concatenate(parts[name])
         if len(joined) == 0:  # a town without signals
             joined = np.zeros((1, *joined.shape[1:]), joined.dtype)
-        setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=array.dtype, device=device))
+        setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=array_type.dtype, device=device))
     return roads

@@ -1,4 +1,4 @@
-"""Bodies and limits of the agents. Bodies follow CARLA 0.9's bounding boxes of the vehicles named beside them."""
+"""Bodies and limits of agents. Bodies follow CARLA 0.9's bounding boxes of the vehicles named beside them."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ WALKER_RATE = math.pi
 def _vehicle(  # noqa: PLR0917
     name: str, kind: AgentKind, size: tuple[float, float, float], accel: float, brake: float, speed: float
 ) -> Model:
+    # The wheelbase is taken as the same share of the length for every vehicle.
     return Model(name, kind, *size, 0.58 * size[0], _STEER, accel, brake, speed)
 
 
@@ -47,7 +48,7 @@ MODELS: dict[str, Model] = {
 
 
 def model(name: str) -> Model:
-    """The model of that name; raises UnknownNameError with the three closest."""
+    """Return the model of that name. Raises UnknownNameError with the three closest names."""
     try:
         return MODELS[name]
     except KeyError:

@@ -1,4 +1,4 @@
-"""Seeded chance in a world's traffic: what `World(noise=...)` takes, and the arrays behind it."""
+"""Seeded randomness in a world's traffic: the argument of `World(noise=...)` and the arrays behind it."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ _NEVER = 1.0e9
 
 @dataclass(frozen=True)
 class Noise:
-    """How much chance there is in traffic; with nothing set there is none.
+    """Amount of randomness in traffic; by default there is none.
 
-    Background Autopilots (not the ego) accelerate unevenly, and change lane without looking. The ego, if the world
-    drives it (Autopilot, route follower), has lapses: it steers on, but leaves throttle and brake as they are. Each
-    agent has two processes (Ornstein-Uhlenbeck, mean 0, variance 1): one is the unevenness, and while the other is in
-    its upper tail the agent has a lapse or changes lane to the left; in its lower tail, to the right.
+    Background Autopilots (not the ego) accelerate unevenly and make careless lane changes. The ego, if the world
+    drives it (Autopilot, route follower), has lapses: it keeps steering, but holds throttle and brake. Each agent has
+    two processes (Ornstein-Uhlenbeck, mean 0, variance 1): one is the unevenness of the acceleration; the other
+    causes a lapse or a lane change to the left in its upper tail, and one to the right in its lower tail.
 
     Attributes:
         accel: Standard deviation of the acceleration of background Autopilots, m/s^2.
-        accel_time: Time in which it forgets, s.
-        lapse: Share of the time that the ego does not attend, in [0, 0.5].
-        careless: Share of the time in which a background Autopilot would change lane without looking, in [0, 0.5].
-        choice_time: Time in which lapses and carelessness forget, s: about how long they last.
-        ramp: How long a careless lane change takes, s.
-        stretches: Into how many stretches of time the normal numbers behind the processes are divided, so that their
-            means can be moved (`noise.push`) and their sums be read (`noise.total`). The first is the first step alone,
-            which says where the processes begin.
-        stretch: Steps of each of the others; the last one goes on to the end.
+        accel_time: Time constant of the acceleration, s.
+        lapse: Share of the time in which the ego is inattentive, in [0, 0.5].
+        careless: Share of the time in which a background Autopilot would change lanes without looking, in [0, 0.5].
+        choice_time: Time constant of lapses and carelessness, s: about how long they last.
+        ramp: Duration of a careless lane change, s.
+        stretches: Number of stretches of time into which the normal numbers behind the processes are divided, so that
+            their means can be shifted (`noise.push`) and their sums read (`noise.total`). The first is the first step
+            alone, which determines where the processes begin.
+        stretch: Steps of each of the others; the last one continues to the end.
     """
 
     accel: float = 0.0
@@ -65,17 +65,22 @@ class Noise:
             raise ConfigError("noise needs times above 0, and at least one stretch of at least one step")
 
     def rule(self, dt: float) -> Any:
-        """As the kernels read it."""
+        """Return the parameters as the kernels read them."""
 
         def beyond(share: float) -> float:
             return NormalDist().inv_cdf(1.0 - share) if share > 0.0 else _NEVER
 
-        rule = NoiseRule()
-        rule.accel = self.accel
-        rule.keep = wp.vec2(math.exp(-dt / self.accel_time), math.exp(-dt / self.choice_time))
-        rule.lapse, rule.careless, rule.ramp = beyond(self.lapse), beyond(self.careless / 2.0), self.ramp
-        rule.stretch, rule.stretches = self.stretch, self.stretches
-        return rule
+        parameters = NoiseRule()
+        parameters.accel = self.accel
+        parameters.keep = wp.vec2(math.exp(-dt / self.accel_time), math.exp(-dt / self.choice_time))
+        # The left and the right tail share the probability of a careless lane change.
+        parameters.lapse, parameters.careless, parameters.ramp = (
+            beyond(self.lapse),
+            beyond(self.careless / 2.0),
+            self.ramp,
+        )
+        parameters.stretch, parameters.stretches = self.stretch, self.stretches
+        return parameters
 
 
 def noise_state(
@@ -84,12 +89,12 @@ def noise_state(
     """The arrays of as many scenes as `order` names episodes; keys are those of the episodes."""
     state = NoiseState()
     shape = (len(order), agents, noise.stretches)
-    for name, array in array_types(NoiseState).items():
-        setattr(state, name, wp.zeros(shape[: array.ndim], dtype=array.dtype, device=device))
+    for name, array_type in array_types(NoiseState).items():
+        setattr(state, name, wp.zeros(shape[: array_type.ndim], dtype=array_type.dtype, device=device))
     state.key.assign(episode_keys(episodes)[order])
     return state
 
 
 def episode_keys(episodes: Sequence[Episode]) -> Keys:
-    """The key of each episode's chance, where nobody gives another one."""
-    return np.array([int(digest("noise", e.key, e.seed)[:16], 16) for e in episodes], np.uint64)
+    """Return the default key of each episode's randomness."""
+    return np.array([int(digest("noise", episode.key, episode.seed)[:16], 16) for episode in episodes], np.uint64)

@@ -1,4 +1,4 @@
-"""What drivers outside the world see: arrays of one step in the frame of each agent that they drive."""
+"""Observations of drivers outside the world: arrays of one step in the frame of each agent that they drive."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ SIGHT = 60.0  # m
 
 
 def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, Any] | None = None) -> Observation:
-    """What the agents [N, 2] (scene, agent) see; see `ssad.core.driving.Observation`. ended [B]."""
+    """Return the observation of agents [N, 2] (scene, agent); see `ssad.core.driving.Observation`. ended [B]."""
     scene, agent = np.asarray(agents, np.int32).T
-    here = state.pose[scene, agent]
+    pose = state.pose[scene, agent]
     speed = state.speed[scene, agent]
-    route, offset, error, at = _route(state, scene, agent, here)
-    others, relation = _others(state, scene, agent, here)
+    route, lane_offset, heading_error, route_point = _route(state, scene, agent, pose)
+    neighbours, relation = _others(state, scene, agent, pose)
     return Observation(
         scene=scene.copy(),
         agent=agent.copy(),
         time=state.time[scene].astype(np.float32),
         speed=speed,
         accel=state.accel[scene, agent],
-        pose=here,
+        pose=pose,
         target_speed=state.target_speed[scene, agent],
         route=route.astype(np.float32),
-        lane_offset=offset.astype(np.float32),
-        heading_error=error.astype(np.float32),
-        others=others,
+        lane_offset=lane_offset.astype(np.float32),
+        heading_error=heading_error.astype(np.float32),
+        others=neighbours,
         others_lane=relation,
-        signal=_signal(state, scene, at),
+        signal=_signal(state, scene, route_point),
         done=ended[scene],
         readings={} if readings is None else readings,
     )
@@ -45,62 +45,65 @@ def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, 
 
 def _route(state: WorldState, scene: I32, agent: I32, here: F32) -> tuple[Any, Any, Any, I32]:
     """`route`, `lane_offset`, `heading_error`, and [N] the nearest point in `state.roads`, -1 without a route."""
-    first, count = np.moveaxis(state.route[scene, agent], -1, 0)
-    index = np.minimum(state.progress[scene, agent][:, None] + 1 + np.arange(AHEAD), count[:, None] - 1)
-    route = to_local(here[:, None], state.roads.path[np.maximum(index + first[:, None], 0), :2])
+    first_point, point_count = np.moveaxis(state.route[scene, agent], -1, 0)
+    indices = np.minimum(state.progress[scene, agent][:, None] + 1 + np.arange(AHEAD), point_count[:, None] - 1)
+    route = to_local(here[:, None], state.roads.path[np.maximum(indices + first_point[:, None], 0), :2])
     straight = np.stack([np.arange(1.0, AHEAD + 1), np.zeros(AHEAD)], 1)
-    has = count > 1
-    route = np.where(has[:, None, None], route, straight)
-    at = np.where(has, first + state.progress[scene, agent], -1)
-    point = state.roads.path[np.maximum(at, 0)]
-    offset = np.where(has, to_local(point[:, :3], here[:, :2])[:, 1], 0.0)
-    error = np.where(has, np.angle(np.exp(1j * (here[:, 2] - point[:, 2]))), 0.0)
-    return route, offset, error, at
+    has_route = point_count > 1
+    route = np.where(has_route[:, None, None], route, straight)
+    nearest_point = np.where(has_route, first_point + state.progress[scene, agent], -1)
+    point = state.roads.path[np.maximum(nearest_point, 0)]
+    offset = np.where(has_route, to_local(point[:, :3], here[:, :2])[:, 1], 0.0)
+    heading_error = np.where(has_route, np.angle(np.exp(1j * (here[:, 2] - point[:, 2]))), 0.0)
+    return route, offset, heading_error, nearest_point
 
 
 def _others(state: WorldState, scene: I32, agent: I32, here: F32) -> tuple[F32, U8]:
     """`others` and `others_lane`."""
     pose, kind = state.pose[scene], state.kind[scene]
-    place = to_local(here[:, None], pose[..., :2])
+    positions = to_local(here[:, None], pose[..., :2])
     distance = np.hypot(*np.moveaxis(pose[..., :2] - here[:, None, :2], -1, 0))
-    there = state.active[scene] & (kind != AgentKind.NONE) & (distance <= SIGHT)
-    rows = np.arange(len(scene))
-    there[rows, agent] = False
-    order = np.argsort(np.where(there, distance, np.inf), axis=1, kind="stable")[:, :NEAREST]
-    rows = rows[:, None]
+    visible = state.active[scene] & (kind != AgentKind.NONE) & (distance <= SIGHT)
+    row_index = np.arange(len(scene))
+    visible[row_index, agent] = False
+    # A stable sort: equally distant agents keep their order on every machine.
+    nearest_order = np.argsort(np.where(visible, distance, np.inf), axis=1, kind="stable")[:, :NEAREST]
+    row_index = row_index[:, None]
     size = state.size[scene]
-    turn = np.angle(np.exp(1j * (pose[..., 2] - here[:, None, 2])))
-    columns = (place[..., 0], place[..., 1], turn, state.speed[scene], size[..., 0], size[..., 1], kind)
-    table = np.stack([column.astype(np.float32) for column in columns], -1)
-    table = np.where(there[..., None], table, 0.0)[rows, order]
+    relative_yaw = np.angle(np.exp(1j * (pose[..., 2] - here[:, None, 2])))
+    columns = (positions[..., 0], positions[..., 1], relative_yaw, state.speed[scene], size[..., 0], size[..., 1], kind)
+    features = np.stack([column.astype(np.float32) for column in columns], -1)
+    features = np.where(visible[..., None], features, 0.0)[row_index, nearest_order]
     others = np.zeros((len(scene), NEAREST, 7), np.float32)
-    others[:, : table.shape[1]] = table
+    others[:, : features.shape[1]] = features
     relation = np.zeros((len(scene), NEAREST), np.uint8)
-    found = lane_relations(state, scene, agent)[rows, order]
-    relation[:, : table.shape[1]] = np.where(there[rows, order], found, LaneRelation.ELSEWHERE)
+    relations = lane_relations(state, scene, agent)[row_index, nearest_order]
+    relation[:, : features.shape[1]] = np.where(visible[row_index, nearest_order], relations, LaneRelation.ELSEWHERE)
     return others, relation
 
 
 def lane_relations(state: WorldState, scene: I32, agent: I32) -> U8:
-    """[N, A] `LaneRelation` of every agent of the scene to the agent that looks."""
+    """Return the `LaneRelation` [N, A] of every agent of the scene to the observing agent."""
     roads = state.roads
-    lane, mine = state.lane[scene], state.lane[scene, agent][:, None]
-    on_road = (lane >= 0) & (mine >= 0)
-    out = np.zeros(lane.shape, np.uint8)
-    first, count = np.moveaxis(state.route[scene, agent], -1, 0)
-    index = np.minimum(state.progress[scene, agent][:, None] + np.arange(int(SIGHT)), count[:, None] - 1)
-    taken = np.where((count > 1)[:, None], roads.lane[np.maximum(index + first[:, None], 0)], -1)
-    out[(lane >= 0) & (lane[:, :, None] == taken[:, None]).any(-1)] = LaneRelation.ROUTE
-    out[on_road & (lane == roads.right[mine])] = LaneRelation.RIGHT
-    out[on_road & (lane == roads.left[mine])] = LaneRelation.LEFT
-    out[on_road & (lane == mine)] = LaneRelation.SAME
-    return out
+    lane, own_lane = state.lane[scene], state.lane[scene, agent][:, None]
+    on_road = (lane >= 0) & (own_lane >= 0)
+    relations = np.zeros(lane.shape, np.uint8)
+    first_point, point_count = np.moveaxis(state.route[scene, agent], -1, 0)
+    indices = np.minimum(state.progress[scene, agent][:, None] + np.arange(int(SIGHT)), point_count[:, None] - 1)
+    route_lanes = np.where((point_count > 1)[:, None], roads.lane[np.maximum(indices + first_point[:, None], 0)], -1)
+    # In ascending precedence: later assignments overwrite earlier ones.
+    relations[(lane >= 0) & (lane[:, :, None] == route_lanes[:, None]).any(-1)] = LaneRelation.ROUTE
+    relations[on_road & (lane == roads.right[own_lane])] = LaneRelation.RIGHT
+    relations[on_road & (lane == roads.left[own_lane])] = LaneRelation.LEFT
+    relations[on_road & (lane == own_lane)] = LaneRelation.SAME
+    return relations
 
 
 def _signal(state: WorldState, scene: I32, at: I32) -> F32:
     """`signal`: state and metres to the stop line of the next one."""
-    lamp = np.where(at >= 0, state.roads.signal[at], -1)
-    out = np.zeros((len(scene), 2), np.float32)
-    out[:, 0] = np.where(lamp >= 0, state.signal[scene, lamp], 0)
-    out[:, 1] = np.where(lamp >= 0, state.roads.rule[at, 1], FAR)
-    return out
+    next_signal = np.where(at >= 0, state.roads.signal[at], -1)
+    signal_rows = np.zeros((len(scene), 2), np.float32)
+    # Without a signal ahead the lookup reads the last one, and `where` discards it.
+    signal_rows[:, 0] = np.where(next_signal >= 0, state.signal[scene, next_signal], 0)
+    signal_rows[:, 1] = np.where(next_signal >= 0, state.roads.rule[at, 1], FAR)
+    return signal_rows

@@ -1,7 +1,7 @@
-"""Rewards and costs as functions over batch arrays: of one step of the ego's, or of an adversary's.
+"""Rewards and costs as functions over batch arrays, for one step of the egos or of adversaries.
 
-Each takes `WorldState`s and agents [N, 2] (scene, agent) and gives [N] or [B]. Since a state may be a view that holds
-until the next step, what a reward needs of the step before is measured then (`distance_to_goal`).
+Each takes `WorldState`s and agents [N, 2] (scene, agent) and returns [N] or [B]. A state may be a view that is valid
+until the next step only, so rewards that need the step before take a quantity measured then (`distance_to_goal`).
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ _ASIDE = 0.5  # m from the route that cost nothing
 
 
 def _ego_reward(state: WorldState, *, desired_speed: float, collision: float, living: float, aside: float = 0.0) -> F64:
-    point = state.roads.path[state.route[:, 0, 0] + state.route_point]
-    x, y, yaw = (state.pose[:, 0] - point[:, :3]).T
-    offset = np.cos(point[:, 2]) * y - np.sin(point[:, 2]) * x
-    along = state.speed[:, 0] * np.cos(yaw)
+    route_point = state.roads.path[state.route[:, 0, 0] + state.route_point]
+    x, y, yaw = (state.pose[:, 0] - route_point[:, :3]).T
+    offset = np.cos(route_point[:, 2]) * y - np.sin(route_point[:, 2]) * x
+    speed_along = state.speed[:, 0] * np.cos(yaw)
     steer = np.abs(state.control[:, 0, 2])
-    reward = along - collision * (state.contact != Contact.NONE) - 10.0 * (along > desired_speed)
-    reward = reward - (np.abs(offset) > 4.0) - 5.0 * steer * steer - 0.2 * steer * along * along - living
+    reward = speed_along - collision * (state.contact != Contact.NONE) - 10.0 * (speed_along > desired_speed)
+    reward = reward - (np.abs(offset) > 4.0) - 5.0 * steer * steer - 0.2 * steer * speed_along * speed_along - living
     reward = reward - aside * np.maximum(np.abs(offset) - _ASIDE, 0.0)
-    found: F64 = reward.astype(np.float64)
-    return found
+    rewards: F64 = reward.astype(np.float64)
+    return rewards
 
 
 def safebench(state: WorldState) -> F64:
-    """SafeBench's reward of the egos, [B].
+    """Return SafeBench's reward of the egos, [B].
 
-    -1 for a collision, + speed along the lane, -10 above 8 m/s, -1 beyond 4 m from the route, -5 steer^2, -0.2 |steer|
-    times the speed squared. Source: SafeBench (Xu et al. 2022), its environment's `_get_reward`.
+    -1 for a collision, + speed along the lane, -10 above 8 m/s, -1 beyond 4 m from the route, -5 steer^2, -0.2
+    |steer| times the speed squared. Source: SafeBench (Xu et al. 2022), its environment's `_get_reward`.
     """
     return _ego_reward(state, desired_speed=8.0, collision=1.0, living=0.0)
 
 
 def frea(state: WorldState) -> F64:
-    """FREA's reward of the egos, [B]: as SafeBench's, with -10 for a collision, 6 m/s desired, and -0.1 a step."""
+    """Return FREA's reward of the egos, [B]: SafeBench's with -10 for a collision, 6 m/s desired, and -0.1 a step."""
     return _ego_reward(state, desired_speed=6.0, collision=10.0, living=0.1)
 
 
@@ -68,64 +68,66 @@ REWARDS: dict[str, Reward] = {"safebench": safebench, "frea": frea, "driver": dr
 
 
 def goals(state: WorldState) -> F32:
-    """Where adversaries want to be, [B, 2]: the point of the ego's route that the ego reaches next, 6.5 m ahead."""
-    first, count = np.moveaxis(state.route[:, 0], -1, 0)
-    path = state.roads.path
-    part = to_local(path[first + state.progress[:, 0], :3], state.pose[:, 0, :2])[:, 0]
-    at = np.clip(state.progress[:, 0] + part + GOAL_AHEAD, 0.0, count - 1.0)
-    index = np.minimum(at.astype(np.int64), count - 2)
-    share = (at - index)[:, None]
-    a, b = path[first + index, :2], path[first + index + 1, :2]
-    goal: F32 = (a + share * (b - a)).astype(np.float32)
+    """Return the adversaries' goals, [B, 2]: the next point of the ego's route 6.5 m ahead of the ego."""
+    first_point, point_count = np.moveaxis(state.route[:, 0], -1, 0)
+    route_points = state.roads.path
+    offset = to_local(route_points[first_point + state.progress[:, 0], :3], state.pose[:, 0, :2])[:, 0]
+    goal_distance = np.clip(state.progress[:, 0] + offset + GOAL_AHEAD, 0.0, point_count - 1.0)
+    # The last segment also serves its end point.
+    segment = np.minimum(goal_distance.astype(np.int64), point_count - 2)
+    fraction = (goal_distance - segment)[:, None]
+    segment_start, segment_end = route_points[first_point + segment, :2], route_points[first_point + segment + 1, :2]
+    goal: F32 = (segment_start + fraction * (segment_end - segment_start)).astype(np.float32)
     return goal
 
 
 def distance_to_goal(state: WorldState, agents: I32) -> F64:
-    """[N] m from each adversary to the goal of its scene."""
+    """Return the distance [N] from each adversary to the goal of its scene, m."""
     scene, agent = agents.T
-    gap = state.pose[scene, agent, :2] - goals(state)[scene]
-    found: F64 = np.hypot(gap[:, 0], gap[:, 1]).astype(np.float64)
-    return found
+    offset = state.pose[scene, agent, :2] - goals(state)[scene]
+    distances: F64 = np.hypot(offset[:, 0], offset[:, 1]).astype(np.float64)
+    return distances
 
 
 def hit_ego(state: WorldState, agents: I32) -> Bool:
-    """[N] whether an adversary touches the ego."""
+    """Return whether each adversary touches the ego, [N]."""
     scene, agent = agents.T
-    found: Bool = (state.touch[scene, agent] & np.int64(1)) != 0
-    return found
+    # `touch` has one bit per agent; the ego is agent 0.
+    touches: Bool = (state.touch[scene, agent] & np.int64(1)) != 0
+    return touches
 
 
 def hit_others(state: WorldState, agents: I32) -> Bool:
-    """[N] whether an adversary touches anybody but the ego."""
+    """Return whether each adversary touches an agent other than the ego, [N]."""
     scene, agent = agents.T
-    found: Bool = (state.touch[scene, agent] & ~np.int64(1)) != 0
-    return found
+    touches: Bool = (state.touch[scene, agent] & ~np.int64(1)) != 0
+    return touches
 
 
 def adversary(state: WorldState, agents: I32, before: F64, *, literal: bool = False, off_road: float = 0.0) -> F64:
-    """The reward of goal-seeking adversaries (Adv.PPO), [N].
+    """Return the reward of goal-seeking adversaries (Adv.PPO), [N].
 
-    clip(before - now, -1, 1) - 15 for a contact with anybody but the ego + 15 within 2 m of the goal: what the code
-    that gave the published results computes.
+    clip(before - now, -1, 1) - 15 for a contact with an agent other than the ego + 15 within 2 m of the goal, as the
+    code that produced the published results computes it.
 
     Args:
         state: After the step.
         agents: [N, 2] scene and agent of the adversaries.
         before: [N] `distance_to_goal` before the step.
-        literal: Equation 6 as it is printed instead: now - before - 15 r_col - 15 r_fin with r_col = -1 and r_fin = 1.
+        literal: Equation 6 as printed instead: now - before - 15 r_col - 15 r_fin with r_col = -1 and r_fin = 1.
             Its signs reward driving away and contacts, and punish reaching the goal.
-        off_road: What each step with its centre off the road costs; neither the paper nor FREA has such a term.
+        off_road: Cost of each step with its centre off the road; neither the paper nor FREA has such a term.
 
     Source: the paper's equation 6; FREA (Chen et al. 2024).
     """
-    now = distance_to_goal(state, agents)
-    hit, there = hit_others(state, agents), now < GOAL_RADIUS
-    cost = off_road * (state.lane[agents[:, 0], agents[:, 1]] < 0)
+    distance = distance_to_goal(state, agents)
+    hit, at_goal = hit_others(state, agents), distance < GOAL_RADIUS
+    road_cost = off_road * (state.lane[agents[:, 0], agents[:, 1]] < 0)
     if literal:
-        found: F64 = now - before + 15.0 * hit - 15.0 * there - cost
-        return found
-    gain: F64 = np.clip(before - now, -1.0, 1.0) - 15.0 * hit + 15.0 * there - cost
-    return gain
+        literal_reward: F64 = distance - before + 15.0 * hit - 15.0 * at_goal - road_cost
+        return literal_reward
+    reward: F64 = np.clip(before - distance, -1.0, 1.0) - 15.0 * hit + 15.0 * at_goal - road_cost
+    return reward
 
 
 def collision_cost(
@@ -136,31 +138,39 @@ def collision_cost(
     weight_between: float = 3.0,
     weight_off_road: float = 20.0,
 ) -> F64:
-    """The cost that a set of colliding adversaries makes small, [B], in m.
+    """Return the cost that a set of colliding adversaries minimises, [B], in m.
 
-    The least distance between the ego's body and an adversary's, less `weight_between` times the least distance of two
-    adversaries (at most `safe_distance`), plus `weight_off_road` for each adversary whose centre is off the road.
+    The smallest distance between the bodies of the ego and an adversary, minus `weight_between` times the smallest
+    distance of two adversaries (at most `safe_distance`), plus `weight_off_road` for each adversary whose centre is
+    off the road.
 
     Args:
         state: The state.
-        adversaries: [B, A] who they are. A scene without any costs 0.
+        adversaries: [B, A] mask of the adversaries. A scene without any costs 0.
         safe_distance: m.
         weight_between: The paper's lambda.
         weight_off_road: The paper's gamma.
 
-    Source: the paper's equation 5; KING (Hanselmann et al. 2022). KING blurs the drivable area with a Gaussian so that
-    this term has a gradient; here it is what the Gaussian blurs.
+    Source: the paper's equation 5; KING (Hanselmann et al. 2022). KING blurs the drivable area with a Gaussian so
+    that this term has a gradient; here the unblurred area is used.
     """
-    mine = np.asarray(adversaries, bool) & state.active
+    active_adversaries = np.asarray(adversaries, bool) & state.active
     boxes = np.concatenate([state.pose, state.size], -1)
-    to_ego = np.where(mine, obb_distance(boxes[:, :1], boxes), np.inf).min(1)
-    left, right = np.triu_indices(mine.shape[1], 1)
-    between = np.where(mine[:, left] & mine[:, right], obb_distance(boxes[:, left], boxes[:, right]), np.inf)
-    nearest = np.where(mine.sum(1) > 1, np.minimum(between.min(1, initial=np.inf), safe_distance), 0.0)
-    off = (mine & (state.lane < 0)).sum(1)
-    cost = np.where(mine.any(1), to_ego, 0.0) - weight_between * nearest + weight_off_road * off
-    found: F64 = cost.astype(np.float64)
-    return found
+    to_ego = np.where(active_adversaries, obb_distance(boxes[:, :1], boxes), np.inf).min(1)
+    first_index, second_index = np.triu_indices(active_adversaries.shape[1], 1)
+    between = np.where(
+        active_adversaries[:, first_index] & active_adversaries[:, second_index],
+        obb_distance(boxes[:, first_index], boxes[:, second_index]),
+        np.inf,
+    )
+    # A single adversary has no other to keep away from.
+    nearest = np.where(active_adversaries.sum(1) > 1, np.minimum(between.min(1, initial=np.inf), safe_distance), 0.0)
+    off_road_count = (active_adversaries & (state.lane < 0)).sum(1)
+    cost = (
+        np.where(active_adversaries.any(1), to_ego, 0.0) - weight_between * nearest + weight_off_road * off_road_count
+    )
+    costs: F64 = cost.astype(np.float64)
+    return costs
 
 
 def colliding(state: WorldState, agents: I32, before: F64) -> F64:
@@ -177,10 +187,10 @@ def colliding(state: WorldState, agents: I32, before: F64) -> F64:
 
 
 def cost_of(state: WorldState, agents: I32) -> F64:
-    """[N] `collision_cost` of the scene of each adversary."""
-    mine = np.zeros(state.active.shape, bool)
-    mine[agents[:, 0], agents[:, 1]] = True
-    return np.asarray(collision_cost(state, mine)[agents[:, 0]])
+    """Return `collision_cost` of the scene of each adversary, [N]."""
+    mask = np.zeros(state.active.shape, bool)
+    mask[agents[:, 0], agents[:, 1]] = True
+    return np.asarray(collision_cost(state, mask)[agents[:, 0]])
 
 
 def feasible(state: WorldState, agents: I32, before: F64, avoided: Bool, *, off_road: float = 0.0) -> F64:
@@ -201,7 +211,9 @@ def feasible(state: WorldState, agents: I32, before: F64, avoided: Bool, *, off_
     turns the adversary back where there is none; here the encounter is judged when it is over.
     """
     scene, agent = agents.T
-    nearer = np.clip(before - distance_to_goal(state, agents), -1.0, 1.0)
+    progress = np.clip(before - distance_to_goal(state, agents), -1.0, 1.0)
     contact = np.where(hit_ego(state, agents), np.where(avoided, 30.0, -10.0), 0.0)
-    gain: F64 = 0.3 * nearer - 15.0 * hit_others(state, agents) + contact - off_road * (state.lane[scene, agent] < 0)
-    return gain
+    reward: F64 = (
+        0.3 * progress - 15.0 * hit_others(state, agents) + contact - off_road * (state.lane[scene, agent] < 0)
+    )
+    return reward

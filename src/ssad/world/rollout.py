@@ -1,4 +1,4 @@
-"""The one loop of all that drives: drivers act for agents of a simulator, step by step, and what happens is kept."""
+"""Simulation loop: drivers act for agents of a simulator step by step, and the outcome is recorded."""
 
 from __future__ import annotations
 
@@ -34,14 +34,21 @@ _AGENT = ("x", "y", "yaw", "speed", "active")
 
 
 class Loop:
-    """Drivers at work in a simulator.
+    """Drivers acting in a simulator.
 
-    `drivers` says who acts for whom: an agent's number, or a selector that chooses at every step whom its driver takes
-    over (those it no longer chooses are given back). Agents that nobody is named for are driven by what their episode
-    says. All that changes lies in the simulator, so that a snapshot of it continues to the bit if its drivers do.
-    An episode may also name an agent's driver (`EpisodeAgent.policy`), which `policies` makes; whoever is in `drivers`
-    goes before it. `sensors` adds to those of `ssad.world.sensors`; only what a driver asks for is computed.
-    `perturbation` changes the pictures ([N, C, H, W]) that drivers get; a mapping those of sensors it names.
+    All changing state lies in the simulator, so a restored snapshot continues bit-exactly if the drivers keep none.
+
+    Args:
+        simulator: The simulator.
+        drivers: Driver by agent number, or by a selector that chooses at every step the agents that its driver
+            controls; agents that it no longer chooses are returned. Agents without a driver follow their episode.
+        sensors: Sensors in addition to `ssad.world.sensors`; only requested ones are computed.
+        perturbation: Changes the images ([N, C, H, W]) that drivers receive; a mapping applies to the sensors it
+            names.
+        policies: Makes the drivers that episodes name (`EpisodeAgent.policy`); `drivers` take precedence.
+
+    Raises:
+        ConfigError: A driver does not fit the simulator or requests an unknown sensor, or `policies` is missing.
     """
 
     def __init__(
@@ -64,42 +71,42 @@ class Loop:
         self.sensors = SENSORS | dict(sensors or {})
         self.perturbation = perturbation
         shape = (simulator.batch, simulator.agents)
-        for who, driver in self.drivers:
-            if isinstance(who, int) and not 0 <= who < simulator.agents:
-                raise ConfigError(f"driver {driver.name}: there is no agent {who}; scenes have {simulator.agents}")
+        for target, driver in self.drivers:
+            if isinstance(target, int) and not 0 <= target < simulator.agents:
+                raise ConfigError(f"driver {driver.name}: there is no agent {target}; scenes have {simulator.agents}")
             if isinstance(driver, Believer):
-                _check_believer(simulator, who, driver)
+                _check_believer(simulator, target, driver)
             for name in getattr(driver, "sensors", ()):
                 if name not in self.sensors:
-                    known = ", ".join(self.sensors)
-                    raise ConfigError(f"driver {driver.name} asks for sensor '{name}'; known: {known}")
+                    available = ", ".join(self.sensors)
+                    raise ConfigError(f"driver {driver.name} asks for sensor '{name}'; known: {available}")
         # sensors that remember follow every step, also while nobody looks
-        asked = {name for _, driver in self.drivers for name in getattr(driver, "sensors", ())}
-        following = (getattr(self.sensors[name], "follow", None) for name in sorted(asked))
+        requested = {name for _, driver in self.drivers for name in getattr(driver, "sensors", ())}
+        following = (getattr(self.sensors[name], "follow", None) for name in sorted(requested))
         self._following = [follow for follow in following if follow is not None]
         self._controls = np.zeros((*shape, 4), np.float32)
         self._fixed = [
-            np.stack([np.arange(shape[0]), np.full(shape[0], who)], 1).astype(np.int32)
-            if isinstance(who, int)
+            np.stack([np.arange(shape[0]), np.full(shape[0], target)], 1).astype(np.int32)
+            if isinstance(target, int)
             else None
-            for who, _ in self.drivers
+            for target, _ in self.drivers
         ]
 
     def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
-        """Start scenes again (default: all), as `Simulator.reset`; drivers take their seats there.
+        """Restart scenes (default: all) as `Simulator.reset` does, and assign the drivers there.
 
-        Drivers forget the past only when all scenes start again.
+        Drivers forget the past only when all scenes restart.
         """
         simulator = self.simulator
         simulator.reset(scenes, episodes=episodes)
         started = np.full(simulator.batch, scenes is None)
         if scenes is not None:
             started[np.asarray(scenes)] = True
-        for policy, (who, driver) in enumerate(self.drivers):
-            if isinstance(who, int):
-                self._seat(policy, (np.arange(simulator.agents) == who) & started[:, None])
+        for policy, (target, driver) in enumerate(self.drivers):
+            if isinstance(target, int):
+                self._seat(policy, (np.arange(simulator.agents) == target) & started[:, None])
             if (driver.controller == Controller.EXTERNAL or isinstance(driver, Believer)) and scenes is None:
-                driver.reset([simulator.episodes[k] for k in simulator.assigned])
+                driver.reset([simulator.episodes[episode_index] for episode_index in simulator.assigned])
 
     def _seat(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
         driver = self.drivers[policy][1]
@@ -109,46 +116,51 @@ class Loop:
     def step(self, controls: npt.ArrayLike | None = None) -> None:
         """Advance all scenes by one step.
 
-        `controls` [B, A, 3|4] are for agents that no driver here acts for. Raises ConfigError if a driver returns
-        controls of a wrong shape or not finite; what it raises passes.
+        Args:
+            controls: [B, A, 3|4] for agents that no driver acts for.
+
+        Raises:
+            ConfigError: A driver returned controls of a wrong shape or not finite. Its own exceptions propagate.
         """
         if not self.drivers:
             self.simulator.step(controls)
             return
         self._controls[:] = 0.0
         if controls is not None:
-            given = np.asarray(controls, np.float32)
-            self._controls[..., : given.shape[-1]] = given
-        asked = controls is not None
+            values = np.asarray(controls, np.float32)
+            self._controls[..., : values.shape[-1]] = values
+        has_controls = controls is not None
         for follow in self._following:
             follow(self.simulator)
         state: WorldState | None = None
-        for policy, (who, driver) in enumerate(self.drivers):
+        for policy, (target, driver) in enumerate(self.drivers):
             agents = self._fixed[policy]
             external = driver.controller == Controller.EXTERNAL
             if agents is None or external or isinstance(driver, Believer):
+                # A takeover changes controllers in place, which the next drivers must observe.
                 state = self.simulator.state() if state is None else state
-            if agents is None and not isinstance(who, int):
+            if agents is None and not isinstance(target, int):
                 assert state is not None
-                chosen, state = self._choose(who, state)
-                chosen = chosen & (self.simulator.ended() == End.RUNNING)[:, None]
-                had = state.policy == policy
-                if (chosen != had).any():
-                    if (had & ~chosen).any():
-                        self.simulator.take(had & ~chosen, None)
-                    if (chosen & ~had).any():
-                        self._seat(policy, chosen & ~had)
+                selected, state = self._choose(target, state)
+                # An ended scene keeps its last state, so no agent of it changes hands.
+                selected = selected & (self.simulator.ended() == End.RUNNING)[:, None]
+                current = state.policy == policy
+                if (selected != current).any():
+                    if (current & ~selected).any():
+                        self.simulator.take(current & ~selected, None)
+                    if (selected & ~current).any():
+                        self._seat(policy, selected & ~current)
                     state = self.simulator.state()
-                agents = np.argwhere(chosen).astype(np.int32)
+                agents = np.argwhere(selected).astype(np.int32)
             if external and agents is not None and len(agents):
                 assert state is not None
-                asked = True
-                given = self._act(driver, state, agents)
-                self._controls[agents[:, 0], agents[:, 1], : given.shape[1]] = given
+                has_controls = True
+                values = self._act(driver, state, agents)
+                self._controls[agents[:, 0], agents[:, 1], : values.shape[1]] = values
             if isinstance(driver, Believer) and agents is not None:
                 assert state is not None
                 self._believe(driver, state, agents)
-        self.simulator.step(self._controls if asked else None)
+        self.simulator.step(self._controls if has_controls else None)
 
     def _choose(self, who: Selector, state: WorldState) -> tuple[Bool, WorldState]:
         """Whom a selector chooses [B, A], and the state after it has noted what it remembers and removed whom it does.
@@ -167,7 +179,7 @@ class Loop:
         return np.asarray(choice.agents, bool), state
 
     def _believe(self, driver: Driver, state: WorldState, egos: I32) -> None:
-        """Hand what the driver believes to the planner; scenes that have ended keep what they had."""
+        """Pass the driver's belief to the planner; ended scenes keep their previous one."""
         assert isinstance(driver, Believer)
         assert isinstance(self.simulator, Planner)
         ended = self.simulator.ended() != End.RUNNING
@@ -180,20 +192,20 @@ class Loop:
             raise ConfigError(f"system {driver.name}: {error}") from None
 
     def _act(self, driver: Driver, state: WorldState, agents: I32) -> F32:
-        """Controls [N, 3|4] of the agents; 0 where the episode has ended."""
+        """Return the controls [N, 3|4] of the agents; 0 where the episode has ended."""
         ended = self.simulator.ended() != End.RUNNING
         readings = self._readings(driver, state, agents)
-        given = np.asarray(driver.act(observe(state, agents, ended, readings)), np.float32)
+        controls = np.asarray(driver.act(observe(state, agents, ended, readings)), np.float32)
         readings.close()
-        if given.ndim != 2 or given.shape[0] != len(agents) or given.shape[1] not in (3, 4):
+        if controls.ndim != 2 or controls.shape[0] != len(agents) or controls.shape[1] not in (3, 4):
             raise ConfigError(
-                f"system {driver.name}: act returned shape {given.shape}, expected ({len(agents)}, 3): "
+                f"system {driver.name}: act returned shape {controls.shape}, expected ({len(agents)}, 3): "
                 "throttle, brake, steer"
             )
         running = ~ended[agents[:, 0]]
-        if not np.isfinite(given[running]).all():
+        if not np.isfinite(controls[running]).all():
             raise ConfigError(f"system {driver.name}: act returned a control that is not finite")
-        return np.where(running[:, None], given, np.float32(0.0))
+        return np.where(running[:, None], controls, np.float32(0.0))
 
     def _readings(self, driver: Driver, state: WorldState, agents: I32) -> _Readings:
         names = tuple(getattr(driver, "sensors", ()))
@@ -202,12 +214,14 @@ class Loop:
     def _read(self, name: str, driver: Driver, state: WorldState, agents: I32) -> Any:
         reading = self.sensors[name](self.simulator, agents)
         perturbation = self.perturbation.get(name) if isinstance(self.perturbation, Mapping) else self.perturbation
+        # Only images have four dimensions; other readings pass unchanged.
         if perturbation is None or getattr(reading, "ndim", 0) != 4:
             return reading
         episodes, assigned = self.simulator.episodes, self.simulator.assigned
         generators = []
         for scene, agent in agents.tolist():
             episode, step = episodes[assigned[scene]], round(float(state.time[scene]) / self.simulator.dt)
+            # Seeded by what it applies to, so that the result does not depend on the batch.
             generators.append(generator("perturbation", episode.key, episode.seed, name, agent, step))
         if hasattr(reading, "cpu"):  # pictures that stayed on a device
             reading = reading.cpu().numpy()
@@ -215,7 +229,7 @@ class Loop:
 
 
 class _Readings(Mapping[str, Any]):
-    """What sensors show, each read when it is first asked for: a camera that nobody looks through renders nothing."""
+    """Lazily read sensors: an unused camera renders nothing."""
 
     def __init__(self, names: tuple[str, ...], read: Callable[[str], Any]) -> None:
         self._names, self._read, self._found = names, read, dict[str, Any]()
@@ -237,19 +251,19 @@ class _Readings(Mapping[str, Any]):
         return len(self._names)
 
     def close(self) -> None:
-        """The step is over: what was not read cannot be read any more."""
+        """End the step: sensors that were not read are no longer available."""
         self._open = False
 
 
 def _told_to(simulator: Simulator, policy: str, number: int) -> Selector:
-    """The agents that their episodes give to a policy, driver `number`, and that nobody else has taken over."""
-    told = np.zeros((len(simulator.episodes), simulator.agents), bool)
-    for row, episode in zip(told, simulator.episodes, strict=True):
+    """Return a selector of the agents that follow a policy by their episode and that no other driver controls."""
+    follows_policy = np.zeros((len(simulator.episodes), simulator.agents), bool)
+    for row, episode in zip(follows_policy, simulator.episodes, strict=True):
         row[: len(episode.agents)] = [agent.policy == policy for agent in episode.agents]
 
     def choose(state: WorldState) -> Bool:
         free = (state.policy < 0) | (state.policy == number)
-        return np.asarray(told[simulator.assigned] & free & state.active)
+        return np.asarray(follows_policy[simulator.assigned] & free & state.active)
 
     return choose
 
@@ -266,7 +280,7 @@ def _check_believer(simulator: Simulator, who: int | Selector, driver: Driver) -
 
 
 def run(loop: Loop) -> None:
-    """Start all scenes again and step them to their ends."""
+    """Restart all scenes and step them to their ends."""
     loop.reset()
     for _ in range(step_limit(loop.simulator)):
         loop.step()
@@ -275,10 +289,10 @@ def run(loop: Loop) -> None:
 
 
 def step_limit(simulator: Simulator) -> int:
-    """Steps after which every episode has ended."""
-    limits = [simulator.episodes[k].limits for k in simulator.assigned]
-    most = max(int(limit.max_steps) for limit in limits)
-    return min(most, int(max(limit.max_time for limit in limits) / simulator.dt) + 1)
+    """Return the number of steps after which every episode has ended."""
+    limits = [simulator.episodes[index].limits for index in simulator.assigned]
+    max_steps = max(int(limit.max_steps) for limit in limits)
+    return min(max_steps, int(max(limit.max_time for limit in limits) / simulator.dt) + 1)
 
 
 def rollout(
@@ -292,18 +306,18 @@ def rollout(
     """Drive all scenes of a simulator from their starts to their ends.
 
     Args:
-        simulator: Where: `World(episodes, graphs)`, or another simulator.
-        drivers: Who drives whom, as `Loop` takes it; a driver alone drives the egos.
-        sensors: What drivers may ask for besides `ssad.world.sensors.SENSORS`.
-        perturbation: What changes the pictures that drivers get; a mapping: of each sensor by its name.
+        simulator: `World(episodes, graphs)`, or another simulator.
+        drivers: Drivers as `Loop` takes them; a single driver drives the egos.
+        sensors: Sensors that drivers may request besides `ssad.world.sensors.SENSORS`.
+        perturbation: Changes the images that drivers receive; a mapping applies to the sensors it names.
         policies: Makes the drivers that episodes name, such as `ssad.drivers.make_system`.
 
     Returns:
         A trace of each scene.
 
     Raises:
-        ConfigError: A driver returns controls of a wrong shape or not finite, or asks for what is not there. Episodes
-            name drivers, and there is no `policies`.
+        ConfigError: A driver returns controls of a wrong shape or not finite, or requests an unknown sensor. Episodes
+            name drivers, and `policies` is missing.
     """
     by_agent: Drivers = drivers if isinstance(drivers, Mapping) else {0: drivers}
     loop = Loop(simulator, by_agent, sensors=sensors, perturbation=perturbation, policies=policies)
@@ -314,16 +328,17 @@ def rollout(
         running = simulator.ended() == End.RUNNING
         loop.step()
         rows.append(_row(simulator.state()))
+        # An ended scene keeps standing in the batch; its rows beyond the end are cut below.
         lengths[running] = step
         if (simulator.ended() != End.RUNNING).all():
             break
-    whole = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return [_trace(simulator, whole, b, int(lengths[b]) + 1) for b in range(simulator.batch)]
+    recording = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return [_trace(simulator, recording, scene, int(lengths[scene]) + 1) for scene in range(simulator.batch)]
 
 
 def route_signals(graph: LaneGraph, route: Route) -> I32:
-    """The signals at the junctions that a route passes: those whose states a trace keeps."""
-    junctions = {int(graph.junction[k]) for k in np.unique(route.lane[route.lane >= 0])} - {-1}
+    """Return the signals at the junctions that a route passes; a trace keeps their states."""
+    junctions = {int(graph.junction[lane]) for lane in np.unique(route.lane[route.lane >= 0])} - {-1}
     return np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
 
 
@@ -357,25 +372,25 @@ def _trace(simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: in
     episode = simulator.episodes[simulator.assigned[b]]
     graph = simulator.graphs[episode.town]
     state = simulator.state()
-    n = int((state.kind[b] != AgentKind.NONE).sum())
-    agent: dict[str, Any] = {name: rows[name][:steps, b, :n].copy() for name in _AGENT}
-    ego: dict[str, Any] = {name: rows[name][:steps, b].copy() for name in rows if name not in _AGENT}
+    agent_count = int((state.kind[b] != AgentKind.NONE).sum())
+    agent_fields: dict[str, Any] = {name: rows[name][:steps, b, :agent_count].copy() for name in _AGENT}
+    ego_fields: dict[str, Any] = {name: rows[name][:steps, b].copy() for name in rows if name not in _AGENT}
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built
-    near = route_signals(graph, route)
-    ego["signal"] = ego["signal"][:, near]
+    signal_ids = route_signals(graph, route)
+    ego_fields["signal"] = ego_fields["signal"][:, signal_ids]
     return EpisodeTrace(
         key=episode.key,
         town=episode.town,
         dt=simulator.dt,
-        names=tuple(a.name for a in episode.agents),
-        models=tuple(a.model for a in episode.agents),
-        kind=state.kind[b, :n].astype(np.uint8),
-        length=state.size[b, :n, 0].astype(np.float32),
-        width=state.size[b, :n, 1].astype(np.float32),
-        signal_ids=near,
+        names=tuple(participant.name for participant in episode.agents),
+        models=tuple(participant.model for participant in episode.agents),
+        kind=state.kind[b, :agent_count].astype(np.uint8),
+        length=state.size[b, :agent_count, 0].astype(np.float32),
+        width=state.size[b, :agent_count, 1].astype(np.float32),
+        signal_ids=signal_ids,
         route=route.xy,
         end=ENDS[int(simulator.ended()[b])] or "max_steps",
-        **agent,
-        **ego,
+        **agent_fields,
+        **ego_fields,
     )

@@ -16,19 +16,19 @@ from ssad.world.env import VectorEnv
 
 
 class Alike:
-    """What a vector environment of stable-baselines3 answers of scenes that have nothing of their own."""
+    """Attribute access of a stable-baselines3 vector environment whose scenes have no attributes of their own."""
 
     num_envs: int
 
     def close(self) -> None:
-        """Nothing to close: no process, no window."""
+        """Do nothing: there is no process or window to close."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of this environment, once for each scene."""
+        """Return an attribute of this environment, once for each scene."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of this environment: the scenes have none of their own."""
+        """Set an attribute of this environment, shared by all scenes."""
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
@@ -36,19 +36,19 @@ class Alike:
         return [getattr(self, method_name)(*args, **options) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Scenes are never wrapped."""
+        """Return False for each scene: scenes are never wrapped."""
         return [False for _ in self._get_indices(indices)]
 
     def _get_indices(self, indices: Any) -> Sequence[int]:
-        found: Sequence[int] = range(self.num_envs) if indices is None else np.atleast_1d(indices).tolist()
-        return found
+        scene_indices: Sequence[int] = range(self.num_envs) if indices is None else np.atleast_1d(indices).tolist()
+        return scene_indices
 
 
 class SB3VecEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
-    """All scenes of a `VectorEnv` as stable-baselines3 wants them, without a process or a wrapper a scene.
+    """All scenes of a `VectorEnv` in stable-baselines3's interface, without a process or a wrapper per scene.
 
     An ended scene starts another episode in the same step. `infos` of its row then hold `terminal_observation`,
-    `TimeLimit.truncated`, `episode` (return `r`, length `l`, seconds `t`) and `end`, why it ended; other rows are
+    `TimeLimit.truncated`, `episode` (return `r`, length `l`, seconds `t`) and `end`, the reason; other rows are
     empty.
     """
 
@@ -62,7 +62,7 @@ class SB3VecEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may n
         super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
 
     def reset(self) -> npt.NDArray[np.float32]:
-        """Start all scenes; draws their episodes by the seed given to `seed`, if any."""
+        """Start all scenes, sampling their episodes with the seed given to `seed`, if any."""
         observation, _ = self.environment.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
@@ -71,37 +71,37 @@ class SB3VecEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may n
         return observation
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Keep the actions of the next step."""
+        """Store the actions of the next step."""
         self._actions = actions
 
     def step_wait(
         self,
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.bool_], list[dict[str, Any]]]:
-        """One step of 0.1 s in every scene."""
+        """Advance every scene by one step of 0.1 s."""
         observation, reward, terminated, truncated, info = self.environment.step(self._actions)
-        done = terminated | truncated
+        ended = terminated | truncated
         self._returns += reward
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for b in np.flatnonzero(done).tolist():
+        for scene in np.flatnonzero(ended).tolist():
             episode = {
-                "r": float(self._returns[b]),
-                "l": int(self._lengths[b]),
+                "r": float(self._returns[scene]),
+                "l": int(self._lengths[scene]),
                 "t": round(time.time() - self._began, 6),
             }
-            infos[b] = {
-                "terminal_observation": info["final_obs"][b],
-                "TimeLimit.truncated": bool(truncated[b]),
+            infos[scene] = {
+                "terminal_observation": info["final_obs"][scene],
+                "TimeLimit.truncated": bool(truncated[scene]),
                 "episode": episode,
-                "end": info["end"][b],
+                "end": info["end"][scene],
             }
-        self._returns[done] = 0.0
-        self._lengths[done] = 0
-        return observation, reward.astype(np.float32), done, infos
+        self._returns[ended] = 0.0
+        self._lengths[ended] = 0
+        return observation, reward.astype(np.float32), ended, infos
 
 
 class Choosing(VecEnvWrapper):  # type: ignore[misc]  # stable-baselines3 may not be installed
-    """The same scenes for an algorithm that chooses: actions are numbers of rows of `ssad.world.actions.CHOICES`."""
+    """Wrapper for algorithms with discrete actions: actions are row numbers of `ssad.world.actions.CHOICES`."""
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv, action_space=Discrete(len(CHOICES)))
@@ -111,9 +111,9 @@ class Choosing(VecEnvWrapper):  # type: ignore[misc]  # stable-baselines3 may no
         return self.venv.reset()
 
     def step_async(self, actions: npt.NDArray[np.integer[Any]]) -> None:
-        """Keep the actions of the next step [num_envs]."""
+        """Store the actions of the next step [num_envs]."""
         self.venv.step_async(CHOICES[actions])
 
     def step_wait(self) -> Any:
-        """One step in every scene."""
+        """Advance every scene by one step."""
         return self.venv.step_wait()

@@ -1,4 +1,4 @@
-"""Scenes of a world as pictures from above, and a window that shows them."""
+"""Top views of a world's scenes, and a window that shows them."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ NEAR = 80.0  # m around the ego in which traffic lights are drawn
 
 
 class SceneViews:
-    """Draws scenes of a world as they are now; a town's roads are prepared when it is first drawn."""
+    """Renderer of a world's current scenes; a town's roads are prepared when it is first drawn."""
 
     def __init__(self, world: World) -> None:
         self.world = world
         self._towns: dict[str, TopView] = {}
 
     def draw(self, scene: int) -> U8:
-        """A scene from above, RGB [540, 960, 3]."""
+        """Render a scene from above, RGB [540, 960, 3]."""
         state = self.world.state()
         episode = self.world.episodes[int(self.world.assigned[scene])]
         graph = self.world.graphs[episode.town]
         if episode.town not in self._towns:
             self._towns[episode.town] = TopView(graph)
         pose = np.asarray(state.pose[scene], np.float64)
-        first, count = (int(v) for v in state.route[scene, 0])
-        states = state.signal[scene]
-        close = np.flatnonzero(np.linalg.norm(graph.signal_xy.reshape(-1, 2) - pose[0, :2], axis=1) < NEAR)
-        lamps = [(*map(float, graph.signal_xy[s]), int(states[s])) for s in close]
-        time, share = float(state.time[scene]), float(state.route_complete[scene])
+        first, count = (int(value) for value in state.route[scene, 0])
+        signal_states = state.signal[scene]
+        near_signals = np.flatnonzero(np.linalg.norm(graph.signal_xy.reshape(-1, 2) - pose[0, :2], axis=1) < NEAR)
+        signals = [(*map(float, graph.signal_xy[signal]), int(signal_states[signal])) for signal in near_signals]
+        time, completion = float(state.time[scene]), float(state.route_complete[scene])
         return self._towns[episode.town].draw(
             Moment(
                 pose,
@@ -42,15 +42,15 @@ class SceneViews:
                 state.active[scene],
                 state.roads.path[first : first + count, :2],
                 np.zeros((0, 2)),
-                lamps,  # type: ignore[arg-type]
+                signals,  # type: ignore[arg-type]
                 hit=6 if state.contact[scene] else None,
-                words=[f"{time:5.1f} s   {float(state.speed[scene, 0]):5.1f} m/s   route {share:3.0f} %"],
+                words=[f"{time:5.1f} s   {float(state.speed[scene, 0]):5.1f} m/s   route {completion:3.0f} %"],
             )
         )
 
 
 class Window:
-    """A window of pygame (the extra `window`), opened with the first picture."""
+    """A pygame window (the extra `window`), opened with the first image."""
 
     def __init__(self, rate: float) -> None:
         try:
@@ -74,7 +74,7 @@ class Window:
         self._clock.tick(self._rate)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the window."""
         if self._surface is not None:
             self._pygame.display.quit()
             self._surface = None

@@ -1,4 +1,4 @@
-"""What a driver may ask for besides the list of objects, by name; computed on the device for all rows at once."""
+"""Sensors that drivers can request by name besides the object list, computed on the device for all rows at once."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ BEHIND = 8.0  # m
 
 
 def launcher(world: World, kernel: Any, agents: I32, shape: tuple[int, ...], dim: Any, *more: Any) -> tuple[Any, Any]:
-    """A recorded launch of an observation kernel for `agents` [N, 2], and the array that it fills."""
-    who = wp.array(np.ascontiguousarray(agents, np.int32), dtype=wp.vec2i, device=world.device)
-    out = wp.zeros(shape, dtype=wp.float32, device=world.device)
+    """Record a launch of an observation kernel for `agents` [N, 2]; return it and the array that it fills."""
+    agent_array = wp.array(np.ascontiguousarray(agents, np.int32), dtype=wp.vec2i, device=world.device)
+    output = wp.zeros(shape, dtype=wp.float32, device=world.device)
     bank = world.bank
-    return world.launch(kernel, dim, [bank.episodes, bank.roads, world.arrays, bank.agents, who, *more, out]), out
+    return world.launch(
+        kernel, dim, [bank.episodes, bank.roads, world.arrays, bank.agents, agent_array, *more, output]
+    ), output
 
 
 def _rows(kernel: Any, width: int, part: slice) -> Sensor:
     def read(simulator: Any, agents: I32) -> F32:
-        found = _read(simulator, kernel, agents, (len(agents), width), len(agents))
-        return found[:, part].copy()
+        table = _read(simulator, kernel, agents, (len(agents), width), len(agents))
+        return table[:, part].copy()
 
     return read
 
@@ -40,17 +42,17 @@ def _read(simulator: Any, kernel: Any, agents: I32, shape: tuple[int, ...], dim:
         simulator = getattr(simulator, "mirror", None)
     if not isinstance(simulator, World):
         raise ConfigError("this simulator mirrors nothing in a World: give your own sensors to rollout(sensors=...)")
-    # drivers look through the same eyes at every step: keep the last launch
-    key = (kernel, shape, more)
-    kept: dict[Any, Any] = simulator.__dict__.setdefault("_looks", {})
-    if key not in kept or not np.array_equal(kept[key][0], agents):
-        command, out = launcher(simulator, kernel, agents, shape, dim, *more)
-        kept[key] = (np.array(agents), command, out, out.numpy())
-    _, command, out, found = kept[key]
+    # Drivers observe the same agents at every step, so the last launch is kept.
+    cache_key = (kernel, shape, more)
+    cache: dict[Any, Any] = simulator.__dict__.setdefault("_looks", {})
+    if cache_key not in cache or not np.array_equal(cache[cache_key][0], agents):
+        command, output = launcher(simulator, kernel, agents, shape, dim, *more)
+        cache[cache_key] = (np.array(agents), command, output, output.numpy())
+    _, command, output, values = cache[cache_key]
     command.launch()
     if simulator.device != "cpu":
-        found = out.numpy()
-    return np.asarray(found)
+        values = output.numpy()
+    return np.asarray(values)
 
 
 def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND) -> Sensor:
@@ -65,15 +67,15 @@ def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND
     """
 
     def read(simulator: Any, agents: I32) -> F32:
-        n = len(agents)
-        shape = (n, CHANNELS, side, side)
-        return _read(simulator, look_from_above, agents, shape, (n, side, side), side, pixels, behind).copy()
+        count = len(agents)
+        shape = (count, CHANNELS, side, side)
+        return _read(simulator, look_from_above, agents, shape, (count, side, side), side, pixels, behind).copy()
 
     return read
 
 
 def truth(simulator: Any, agents: I32) -> Belief:
-    """What the Autopilot of the background traffic knows of everybody, for egos [N, 2]; see `Planner.truth`."""
+    """Return the truth as a belief, as background traffic perceives it, for egos [N, 2]; see `Planner.truth`."""
     if not isinstance(simulator, Planner):
         raise ConfigError("this simulator's Autopilot plans over no belief: it cannot tell the truth as one")
     if agents[:, 1].any():
@@ -82,7 +84,7 @@ def truth(simulator: Any, agents: I32) -> Belief:
 
 
 def traffic(simulator: Any, agents: I32) -> F32:
-    """What the shipped learned drivers see, [N, 69], all numbers around 1; see `SENSORS`."""
+    """Return the observation of the shipped learned drivers, [N, 69], all numbers around 1; see `SENSORS`."""
     return _read(simulator, look_at_traffic, agents, (len(agents), TRAFFIC), len(agents), float(simulator.dt)).copy()
 
 

@@ -1,1 +1,1 @@
-"""Recorded drives in the nuScenes schema."""
+"""Recorded drives in the nuScenes schema: reader, writer and index."""

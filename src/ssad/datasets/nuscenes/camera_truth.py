@@ -1,4 +1,4 @@
-"""What a camera of a data set should find: the true boxes of a picture."""
+"""Ground truth of a camera of a data set: the true boxes of an image."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
     Raises:
         ConfigError: There is none, or no such split.
     """
-    there = {scene.name for scene in data.scenes()}
-    found = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in there)
-    if not found:
-        raise ConfigError(f"{data.root / data.version}: none of its {len(there)} scenes is in the split '{split}'")
-    return found
+    available = {scene.name for scene in data.scenes()}
+    scenes = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in available)
+    if not scenes:
+        raise ConfigError(f"{data.root / data.version}: none of its {len(available)} scenes is in the split '{split}'")
+    return scenes
 
 
 def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) -> Truth:
@@ -47,25 +47,25 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
     """
     import torch
 
-    rows, box, turn = boxes_in_picture(frame, found, hit=hit)
+    rows, box, world_to_camera = boxes_in_picture(frame, found, hit=hit)
     assert frame.intrinsic is not None
-    own, centre = found.take(rows), found.centre @ turn[:3, :3].T + turn[:3, 3]
-    ahead = own.axes()[:, :, 0] @ turn[:3, :3].T
-    speed = own.velocity @ turn[:3, :3].T
-    label = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[name])) for name in own.category]
-    attribute = [_attribute(names) for names in own.attributes]
+    visible, camera_centres = found.take(rows), found.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    axes = visible.axes()[:, :, 0] @ world_to_camera[:3, :3].T
+    velocities = visible.velocity @ world_to_camera[:3, :3].T
+    labels = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[name])) for name in visible.category]
+    attributes = [_attribute(names) for names in visible.attributes]
 
     def floats(values: F64) -> torch.Tensor:
         return torch.from_numpy(np.array(values, np.float32))
 
-    solid = Solids(
-        floats(centre[rows]),
-        floats(own.size_lwh[:, size_columns("lwh", "lhw")]),
-        floats(camera_yaw(ahead)),
-        floats(speed[:, [0, 2]]),
-        torch.tensor(attribute, dtype=torch.int64),
+    solids = Solids(
+        floats(camera_centres[rows]),
+        floats(visible.size_lwh[:, size_columns("lwh", "lhw")]),
+        floats(camera_yaw(axes)),
+        floats(velocities[:, [0, 2]]),
+        torch.tensor(attributes, dtype=torch.int64),
     )
-    return Truth(torch.tensor(label, dtype=torch.int64), floats(box), solid, floats(frame.intrinsic))
+    return Truth(torch.tensor(labels, dtype=torch.int64), floats(box), solids, floats(frame.intrinsic))
 
 
 def boxes_in_picture(
@@ -86,19 +86,20 @@ def boxes_in_picture(
     """
     if frame.intrinsic is None:
         raise ConfigError(f"{frame.channel} is no camera")
-    wanted = np.array([CATEGORY_TO_CLASS.get(c) in MMDET3D_CLASSES for c in found.category], bool)
+    is_visible = np.array([CATEGORY_TO_CLASS.get(category) in MMDET3D_CLASSES for category in found.category], bool)
     if hit and len(found):
-        wanted &= found.lidar_points > 0
-    turn: F64 = np.asarray(np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego), np.float64)
-    centre = found.centre @ turn[:3, :3].T + turn[:3, 3]
-    flat = centre @ frame.intrinsic.T
+        is_visible &= found.lidar_points > 0
+    world_to_camera: F64 = np.asarray(np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego), np.float64)
+    camera_centres = found.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    projected = camera_centres @ frame.intrinsic.T
+    # Points in the camera's plane divide by zero; the depth test below drops them.
     with np.errstate(all="ignore"):
-        middle = flat[:, :2] / flat[:, 2:]
-    wanted &= (flat[:, 2] > NEAR) & (middle >= 0).all(1)
-    wanted &= (middle[:, 0] < frame.width) & (middle[:, 1] < frame.height)
-    box, seen = _hulls(frame, found, turn)
-    rows = np.flatnonzero(wanted & seen)
-    return rows, box[rows], turn
+        middle = projected[:, :2] / projected[:, 2:]
+    is_visible &= (projected[:, 2] > NEAR) & (middle >= 0).all(1)
+    is_visible &= (middle[:, 0] < frame.width) & (middle[:, 1] < frame.height)
+    box, has_area = _hulls(frame, found, world_to_camera)
+    rows = np.flatnonzero(is_visible & has_area)
+    return rows, box[rows], world_to_camera
 
 
 def _attribute(names: Sequence[str]) -> int:
@@ -108,6 +109,6 @@ def _attribute(names: Sequence[str]) -> int:
 def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool]:
     """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
     assert frame.intrinsic is not None
-    local = found.corners() @ turn[:3, :3].T + turn[:3, 3]
-    box = hulls(local, frame.intrinsic, (frame.width, frame.height))
+    camera_corners = found.corners() @ turn[:3, :3].T + turn[:3, 3]
+    box = hulls(camera_corners, frame.intrinsic, (frame.width, frame.height))
     return box, np.asarray(((box[:, 2:] - box[:, :2]) > 1.0).all(1))

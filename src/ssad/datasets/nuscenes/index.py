@@ -24,7 +24,7 @@ from ssad.core.seeding import digest
 from ssad.datasets.nuscenes.schema import TABLES, TableRecord
 from ssad.datasets.nuscenes.tables import stream, table_path
 
-SMALL = 32 << 20  # bytes of all tables; below it an index in memory is quicker than a file
+SMALL = 32 << 20  # size of all tables, bytes; below it an index in memory is faster than a file
 LAYOUT = 1
 PARENT: Final = {"sample": "scene_token", "sample_data": "sample_token", "sample_annotation": "sample_token"}
 _NAME: Final = {kind: name for name, kind in TABLES.items()}
@@ -34,24 +34,24 @@ R = TypeVar("R", bound=TableRecord)
 
 
 class Index(Protocol):
-    """What the reader asks of an index; the rows of a table, or of one parent, come in table order."""
+    """Index of a version; the rows of a table, or of one parent, come in table order."""
 
     def rows(self, kind: type[R]) -> list[R]:
-        """A whole table."""
+        """Return all rows of a table."""
 
     def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
-        """Rows by token; absent tokens are left out."""
+        """Return rows by token; absent tokens are left out."""
 
     def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
         """Rows whose parent (`PARENT`) is one of the given tokens."""
 
     def close(self) -> None:
-        """Give back what is open; a later call opens it again."""
+        """Release open resources; a later call opens them again."""
 
 
 def fingerprint(root: Path, version: str) -> tuple[tuple[str, int, int], ...]:
-    """Name, size and modification time (ns) of every table. FormatError when one is missing."""
-    found = []
+    """Return name, size and modification time (ns) of every table. FormatError if one is missing."""
+    states = []
     for name in TABLES:
         path = table_path(root, version, name)
         try:
@@ -60,8 +60,8 @@ def fingerprint(root: Path, version: str) -> tuple[tuple[str, int, int], ...]:
             raise FormatError(f"{path}: no such file; a nuScenes version has {len(TABLES)} tables") from None
         except OSError as error:
             raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
-        found.append((name, stat.st_size, stat.st_mtime_ns))
-    return tuple(found)
+        states.append((name, stat.st_size, stat.st_mtime_ns))
+    return tuple(states)
 
 
 def open_index(root: Path, version: str, *, small: int | None = None) -> Index:
@@ -76,21 +76,21 @@ def open_index(root: Path, version: str, *, small: int | None = None) -> Index:
         FormatError: The tables are broken, or changed while they were indexed.
         StoreError: The index cannot be written.
     """
-    state = fingerprint(root, version)
-    if sum(size for _, size, _ in state) < (SMALL if small is None else small):
+    table_state = fingerprint(root, version)
+    if sum(size for _, size, _ in table_state) < (SMALL if small is None else small):
         return MemoryIndex(root, version)
-    place = digest(str((root / version).resolve()))[:16]
+    folder_digest = digest(str((root / version).resolve()))[:16]
     folder = home() / "cache" / "nuscenes"
-    path = folder / f"{place}{digest(LAYOUT, state)[:16]}.sqlite"
+    path = folder / f"{folder_digest}{digest(LAYOUT, table_state)[:16]}.sqlite"
     if not path.exists():
         build(path, root, version)
-        if fingerprint(root, version) != state:
+        if fingerprint(root, version) != table_state:
             path.unlink(missing_ok=True)
             raise FormatError(f"{root / version}: a table changed while it was indexed; try again")
-        for old in folder.glob(f"{place}*.sqlite"):  # of the same folder, before its tables changed
-            if old != path:
+        for outdated in folder.glob(f"{folder_digest}*.sqlite"):  # indexes of the same folder before its tables changed
+            if outdated != path:
                 with contextlib.suppress(OSError):
-                    old.unlink()
+                    outdated.unlink()
     return FileIndex(path)
 
 
@@ -121,6 +121,7 @@ def build(path: Path, root: Path, version: str) -> None:
 
 
 def _fill(connection: sqlite3.Connection, root: Path, version: str) -> None:
+    # No journal: the file is temporary until complete, so an interrupted one is simply discarded.
     for setting in ("journal_mode=OFF", "synchronous=OFF", "locking_mode=EXCLUSIVE", "page_size=8192"):
         connection.execute(f"PRAGMA {setting}")
     connection.execute("BEGIN")
@@ -141,15 +142,15 @@ def _fill(connection: sqlite3.Connection, root: Path, version: str) -> None:
 
 def _packed(root: Path, version: str, name: str) -> Iterator[tuple[bytes | str, bytes | str | None, bytes]]:
     encode = msgspec.msgpack.Encoder().encode
-    parent = PARENT.get(name)
+    parent_field = PARENT.get(name)
     for block in stream(table_path(root, version, name), TABLES[name]):
         for record in block:
-            above = None if parent is None else _key(getattr(record, parent))
-            yield _key(record.token), above, encode(msgspec.structs.astuple(record))
+            parent_key = None if parent_field is None else _key(getattr(record, parent_field))
+            yield _key(record.token), parent_key, encode(msgspec.structs.astuple(record))
 
 
 def _key(token: str) -> bytes | str:
-    """A token as it is stored: 32 hexadecimal digits in 16 bytes, other text as it is."""
+    """Return a token as it is stored: 32 hexadecimal digits as 16 bytes, other text unchanged."""
     if len(token) == 32 and token.isascii() and token.isalnum() and token == token.lower():
         with contextlib.suppress(ValueError):
             return bytes.fromhex(token)
@@ -166,8 +167,9 @@ def _twice(path: Path, token: str) -> FormatError:
 
 @cache
 def _decoder(kind: type[TableRecord]) -> Any:
-    """A typed decoder of the row as a list of its fields."""
+    """Return a typed decoder of a row as a list of its fields."""
     fields = tuple(field.type for field in msgspec.structs.fields(kind))
+    # A row is stored as a tuple, which saves the names of its fields; the types restore it exactly.
     return msgspec.msgpack.Decoder(tuple.__class_getitem__(fields))
 
 
@@ -180,31 +182,31 @@ class MemoryIndex:
         for name, kind in TABLES.items():
             path = table_path(root, version, name)
             table: dict[str, TableRecord] = {}
-            parent, below = PARENT.get(name), self._children.get(name, {})
+            parent_field, rows_by_parent = PARENT.get(name), self._children.get(name, {})
             for block in stream(path, kind):
                 for record in block:
                     if table.setdefault(record.token, record) is not record:
                         raise _twice(path, record.token)
-                    if parent is not None:
-                        below.setdefault(getattr(record, parent), []).append(record)
+                    if parent_field is not None:
+                        rows_by_parent.setdefault(getattr(record, parent_field), []).append(record)
             self._rows[name] = table
 
     def rows(self, kind: type[R]) -> list[R]:
-        """A whole table."""
+        """Return all rows of a table."""
         return list(self._table(kind).values())
 
     def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
-        """Rows by token; absent tokens are left out."""
+        """Return rows by token; absent tokens are left out."""
         table = self._table(kind)
         return {token: table[token] for token in tokens if token in table}
 
     def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
         """Rows whose parent (`PARENT`) is one of the given tokens, parent by parent."""
-        below: Any = self._children[_NAME[kind]]
-        return [row for parent in dict.fromkeys(parents) for row in below.get(parent, ())]
+        rows_by_parent: Any = self._children[_NAME[kind]]
+        return [row for parent in dict.fromkeys(parents) for row in rows_by_parent.get(parent, ())]
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no resources are open."""
 
     def _table(self, kind: type[R]) -> dict[str, R]:
         table: Any = self._rows[_NAME[kind]]
@@ -212,20 +214,20 @@ class MemoryIndex:
 
 
 class FileIndex:
-    """An index in an SQLite file; each process and thread opens it for itself, so that it may pass through a fork."""
+    """An index in an SQLite file; each process and thread opens it for itself, so that it survives a fork."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._local = threading.local()
 
     def rows(self, kind: type[R]) -> list[R]:
-        """A whole table. Raises StoreError when the file cannot be read."""
+        """Return all rows of a table. StoreError if the file cannot be read."""
         return [self._row(kind, body) for (body,) in self._ask(f"SELECT body FROM {_NAME[kind]} ORDER BY rowid", ())]
 
     def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
-        """Rows by token; absent tokens are left out. Raises StoreError when the file cannot be read."""
-        found = self._in(kind, "token", list(dict.fromkeys(tokens)))
-        return {row.token: row for row in found}
+        """Return rows by token; absent tokens are left out. StoreError if the file cannot be read."""
+        rows = self._in(kind, "token", list(dict.fromkeys(tokens)))
+        return {row.token: row for row in rows}
 
     def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
         """Rows whose parent (`PARENT`) is one of the given tokens. Raises StoreError when the file cannot be read."""
@@ -245,8 +247,9 @@ class FileIndex:
         rows: list[tuple[int, bytes]] = []
         for start in range(0, len(tokens), _BATCH):
             keys = [_key(token) for token in tokens[start : start + _BATCH]]
-            marks = ",".join("?" * len(keys))
-            rows += self._ask(f"SELECT rowid, body FROM {_NAME[kind]} WHERE {column} IN ({marks})", keys)
+            placeholders = ",".join("?" * len(keys))
+            rows += self._ask(f"SELECT rowid, body FROM {_NAME[kind]} WHERE {column} IN ({placeholders})", keys)
+        # By row id, which is the table order.
         rows.sort()
         return [self._row(kind, body) for _, body in rows]
 
@@ -260,6 +263,7 @@ class FileIndex:
             raise StoreError(f"{self.path}: the index cannot be read: {error}; delete the file and try again") from None
 
     def _connection(self) -> sqlite3.Connection:
+        # SQLite connections must not be carried across a fork.
         if getattr(self._local, "pid", None) != os.getpid():
             self.close()
             uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"

@@ -1,7 +1,7 @@
 """nuScenes scene by scene: frames of all sensors joined with calibration and pose, and boxes at any time.
 
-Any version (v1.0-mini to v1.0-trainval) is opened through `ssad.datasets.nuscenes.index`; memory is that of one scene.
-What is found is in `ssad.datasets.nuscenes.scene`, the files are read by `ssad.datasets.nuscenes.files`.
+Any version (v1.0-mini to v1.0-trainval) is opened through `ssad.datasets.nuscenes.index`; memory is that of one
+scene. Scenes are objects of `ssad.datasets.nuscenes.scene`; `ssad.datasets.nuscenes.files` reads the files.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class NuScenes:
         version: Such as v1.0-mini; None for the only one.
 
     Raises:
-        ConfigError: The version is not there, or there are several and none is named.
+        ConfigError: The version does not exist, or several exist and none is named.
         FormatError: The tables are broken.
         StoreError: The index of a large version cannot be written.
     """
@@ -78,21 +78,21 @@ class NuScenes:
         self._index.close()
 
     def scenes(self) -> list[Scene]:
-        """All scenes, in table order."""
+        """Return all scenes, in table order."""
         return list(self._scenes)
 
     def scene(self, name_or_token: str) -> SceneData:
-        """A scene by name or token, with everything in it.
+        """Load a scene by name or token, with its frames and boxes.
 
         Raises:
-            ConfigError: There is no such scene.
+            ConfigError: The scene does not exist.
             FormatError: The tables are broken.
         """
         for record in self._scenes:
             if name_or_token in (record.name, record.token):
                 return self._load(record)
-        close = difflib.get_close_matches(name_or_token, [scene.name for scene in self._scenes], n=3, cutoff=0.0)
-        hint = f"; closest: {', '.join(close)}" if close else "; it has no scene"
+        suggestions = difflib.get_close_matches(name_or_token, [scene.name for scene in self._scenes], n=3, cutoff=0.0)
+        hint = f"; closest: {', '.join(suggestions)}" if suggestions else "; it has no scene"
         raise ConfigError(f"{self.root / self.version}: no scene '{name_or_token}'{hint}")
 
     @cached_property
@@ -118,16 +118,18 @@ class NuScenes:
         return SceneData(record, log, samples, self._frames(record, tokens), self._boxes(samples))
 
     def _path(self, kind: type[TableRecord]) -> Path:
-        return table_path(self.root, self.version, next(name for name, known in TABLES.items() if known is kind))
+        return table_path(
+            self.root, self.version, next(name for name, record_type in TABLES.items() if record_type is kind)
+        )
 
     def _need(self, kind: type[R], tokens: Iterable[str], source: type[TableRecord]) -> dict[str, R]:
-        """Rows by token, all of them. FormatError naming the table that names an absent one."""
-        wanted = list(dict.fromkeys(tokens))
-        found = self._index.get(kind, wanted)
-        for token in wanted:
-            if token not in found:
+        """Return rows by token, all of them. FormatError names the table that refers to a missing row."""
+        unique_tokens = list(dict.fromkeys(tokens))
+        rows = self._index.get(kind, unique_tokens)
+        for token in unique_tokens:
+            if token not in rows:
                 raise self._dangling(source, kind, token)
-        return found
+        return rows
 
     def _dangling(self, source: type[TableRecord], kind: type[TableRecord], token: str) -> FormatError:
         table = self._path(kind).name
@@ -135,26 +137,26 @@ class NuScenes:
 
     def _samples(self, scene: Scene) -> tuple[Sample, ...]:
         """Samples along the chain from the scene's first. FormatError: it dangles, loops or leaves some out."""
-        found = {sample.token: sample for sample in self._index.children(Sample, [scene.token])}
-        chain: list[Sample] = []
+        remaining = {sample.token: sample for sample in self._index.children(Sample, [scene.token])}
+        ordered: list[Sample] = []
         token, source = scene.first_sample_token, "scene"
         while token:
-            sample = found.pop(token, None)
-            where = f"{self._path(Scene if source == 'scene' else Sample)}: scene '{scene.name}'"
-            if sample is None and any(token == other.token for other in chain):
-                raise FormatError(f"{where}: the chain of samples comes back to '{token}'")
+            sample = remaining.pop(token, None)
+            location = f"{self._path(Scene if source == 'scene' else Sample)}: scene '{scene.name}'"
+            if sample is None and any(token == earlier.token for earlier in ordered):
+                raise FormatError(f"{location}: the chain of samples comes back to '{token}'")
             if sample is None:
-                raise FormatError(f"{where}: sample '{token}' is not among its samples in sample.json")
-            if chain and sample.timestamp <= chain[-1].timestamp:
-                raise FormatError(f"{where}: sample '{token}' is not later than the one before it in the chain")
-            chain.append(sample)
+                raise FormatError(f"{location}: sample '{token}' is not among its samples in sample.json")
+            if ordered and sample.timestamp <= ordered[-1].timestamp:
+                raise FormatError(f"{location}: sample '{token}' is not later than the one before it in the chain")
+            ordered.append(sample)
             token, source = sample.next, "sample"
-        if found:
-            where = f"{self._path(Sample)}: scene '{scene.name}'"
-            raise FormatError(f"{where}: sample '{next(iter(found))}' is not in the chain of its samples")
-        if not chain:
+        if remaining:
+            location = f"{self._path(Sample)}: scene '{scene.name}'"
+            raise FormatError(f"{location}: sample '{next(iter(remaining))}' is not in the chain of its samples")
+        if not ordered:
             raise FormatError(f"{self._path(Scene)}: scene '{scene.name}' has no sample")
-        return tuple(chain)
+        return tuple(ordered)
 
     def _frames(self, scene: Scene, samples: Sequence[str]) -> tuple[SensorFrame, ...]:
         rows = self._index.children(SampleData, samples)
@@ -162,16 +164,21 @@ class NuScenes:
             return ()
         calibrations = self._need(CalibratedSensor, (row.calibrated_sensor_token for row in rows), SampleData)
         poses = self._need(EgoPose, (row.ego_pose_token for row in rows), SampleData)
-        mounted = self._matrices(list(calibrations.values()))
-        placed = self._matrices(list(poses.values()))
+        sensor_poses = self._matrices(list(calibrations.values()))
+        ego_poses = self._matrices(list(poses.values()))
         intrinsics = {token: self._intrinsic(record) for token, record in calibrations.items()}
         frames = []
         for row in rows:
             calibration = row.calibrated_sensor_token
             sensor = self._sensor(calibrations[calibration])
-            if (relative := PurePosixPath(row.filename)).is_absolute() or ".." in relative.parts or not row.filename:
-                where = f"{self._path(SampleData)}: '{row.token}'"
-                raise FormatError(f"{where}: '{row.filename}' is no path below the root")
+            # A table may come from anywhere: a path must not lead out of the root.
+            if (
+                (relative_path := PurePosixPath(row.filename)).is_absolute()
+                or ".." in relative_path.parts
+                or not row.filename
+            ):
+                location = f"{self._path(SampleData)}: '{row.token}'"
+                raise FormatError(f"{location}: '{row.filename}' is no path below the root")
             frames.append(
                 SensorFrame(
                     token=row.token,
@@ -185,8 +192,8 @@ class NuScenes:
                     width=row.width or 0,
                     height=row.height or 0,
                     intrinsic=intrinsics[calibration],
-                    sensor_to_ego=mounted[calibration],
-                    ego_to_world=placed[row.ego_pose_token],
+                    sensor_to_ego=sensor_poses[calibration],
+                    ego_to_world=ego_poses[row.ego_pose_token],
                 )
             )
         frames.sort(key=lambda frame: (frame.timestamp_us, frame.channel, frame.token))
@@ -207,62 +214,69 @@ class NuScenes:
         return frozen(np.array(rows, np.float64))
 
     def _matrices(self, records: Sequence[CalibratedSensor] | Sequence[EgoPose]) -> dict[str, F64]:
-        """Poses [4, 4] by token."""
+        """Return poses [4, 4] by token."""
         quaternions = np.array([record.rotation for record in records], np.float64)
-        empty = np.flatnonzero(~(np.abs(quaternions).max(axis=1) > 0.0))
-        if len(empty):
-            record = records[int(empty[0])]
+        zero_rows = np.flatnonzero(~(np.abs(quaternions).max(axis=1) > 0.0))
+        if len(zero_rows):
+            record = records[int(zero_rows[0])]
             raise FormatError(f"{self._path(type(record))}: '{record.token}': the rotation has length zero")
         matrices = frozen(pose_matrix([record.translation for record in records], quaternions))
         return {record.token: matrix for record, matrix in zip(records, matrices, strict=True)}
 
     def _boxes(self, samples: Sequence[Sample]) -> dict[str, Annotations]:
-        """Boxes of each sample of a scene."""
+        """Return the boxes of each sample of a scene."""
         rows = self._index.children(SampleAnnotation, [sample.token for sample in samples])
         instances = self._need(Instance, (row.instance_token for row in rows), SampleAnnotation)
-        place = {row.token: i for i, row in enumerate(rows)}
-        times = {sample.token: sample.timestamp for sample in samples}
-        time = np.array([times[row.sample_token] for row in rows], np.int64)
+        row_by_token = {row.token: row_index for row_index, row in enumerate(rows)}
+        sample_times = {sample.token: sample.timestamp for sample in samples}
+        timestamps = np.array([sample_times[row.sample_token] for row in rows], np.int64)
+        # Velocities need the neighbours in other samples, so they are computed for the whole scene at once.
         centre = _columns([row.translation for row in rows], 3)
-        velocity = velocities(centre, time, *self._neighbours(rows, place, time))
-        members: dict[str, list[int]] = {sample.token: [] for sample in samples}
-        for i, row in enumerate(rows):
-            members[row.sample_token].append(i)
-        result = {}
-        for token, chosen in members.items():
-            own = [rows[i] for i in chosen]
-            result[token] = Annotations(
-                token=tuple(row.token for row in own),
-                instance=tuple(row.instance_token for row in own),
-                category=tuple(self._category(instances[row.instance_token]) for row in own),
-                attributes=tuple(tuple(self._attribute(name) for name in row.attribute_tokens) for row in own),
-                visibility=tuple(row.visibility_token for row in own),
-                centre=frozen(centre[chosen]),
-                size_lwh=frozen(_columns([row.size for row in own], 3)[:, size_columns("wlh", "lwh")]),
-                rotation=self._rotations(own),
-                velocity=frozen(velocity[chosen]),
-                lidar_points=_counts([row.num_lidar_pts for row in own]),
-                radar_points=_counts([row.num_radar_pts for row in own]),
+        velocity = velocities(centre, timestamps, *self._neighbours(rows, row_by_token, timestamps))
+        rows_by_sample: dict[str, list[int]] = {sample.token: [] for sample in samples}
+        for row_index, row in enumerate(rows):
+            rows_by_sample[row.sample_token].append(row_index)
+        boxes = {}
+        for token, sample_rows in rows_by_sample.items():
+            annotations_of_sample = [rows[row_index] for row_index in sample_rows]
+            boxes[token] = Annotations(
+                token=tuple(row.token for row in annotations_of_sample),
+                instance=tuple(row.instance_token for row in annotations_of_sample),
+                category=tuple(self._category(instances[row.instance_token]) for row in annotations_of_sample),
+                attributes=tuple(
+                    tuple(self._attribute(name) for name in row.attribute_tokens) for row in annotations_of_sample
+                ),
+                visibility=tuple(row.visibility_token for row in annotations_of_sample),
+                centre=frozen(centre[sample_rows]),
+                size_lwh=frozen(
+                    _columns([row.size for row in annotations_of_sample], 3)[:, size_columns("wlh", "lwh")]
+                ),
+                rotation=self._rotations(annotations_of_sample),
+                velocity=frozen(velocity[sample_rows]),
+                lidar_points=_counts([row.num_lidar_pts for row in annotations_of_sample]),
+                radar_points=_counts([row.num_radar_pts for row in annotations_of_sample]),
             )
-        return result
+        return boxes
 
     def _neighbours(self, rows: Sequence[SampleAnnotation], place: dict[str, int], time: Any) -> tuple[I32, I32]:
         """Rows [N] of the boxes before and after each box of the same instance, -1 where there is none."""
-        found = np.full((2, len(rows)), -1, np.int32)
-        for i, row in enumerate(rows):
+        neighbours = np.full((2, len(rows)), -1, np.int32)
+        for row_index, row in enumerate(rows):
             for side, token in enumerate((row.prev, row.next)):
                 if not token:
                     continue
-                other = place.get(token)
-                if other is None:
+                neighbour = place.get(token)
+                if neighbour is None:
                     raise self._dangling(SampleAnnotation, SampleAnnotation, token)
-                if (time[other] >= time[i]) if side == 0 else (time[other] <= time[i]):
-                    which = "prev" if side == 0 else "next"
-                    order = "earlier" if side == 0 else "later"
-                    where = f"{self._path(SampleAnnotation)}: '{row.token}'"
-                    raise FormatError(f"{where}: its {which} '{token}' is not {order} (the chain loops)")
-                found[side, i] = other
-        return found[0], found[1]
+                if (time[neighbour] >= time[row_index]) if side == 0 else (time[neighbour] <= time[row_index]):
+                    field_name = "prev" if side == 0 else "next"
+                    expected_order = "earlier" if side == 0 else "later"
+                    location = f"{self._path(SampleAnnotation)}: '{row.token}'"
+                    raise FormatError(
+                        f"{location}: its {field_name} '{token}' is not {expected_order} (the chain loops)"
+                    )
+                neighbours[side, row_index] = neighbour
+        return neighbours[0], neighbours[1]
 
     def _category(self, instance: Instance) -> str:
         name = self._categories.get(instance.category_token)
@@ -278,26 +292,26 @@ class NuScenes:
 
     def _rotations(self, rows: Sequence[SampleAnnotation]) -> F64:
         rotation = _columns([row.rotation for row in rows], 4)
-        empty = np.flatnonzero(~(np.abs(rotation).max(axis=1, initial=0.0) > 0.0))
-        if len(empty):
-            token = rows[int(empty[0])].token
+        zero_rows = np.flatnonzero(~(np.abs(rotation).max(axis=1, initial=0.0) > 0.0))
+        if len(zero_rows):
+            token = rows[int(zero_rows[0])].token
             raise FormatError(f"{self._path(SampleAnnotation)}: '{token}': the rotation has length zero")
         return rotation
 
 
 def _choose(root: Path, version: str | None) -> str:
-    """The version to open: the one asked for, else the only one there is. ConfigError."""
+    """Return the version to open: the requested one, else the only one. ConfigError if there is none."""
     if not root.is_dir():
         raise ConfigError(f"{root}: no such folder; give the nuScenes folder that holds v1.0-*, samples and sweeps")
-    known = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
-    listed = ", ".join(known) or "none"
+    available = sorted(path.name for path in root.glob("v1.0-*") if path.is_dir())
+    listing = ", ".join(available) or "none"
     if version is None:
-        if len(known) != 1:
-            what = "several versions" if known else "no folder v1.0-*"
-            raise ConfigError(f"{root}: {what} (found: {listed}); name the version to read")
-        return known[0]
+        if len(available) != 1:
+            problem = "several versions" if available else "no folder v1.0-*"
+            raise ConfigError(f"{root}: {problem} (found: {listing}); name the version to read")
+        return available[0]
     if not (root / version).is_dir():
-        raise ConfigError(f"{root}: no version '{version}' (found: {listed})")
+        raise ConfigError(f"{root}: no version '{version}' (found: {listing})")
     return version
 
 

@@ -1,9 +1,9 @@
-"""The official results file of the nuScenes detection task, into columns.
+"""The official results file of the nuScenes detection task, as columns.
 
     {"meta": {...}, "results": {SAMPLE_TOKEN: [{"sample_token", "translation", "size", "rotation", "velocity",
      "detection_name", "detection_score", "attribute_name"}, ...]}}
 
-What the devkit's assertions refuse ends in a FormatError that names file, sample and box. Source: nuscenes.org,
+Whatever the devkit's assertions refuse raises a FormatError that names file, sample and box. Source: nuscenes.org,
 detection task; nuscenes-devkit 1.2.0, eval/common/loaders.py, eval/detection/data_classes.py (`DetectionBox`).
 """
 
@@ -35,11 +35,11 @@ _ATTRIBUTE: Final = {"": -1} | {name: i for i, name in enumerate(ATTRIBUTES)}
 _TRANSLATION, _SIZE, _ROTATION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 12)
 _SCORE, _POINTS, _WIDTH = 12, 13, 14
 
-Number = float | None  # null stands for NaN, which JSON does not have
+Number = float | None  # null stands for NaN, which JSON lacks
 
 
 class _Box(msgspec.Struct, gc=False):
-    """A box of the file."""
+    """A box of the results file."""
 
     sample_token: str
     translation: tuple[Number, Number, Number]
@@ -58,7 +58,7 @@ _ENCODER: Final = msgspec.msgpack.Encoder()
 
 
 class _File(msgspec.Struct):
-    """The file: each sample's list is decoded on its own."""
+    """The results file: the list of each sample is decoded separately."""
 
     meta: dict[str, Any]
     results: dict[str, msgspec.Raw]
@@ -71,8 +71,8 @@ class Results:
     Attributes:
         samples: Tokens [S].
         boxes: Rows in the order of the file; ego_distance is NaN.
-        points: LiDAR and radar points in each box [N], -1 where the file does not say; boxes with 0 do not count in the
-            devkit.
+        points: LiDAR and radar points in each box [N], -1 where the file does not say; boxes with 0 do not
+            count in the devkit.
         meta: The meta of the file.
     """
 
@@ -89,41 +89,42 @@ def read_results(
 
     Args:
         path: The file.
-        samples: Tokens that it must have, no more and no less; `BoxTable.sample` indexes them. None: as the file has
-            them.
-        subset: The file may have more samples, which are ignored, and the rows follow the order of `samples` (as in the
-            devkit for a custom split).
+        samples: Tokens that the file must have, no more and no less; `BoxTable.sample` indexes them. None: as
+            in the file.
+        subset: The file may have more samples, which are ignored, and the rows follow the order of `samples`
+            (as in the devkit for a custom split).
         max_boxes: Maximum number of boxes in a sample.
 
     Raises:
         FormatError: The file is broken, or has other samples.
     """
-    file = _decode(path)
-    found, meta = file.results, file.meta
-    names = tuple(found) if samples is None else tuple(samples)
-    index = {token: i for i, token in enumerate(names)}
-    missing = next((token for token in names if token not in found), None)
+    content = _decode(path)
+    sample_boxes, meta = content.results, content.meta
+    sample_tokens = tuple(sample_boxes) if samples is None else tuple(samples)
+    sample_index = {token: position for position, token in enumerate(sample_tokens)}
+    missing = next((token for token in sample_tokens if token not in sample_boxes), None)
     if missing is not None:
         raise FormatError(
             f"{path}: sample {missing} is missing; every sample of the split needs a list, even an empty one"
         )
     if subset:
-        file.results = found = {token: found[token] for token in names}
-    foreign = next((token for token in found if token not in index), None)
-    if foreign is not None:
-        raise FormatError(f"{path}: sample {foreign} is not in the split; leave it out or choose its split")
+        content.results = sample_boxes = {token: sample_boxes[token] for token in sample_tokens}
+    unexpected = next((token for token in sample_boxes if token not in sample_index), None)
+    if unexpected is not None:
+        raise FormatError(f"{path}: sample {unexpected} is not in the split; leave it out or choose its split")
     with uncollected():
-        boxes, points = _columns(path, found, index, max_boxes=max_boxes)
-    return Results(names, boxes, points, meta)
+        boxes, points = _columns(path, sample_boxes, sample_index, max_boxes=max_boxes)
+    return Results(sample_tokens, boxes, points, meta)
 
 
 def with_ego(boxes: BoxTable, ego: F64) -> BoxTable:
-    """The boxes with their distance from the ego in the plane.
+    """Return the boxes with their distance from the ego in the plane.
 
     Args:
         boxes: The boxes.
         ego: Global position of the ego at each sample [S, 3], m.
     """
+    # A results file may hold huge finite coordinates, whose distance overflows to infinity.
     with np.errstate(over="ignore"):
         dx, dy = (boxes.centre[:, :2] - ego[boxes.sample, :2]).T
         return replace(boxes, ego_distance=np.sqrt(dx * dx + dy * dy))
@@ -134,39 +135,41 @@ def _columns(
 ) -> tuple[BoxTable, I32]:
     """Boxes and their points; `index` gives the number of each sample; `found` is emptied to free the text."""
     decoder = msgspec.json.Decoder(list[_Box])
-    numbers: list[F64] = []
+    value_blocks: list[F64] = []
     labels: list[npt.NDArray[np.int8]] = []
     attributes: list[npt.NDArray[np.int8]] = []
     counts = np.zeros(len(found), np.int64)
-    for i, (token, raw) in enumerate(found.items()):
+    for sample_number, (token, encoded) in enumerate(found.items()):
         try:
-            boxes = decoder.decode(raw)
+            boxes = decoder.decode(encoded)
         except msgspec.MsgspecError as error:
             raise FormatError(f"{path}: sample {token}: {_place(error)}") from None
-        counts[i] = len(boxes)
+        counts[sample_number] = len(boxes)
         if len(boxes) > max_boxes:
             raise FormatError(f"{path}: sample {token}: {len(boxes)} boxes, but at most {max_boxes} are allowed")
         if not boxes:
             continue
-        numbers.append(_numbers(boxes))
+        value_blocks.append(_numbers(boxes))
         try:
-            labels.append(np.array([_LABEL[b.detection_name] for b in boxes], np.int8))
-            attributes.append(np.array([_ATTRIBUTE[b.attribute_name] for b in boxes], np.int8))
+            labels.append(np.array([_LABEL[box.detection_name] for box in boxes], np.int8))
+            attributes.append(np.array([_ATTRIBUTE[box.attribute_name] for box in boxes], np.int8))
         except KeyError:
             raise _unknown(path, token, boxes) from None
-        if any(b.sample_token != token for b in boxes):
-            wrong = next(i for i, b in enumerate(boxes) if b.sample_token != token)
-            raise FormatError(f"{path}: sample {token}: box {wrong}: its sample_token is '{boxes[wrong].sample_token}'")
+        if any(box.sample_token != token for box in boxes):
+            box_number = next(sample_number for sample_number, box in enumerate(boxes) if box.sample_token != token)
+            raise FormatError(
+                f"{path}: sample {token}: box {box_number}: its sample_token is '{boxes[box_number].sample_token}'"
+            )
     sample = np.repeat(np.array([index[token] for token in found], np.int32), counts)
     found.clear()
-    table = np.concatenate(numbers) if numbers else np.zeros((0, _WIDTH))
-    numbers.clear()
+    table = np.concatenate(value_blocks) if value_blocks else np.zeros((0, _WIDTH))
+    value_blocks.clear()
     for name, columns in (("translation", _TRANSLATION), ("size", _SIZE), ("rotation", _ROTATION), ("score", [_SCORE])):
-        bad = np.isnan(table[:, columns]).any(axis=1)
-        if bad.any():
-            row = int(bad.argmax())
-            place = row - int((sample == sample[row]).argmax())
-            raise FormatError(f"{path}: sample {list(index)[sample[row]]}: box {place}: its {name} is NaN")
+        is_nan = np.isnan(table[:, columns]).any(axis=1)
+        if is_nan.any():
+            table_row = int(is_nan.argmax())
+            box_index = table_row - int((sample == sample[table_row]).argmax())
+            raise FormatError(f"{path}: sample {list(index)[sample[table_row]]}: box {box_index}: its {name} is NaN")
     result = BoxTable(
         sample=sample,
         label=np.concatenate(labels) if labels else np.zeros(0, np.int8),
@@ -182,18 +185,20 @@ def _columns(
 
 
 def _numbers(boxes: Sequence[_Box]) -> F64:
-    """The numbers [n, _WIDTH] of boxes; null becomes NaN."""
-    rows = [(*b.translation, *b.size, *b.rotation, *b.velocity, b.detection_score, b.num_pts) for b in boxes]
+    """Return the numbers [n, _WIDTH] of boxes; null becomes NaN."""
+    rows = [
+        (*box.translation, *box.size, *box.rotation, *box.velocity, box.detection_score, box.num_pts) for box in boxes
+    ]
     packed = _ENCODER.encode(rows)  # three times as fast as np.array(rows)
     offset = len(packed) - len(rows) * _PACKED.itemsize
-    if offset < 0:  # there are nulls, which take one byte
+    if offset < 0:  # a null takes one byte, not nine
         return np.array(rows, np.float64)
     return np.frombuffer(packed, _PACKED, len(rows), offset)["values"]["value"].astype(np.float64)
 
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """No cycle collection meanwhile: many small objects without cycles would set it off again and again."""
+    """Pause garbage collection: many small objects without cycles would trigger it again and again."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -204,26 +209,26 @@ def uncollected() -> Iterator[None]:
 
 
 def _decode(path: str | Path) -> _File:
-    data = _read(path)
+    text = _read(path)
     try:
-        return msgspec.json.decode(data, type=_File)
+        return msgspec.json.decode(text, type=_File)
     except msgspec.ValidationError as error:
         raise FormatError(f"{path}: not a results file: {error}") from None
     except msgspec.MsgspecError as error:
-        hint = " (Infinity is not a number that JSON has)" if b"Infinity" in data else ""
+        hint = " (Infinity is not a number that JSON has)" if b"Infinity" in text else ""
         raise FormatError(f"{path}: not valid JSON: {error}{hint}") from None
 
 
 def _read(path: str | Path) -> bytes | bytearray:
-    """The file's text with NaN outside of strings replaced by null."""
+    """Return the text of the file with NaN outside of strings replaced by null."""
     try:
-        with open(path, "rb") as file:
-            data = file.read()
-            if b"NaN" not in data:
-                return data
-            del data  # the text is held only once
-            file.seek(0)
-            return _without_nan(file)
+        with open(path, "rb") as stream:
+            text = stream.read()
+            if b"NaN" not in text:
+                return text
+            del text  # a file can be large: hold its text only once
+            stream.seek(0)
+            return _without_nan(stream)
     except FileNotFoundError:
         raise FormatError(f"{path}: no such file") from None
     except OSError as error:
@@ -232,45 +237,45 @@ def _read(path: str | Path) -> bytes | bytearray:
 
 def _without_nan(file: BinaryIO) -> bytearray:
     """The text block by block; a NaN is inside of a string where an odd number of quotation marks goes before."""
-    out = bytearray()
+    output = bytearray()
     counted, quotes = 0, 0  # quotation marks among the first `counted` bytes of out
-    rest = b""
+    remainder = b""
     while True:
-        data = file.read(BLOCK)
-        block = rest + data
-        cut = block.rfind(b",") + 1 if data else len(block)  # no comma is inside NaN
-        block, rest = block[:cut], block[cut:]
-        first, *pieces = block.split(b"NaN")
-        out += first
-        for piece in pieces:
-            quotes += _quotes(out[counted:])
-            counted = len(out)
-            out += (b"null" if quotes % 2 == 0 else b"NaN") + piece
-        if not data:
-            return out
+        chunk = file.read(BLOCK)
+        block = remainder + chunk
+        block_end = block.rfind(b",") + 1 if chunk else len(block)  # no comma is inside NaN
+        block, remainder = block[:block_end], block[block_end:]
+        head, *tails = block.split(b"NaN")
+        output += head
+        for tail in tails:
+            quotes += _quotes(output[counted:])
+            counted = len(output)
+            output += (b"null" if quotes % 2 == 0 else b"NaN") + tail
+        if not chunk:
+            return output
 
 
 def _quotes(text: bytearray) -> int:
-    """Number of quotation marks that begin or end a string."""
+    """Return the number of quotation marks that begin or end a string."""
     return (re.sub(rb"\\.", b"", text, flags=re.DOTALL) if b"\\" in text else text).count(b'"')
 
 
 def _place(error: msgspec.MsgspecError) -> str:
-    """The message of a msgspec error, with its path `$[3].size` in words."""
-    text = str(error)
-    found = re.search(r" - at `\$(?:\[(\d+|\.\.\.)\])?\.?(.*?)`$", text)
-    if found is None:
-        return text
-    where = "".join(f"{part}: " for part in (f"box {found[1]}" if found[1] else "", found[2]) if part)
-    return where + text[: found.start()]
+    """Return the message of a msgspec error with its path `$[3].size` in words."""
+    message = str(error)
+    location = re.search(r" - at `\$(?:\[(\d+|\.\.\.)\])?\.?(.*?)`$", message)
+    if location is None:
+        return message
+    prefix = "".join(f"{step}: " for step in (f"box {location[1]}" if location[1] else "", location[2]) if step)
+    return prefix + message[: location.start()]
 
 
 def _unknown(path: str | Path, token: str, boxes: Sequence[_Box]) -> FormatError:
-    for i, box in enumerate(boxes):
+    for number, box in enumerate(boxes):
         if box.detection_name not in _LABEL:
-            what = f"unknown detection_name '{box.detection_name}'; known: {', '.join(CLASSES)}"
-            return FormatError(f"{path}: sample {token}: box {i}: {what}")
+            problem = f"unknown detection_name '{box.detection_name}'; known: {', '.join(CLASSES)}"
+            return FormatError(f"{path}: sample {token}: box {number}: {problem}")
         if box.attribute_name not in _ATTRIBUTE:
-            what = f"unknown attribute_name '{box.attribute_name}'; known: {', '.join(ATTRIBUTES)} or empty"
-            return FormatError(f"{path}: sample {token}: box {i}: {what}")
+            problem = f"unknown attribute_name '{box.attribute_name}'; known: {', '.join(ATTRIBUTES)} or empty"
+            return FormatError(f"{path}: sample {token}: box {number}: {problem}")
     raise AssertionError

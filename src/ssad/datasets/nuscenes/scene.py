@@ -1,4 +1,4 @@
-"""What the reader gives: the frames and boxes of a scene, and the boxes at any time between key frames.
+"""Frames and boxes of a scene, and its boxes at any time between key frames.
 
 Frames of reference as in `ssad.datasets.nuscenes.schema`. Boxes and velocities are those of the official toolkit
 (nuscenes-devkit 1.2.0: get_boxes, box_velocity).
@@ -18,15 +18,25 @@ from ssad.core.rotations import slerp
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.schema import Log, Sample, Scene
 
-MAX_TIME_DIFF = 1.5  # s between key frames, beyond it no velocity is given
+MAX_TIME_DIFF = 1.5  # s between key frames beyond which the velocity is NaN
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
     """One file of one sensor, joined with its calibration and pose.
 
-    filename is relative to the root; timestamp in us; width, height in pixels (0 for other sensors than cameras);
-    intrinsic [3, 3] (None for other sensors); sensor_to_ego, ego_to_world [4, 4], metres.
+    Attributes:
+        token: Token of the file.
+        sample_token: Token of its sample.
+        scene_token: Token of its scene.
+        channel: Name of the sensor.
+        modality: camera, lidar or radar.
+        filename: Path relative to the root.
+        timestamp_us: Time, us.
+        key_frame: Whether the file belongs to a key frame; else it is a sweep.
+        width, height: Size in pixels; 0 for sensors other than cameras.
+        intrinsic: Camera matrix [3, 3]; None for other sensors.
+        sensor_to_ego, ego_to_world: Poses [4, 4], m.
     """
 
     token: str
@@ -46,10 +56,15 @@ class SensorFrame:
 
 @dataclass(frozen=True, slots=True)
 class Annotations(WorldBoxes):
-    """Boxes at one time in table order.
+    """Boxes at one time, in table order.
 
-    token of the annotation, instance token, category and attribute names, visibility token; velocity [N, 3];
-    lidar_points, radar_points [N] in the box.
+    Attributes:
+        token: Tokens of the annotations.
+        instance: Tokens of the instances.
+        category: Names of the categories.
+        attributes: Names of the attributes of each box.
+        visibility: Tokens of the visibility levels.
+        lidar_points, radar_points: Points in each box [N].
     """
 
     token: tuple[str, ...]
@@ -63,7 +78,7 @@ class Annotations(WorldBoxes):
 
 @dataclass(frozen=True, slots=True)
 class SceneData:
-    """A scene: its samples in time order, and the frames of all sensors (key frames and sweeps) by time and channel."""
+    """A scene: its samples in time order, and the frames of all sensors (with sweeps) by time and channel."""
 
     record: Scene
     log: Log | None
@@ -72,11 +87,11 @@ class SceneData:
     boxes: dict[str, Annotations] = field(repr=False)
 
     def annotations(self, sample_token: str) -> Annotations:
-        """Boxes of a key frame. ConfigError for a sample of another scene."""
-        found = self.boxes.get(sample_token)
-        if found is None:
+        """Return the boxes of a key frame. ConfigError for a sample of another scene."""
+        boxes = self.boxes.get(sample_token)
+        if boxes is None:
             raise ConfigError(f"scene '{self.record.name}' has no sample '{sample_token}'")
-        return found
+        return boxes
 
     def annotations_at(self, timestamp_us: int) -> Annotations:
         """Boxes at a time: those of the following key frame, moved to where they were between it and the one before.
@@ -85,52 +100,71 @@ class SceneData:
         frame, and at a key frame's own time, the boxes are that key frame's.
         """
         times = [sample.timestamp for sample in self.samples]
-        number = bisect_left(times, timestamp_us)
-        if number == len(times) or timestamp_us == times[number]:
-            return self.boxes[self.samples[min(number, len(times) - 1)].token]
-        return self._between(number, timestamp_us)
+        following = bisect_left(times, timestamp_us)
+        if following == len(times) or timestamp_us == times[following]:
+            return self.boxes[self.samples[min(following, len(times) - 1)].token]
+        return self._between(following, timestamp_us)
 
     def annotations_of(self, frame: SensorFrame) -> Annotations:
-        """Boxes that belong to a frame as the official get_boxes gives them: those of its sample, moved for sweeps."""
+        """Return the boxes of a frame as the official get_boxes does: those of its sample, moved for sweeps."""
         if frame.key_frame:
             return self.annotations(frame.sample_token)
-        for number, sample in enumerate(self.samples):
+        for sample_index, sample in enumerate(self.samples):
             if sample.token == frame.sample_token:
-                return self._between(number, frame.timestamp_us)
+                return self._between(sample_index, frame.timestamp_us)
         return self.annotations(frame.sample_token)
 
     def _between(self, number: int, timestamp_us: int) -> Annotations:
         """Boxes of sample `number`, moved towards the sample before it; times beyond the two are clipped."""
         sample = self.samples[number]
-        now = self.boxes[sample.token]
+        current = self.boxes[sample.token]
         if number == 0:
-            return now
-        past = self.samples[number - 1]
-        then = self.boxes[past.token]
-        share = min(max((timestamp_us - past.timestamp) / (sample.timestamp - past.timestamp), 0.0), 1.0)
-        row = {instance: i for i, instance in enumerate(then.instance)}
-        pairs = [(i, row[instance]) for i, instance in enumerate(now.instance) if instance in row]
+            return current
+        previous_sample = self.samples[number - 1]
+        previous = self.boxes[previous_sample.token]
+        share = min(
+            max((timestamp_us - previous_sample.timestamp) / (sample.timestamp - previous_sample.timestamp), 0.0), 1.0
+        )
+        previous_rows = {instance: position for position, instance in enumerate(previous.instance)}
+        pairs = [
+            (position, previous_rows[instance])
+            for position, instance in enumerate(current.instance)
+            if instance in previous_rows
+        ]
         if not pairs:
-            return now
-        new, old = np.array(pairs).T
-        centre, rotation = now.centre.copy(), now.rotation.copy()
-        centre[new] = then.centre[old] + share * (now.centre[new] - then.centre[old])
-        rotation[new] = slerp(then.rotation[old], now.rotation[new], share)
-        return replace(now, centre=frozen(centre), rotation=frozen(rotation))
+            return current
+        current_index, previous_index = np.array(pairs).T
+        centre, rotation = current.centre.copy(), current.rotation.copy()
+        centre[current_index] = previous.centre[previous_index] + share * (
+            current.centre[current_index] - previous.centre[previous_index]
+        )
+        rotation[current_index] = slerp(previous.rotation[previous_index], current.rotation[current_index], share)
+        return replace(current, centre=frozen(centre), rotation=frozen(rotation))
 
 
 def velocities(centre: F64, time: npt.NDArray[np.int64], before: I32, after: I32) -> F64:
-    """Velocity [N, 3] m/s by differences over the neighbours; NaN without one or when they are too far in time."""
-    own = np.arange(len(centre))
-    first, last = np.where(before >= 0, before, own), np.where(after >= 0, after, own)
-    seconds = 1e-6 * time[last] - 1e-6 * time[first]
-    limit = np.where((before >= 0) & (after >= 0), 2.0 * MAX_TIME_DIFF, MAX_TIME_DIFF)
-    known = (first != last) & (seconds <= limit)
+    """Return the velocities of boxes by differences over their neighbours.
+
+    Args:
+        centre: Centres [N, 3], m.
+        time: Times [N], us.
+        before: Row of the previous box of the same instance [N]; -1: none.
+        after: Row of the next box of the same instance [N]; -1: none.
+
+    Returns:
+        Velocities [N, 3], m/s; NaN without a neighbour, or if the neighbours are too far apart in time.
+    """
+    rows = np.arange(len(centre))
+    start, end = np.where(before >= 0, before, rows), np.where(after >= 0, after, rows)
+    # Converted before subtracting, as in the devkit.
+    seconds = 1e-6 * time[end] - 1e-6 * time[start]
+    time_limit = np.where((before >= 0) & (after >= 0), 2.0 * MAX_TIME_DIFF, MAX_TIME_DIFF)
+    is_valid = (start != end) & (seconds <= time_limit)
     with np.errstate(divide="ignore", invalid="ignore"):  # broken tables may have two boxes at one time
-        return np.where(known[:, None], (centre[last] - centre[first]) / seconds[:, None], np.nan)
+        return np.where(is_valid[:, None], (centre[end] - centre[start]) / seconds[:, None], np.nan)
 
 
 def frozen(array: F64) -> F64:
-    """The array, which can no longer be written."""
+    """Make an array read-only and return it."""
     array.setflags(write=False)
     return array

@@ -62,7 +62,7 @@ class Instance(TableRecord, frozen=True, gc=False):
 
 
 class Log(TableRecord, frozen=True, gc=False):
-    """A drive that scenes were cut from."""
+    """A drive from which scenes were cut."""
 
     logfile: str = ""
     vehicle: str = ""
@@ -79,7 +79,7 @@ class Map(TableRecord, frozen=True, gc=False):
 
 
 class Sample(TableRecord, frozen=True, gc=False):
-    """A key frame: annotated, twice a second."""
+    """A key frame, annotated twice a second."""
 
     timestamp: int
     scene_token: str
@@ -120,7 +120,7 @@ class SampleData(TableRecord, frozen=True, gc=False):
 
 
 class Scene(TableRecord, frozen=True, gc=False):
-    """A stretch of about 20 s."""
+    """A part of a log of about 20 s."""
 
     name: str
     log_token: str = ""
@@ -144,6 +144,7 @@ class Visibility(TableRecord, frozen=True, gc=False):
     description: str = ""
 
 
+# File name of each table, without .json -> its record.
 TABLES: Final[dict[str, type[TableRecord]]] = {
     "attribute": Attribute,
     "calibrated_sensor": CalibratedSensor,

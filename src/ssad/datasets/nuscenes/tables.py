@@ -1,4 +1,4 @@
-"""A JSON table as a stream of typed records: memory is that of a block, whatever the size of the file."""
+"""A JSON table as a stream of typed records: memory is that of one block, whatever the size of the file."""
 
 from __future__ import annotations
 
@@ -11,101 +11,106 @@ import msgspec
 from ssad.core.errors import FormatError
 
 BLOCK = 4 << 20
-LIMIT = 16 * BLOCK  # no record is longer
+LIMIT = 16 * BLOCK  # largest undecoded text, bytes: no record is longer
 _SPACE = b" \t\r\n"
 
 T = TypeVar("T")
 
 
 def stream(path: Path, kind: type[T], *, block: int = BLOCK) -> Iterator[list[T]]:
-    """The elements of a JSON array of objects, some at a time, in order.
+    """Yield the elements of a JSON array of objects, in order, a list of them per block.
 
-    A block is cut after its last complete element. A cut inside a string would leave it open, which does not decode,
-    so that a wrong cut cannot pass. FormatError names file and line.
+    A block is cut after its last complete element. A cut inside a string would leave it open, which does not
+    decode, so that a wrong cut cannot pass. FormatError names file and line.
     """
     decoder = msgspec.json.Decoder(list[kind])  # type: ignore[valid-type]
-    line, opened = 1, False
-    rest = b""
+    line_number, opened = 1, False
+    remainder = b""
     try:
-        file = path.open("rb")
+        source = path.open("rb")
     except FileNotFoundError:
         raise FormatError(f"{path}: no such file") from None
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
-    with file:
+    with source:
         while True:
-            data = file.read(block)
-            text = rest + data
+            chunk = source.read(block)
+            text = remainder + chunk
             if not opened:
-                if not text.lstrip(_SPACE) and data:
-                    rest = text
+                if not text.lstrip(_SPACE) and chunk:
+                    remainder = text
                     continue
                 if text.lstrip(_SPACE)[:1] != b"[":
                     raise FormatError(f"{path}:1: expected a JSON list of records")
-                start = text.index(b"[") + 1
-                line += text.count(b"\n", 0, start)
-                text, opened = text[start:], True
-            if not data:
-                yield _last(path, decoder, text, line)
+                list_start = text.index(b"[") + 1
+                line_number += text.count(b"\n", 0, list_start)
+                text, opened = text[list_start:], True
+            if not chunk:
+                yield _last(path, decoder, text, line_number)
                 return
-            cut = text.rfind(b"}") + 1
-            if cut == 0:
-                rest = text
+            # A closing brace may end a record: decoding decides.
+            block_end = text.rfind(b"}") + 1
+            if block_end == 0:
+                remainder = text
                 continue
-            body = text[:cut].lstrip(_SPACE + b",") if text.lstrip(_SPACE)[:1] == b"," else text[:cut]
+            elements = text[:block_end].lstrip(_SPACE + b",") if text.lstrip(_SPACE)[:1] == b"," else text[:block_end]
             try:
-                found = decoder.decode(b"[" + body + b"]")
+                records = decoder.decode(b"[" + elements + b"]")
             except msgspec.MsgspecError:
                 # cut inside a string or an inner object, or broken: more text decides, the end at the latest
                 if len(text) > LIMIT:
-                    raise _error(path, decoder, text, line) from None
-                rest = text
+                    raise _error(path, decoder, text, line_number) from None
+                remainder = text
                 continue
-            line += text.count(b"\n", 0, cut)
-            rest = text[cut:]
-            yield found
+            line_number += text.count(b"\n", 0, block_end)
+            remainder = text[block_end:]
+            yield records
 
 
 def _last(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line: int) -> list[T]:
     """What stands between the last cut and the end of the list."""
-    body = text.lstrip(_SPACE)
-    if body[:1] == b",":
-        body = body[1:]
-        if not body.lstrip(_SPACE).startswith(b"{"):
+    elements = text.lstrip(_SPACE)
+    if elements[:1] == b",":
+        elements = elements[1:]
+        if not elements.lstrip(_SPACE).startswith(b"{"):
             raise FormatError(f"{path}:{line}: not valid JSON: a record is missing after the comma")
     try:
-        return decoder.decode(b"[" + body)
+        return decoder.decode(b"[" + elements)
     except msgspec.MsgspecError:
         raise _error(path, decoder, text, line) from None
 
 
 def _error(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line: int) -> FormatError:
     """Which record is wrong, and how: the elements are decoded one by one."""
-    raws: list[msgspec.Raw]
-    body = text.lstrip(_SPACE).removeprefix(b",")
+    elements: list[msgspec.Raw]
+    list_text = text.lstrip(_SPACE).removeprefix(b",")
     try:
-        raws = msgspec.json.decode(b"[" + body, type=list[msgspec.Raw])
+        elements = msgspec.json.decode(b"[" + list_text, type=list[msgspec.Raw])
     except msgspec.MsgspecError as error:
-        why = str(error)
-        where = line
-        if "byte " in why:
-            position = int("".join(c for c in why.rsplit("byte ", 1)[1] if c.isdigit()) or 0)
-            where += (text[: len(text) - len(body)] + body[:position]).count(b"\n")
-        truncated = "truncated" in why
-        return FormatError(f"{path}:{where}: not valid JSON: {'the file ends too early' if truncated else why}")
-    place = 0
-    for raw in raws:
-        piece = bytes(raw)
-        place = text.find(piece, place)
+        message = str(error)
+        error_line = line
+        if "byte " in message:
+            byte_offset = int(
+                "".join(character for character in message.rsplit("byte ", 1)[1] if character.isdigit()) or 0
+            )
+            error_line += (text[: len(text) - len(list_text)] + list_text[:byte_offset]).count(b"\n")
+        truncated = "truncated" in message
+        return FormatError(
+            f"{path}:{error_line}: not valid JSON: {'the file ends too early' if truncated else message}"
+        )
+    offset = 0
+    for element in elements:
+        element_text = bytes(element)
+        offset = text.find(element_text, offset)
         try:
-            decoder.decode(b"[" + piece + b"]")
+            decoder.decode(b"[" + element_text + b"]")
         except msgspec.MsgspecError as error:
-            where = line + text.count(b"\n", 0, place)
-            return FormatError(f"{path}:{where}: {str(error).replace('$[...]', 'record')}")
-        place += len(piece)
+            error_line = line + text.count(b"\n", 0, offset)
+            return FormatError(f"{path}:{error_line}: {str(error).replace('$[...]', 'record')}")
+        offset += len(element_text)
     return FormatError(f"{path}:{line}: not a list of records")
 
 
 def table_path(root: Path, version: str, name: str) -> Path:
-    """File of a table, such as ROOT/v1.0-mini/sample.json."""
+    """Return the file of a table, such as ROOT/v1.0-mini/sample.json."""
     return root / version / f"{name}.json"

@@ -1,6 +1,6 @@
 """Ground truth of the detection task from the tables of a dataset, with bounded memory.
 
-The tables are streamed and only what the chosen samples need is kept. Source: nuscenes-devkit 1.2.0,
+The tables are streamed, and only rows of the selected samples are kept. Source: nuscenes-devkit 1.2.0,
 eval/common/loaders.py (`load_gt`, `add_center_dist`), nuscenes.py (`box_velocity`).
 """
 
@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """What a results file is compared with.
+    """Ground truth that a results file is compared with.
 
     Attributes:
         samples: Tokens [S].
@@ -63,7 +63,7 @@ class GroundTruth:
     racks: BikeRacks
 
 
-# only what is needed of a table: the rest is passed over by the decoder
+# only the needed fields of a table: the decoder skips all others
 class _Calibrated(msgspec.Struct, gc=False):
     token: str
     sensor_token: str
@@ -104,10 +104,10 @@ class _Annotation(msgspec.Struct, gc=False):
 def read_truth(
     root: str | Path, version: str, *, scenes: Collection[str] | None = None, samples: Collection[str] | None = None
 ) -> GroundTruth:
-    """The ground truth of some scenes, of some samples, or of all.
+    """Read the ground truth of some scenes, of some samples, or of all.
 
-    Samples and the boxes of each are in the order of their tables. Annotations outside the detection classes are left
-    out.
+    Samples and the boxes of each are in the order of their tables. Annotations outside the detection classes
+    are left out.
 
     Args:
         root: The nuScenes root.
@@ -116,28 +116,31 @@ def read_truth(
         samples: Tokens of the samples; None: all.
 
     Raises:
-        FormatError: A table is broken, a reference leads nowhere, or an annotation has two attributes.
-        ConfigError: No sample is chosen.
+        FormatError: A table is broken, a reference is dangling, or an annotation has two attributes.
+        ConfigError: No sample is selected.
     """
     tables = _Tables(Path(root), version)
-    names = {s.token: s.name for s in tables.rows("scene", Scene)}
-    chosen = [
-        s
-        for s in tables.rows("sample", Sample)
-        if (scenes is None or names.get(s.scene_token) in scenes) and (samples is None or s.token in samples)
+    name_by_token = {sample.token: sample.name for sample in tables.rows("scene", Scene)}
+    selected = [
+        sample
+        for sample in tables.rows("sample", Sample)
+        if (scenes is None or name_by_token.get(sample.scene_token) in scenes)
+        and (samples is None or sample.token in samples)
     ]
-    if not chosen:
+    if not selected:
         raise ConfigError(f"{tables.folder}: it has none of the chosen scenes; is this the version of the split?")
-    index = {s.token: i for i, s in enumerate(chosen)}
-    if samples is not None and len(index) != len(set(samples)):
-        raise ConfigError(f"{tables.folder}: it lacks {len(set(samples)) - len(index)} of the chosen samples")
-    used = tuple(dict.fromkeys(tables.find(names, s.scene_token, "scene") for s in chosen))
-    place = {name: i for i, name in enumerate(used)}
-    scene = np.array([place[names[s.scene_token]] for s in chosen], np.int32)
-    ego = _ego(tables, index)
+    sample_index = {sample.token: position for position, sample in enumerate(selected)}
+    if samples is not None and len(sample_index) != len(set(samples)):
+        raise ConfigError(f"{tables.folder}: it lacks {len(set(samples)) - len(sample_index)} of the chosen samples")
+    scene_names = tuple(dict.fromkeys(tables.find(name_by_token, sample.scene_token, "scene") for sample in selected))
+    scene_index = {scene_name: position for position, scene_name in enumerate(scene_names)}
+    scene_of_sample = np.array([scene_index[name_by_token[sample.scene_token]] for sample in selected], np.int32)
+    ego = _ego(tables, sample_index)
     with uncollected():
-        boxes, points, visibility, racks = _annotations(tables, chosen, index)
-    return GroundTruth(tuple(index), scene, used, ego, with_ego(boxes, ego), points, visibility, racks)
+        boxes, points, visibility, racks = _annotations(tables, selected, sample_index)
+    return GroundTruth(
+        tuple(sample_index), scene_of_sample, scene_names, ego, with_ego(boxes, ego), points, visibility, racks
+    )
 
 
 @dataclass(frozen=True)
@@ -164,87 +167,123 @@ class _Tables:
 
 def _ego(tables: _Tables, index: Mapping[str, int]) -> F64:
     """Global position [S, 3] of the ego at each sample: the pose of its LiDAR key frame."""
-    sensors = {s.token for s in tables.rows("sensor", Sensor) if s.channel == LIDAR}
-    own = {c.token for c in tables.rows("calibrated_sensor", _Calibrated) if c.sensor_token in sensors}
-    pose: list[str | None] = [None] * len(index)
-    for data in tables.rows("sample_data", _Data):
-        if data.is_key_frame and data.calibrated_sensor_token in own and data.sample_token in index:
-            pose[index[data.sample_token]] = data.ego_pose_token
-    if None in pose:
-        token = list(index)[pose.index(None)]
+    sensors = {sensor.token for sensor in tables.rows("sensor", Sensor) if sensor.channel == LIDAR}
+    lidar_calibrations = {
+        calibration.token
+        for calibration in tables.rows("calibrated_sensor", _Calibrated)
+        if calibration.sensor_token in sensors
+    }
+    pose_tokens: list[str | None] = [None] * len(index)
+    for record in tables.rows("sample_data", _Data):
+        if (
+            record.is_key_frame
+            and record.calibrated_sensor_token in lidar_calibrations
+            and record.sample_token in index
+        ):
+            pose_tokens[index[record.sample_token]] = record.ego_pose_token
+    if None in pose_tokens:
+        token = list(index)[pose_tokens.index(None)]
         raise FormatError(f"{tables.folder}/sample_data.json: sample {token} has no key frame of {LIDAR}")
-    wanted = set(pose)
-    found = {p.token: p.translation for p in tables.rows("ego_pose", _Pose) if p.token in wanted}
-    missing = next((token for token in pose if token not in found), None)
+    used_poses = set(pose_tokens)
+    positions = {
+        ego_pose.token: ego_pose.translation
+        for ego_pose in tables.rows("ego_pose", _Pose)
+        if ego_pose.token in used_poses
+    }
+    missing = next((token for token in pose_tokens if token not in positions), None)
     if missing is not None:
         raise FormatError(f"{tables.folder}/ego_pose.json: it has no record '{missing}' that is used")
-    return np.array([found[token] for token in pose if token is not None], np.float64)
+    return np.array([positions[token] for token in pose_tokens if token is not None], np.float64)
 
 
 def _annotations(
     tables: _Tables, chosen: Sequence[Sample], index: Mapping[str, int]
 ) -> tuple[BoxTable, I32, I8, BikeRacks]:
     """Boxes, their points and visibility, and the bicycle racks of the samples."""
-    category = {c.token: c.name for c in tables.rows("category", Category)}
-    kinds = {name: CLASSES.index(kind) for name, kind in CATEGORY_TO_CLASS.items()} | {BICYCLE_RACK: _RACK_LABEL}
-    label_of = {
-        i.token: kinds.get(tables.find(category, i.category_token, "category"), -1)
-        for i in tables.rows("instance", _Instance)
+    category_names = {
+        category_record.token: category_record.name for category_record in tables.rows("category", Category)
+    }
+    label_by_category = {
+        category_name: CLASSES.index(class_name) for category_name, class_name in CATEGORY_TO_CLASS.items()
+    } | {BICYCLE_RACK: _RACK_LABEL}
+    label_by_instance = {
+        instance.token: label_by_category.get(tables.find(category_names, instance.category_token, "category"), -1)
+        for instance in tables.rows("instance", _Instance)
     }
     attributes = {
-        a.token: ATTRIBUTES.index(a.name) for a in tables.rows("attribute", Attribute) if a.name in ATTRIBUTES
+        annotation.token: ATTRIBUTES.index(annotation.name)
+        for annotation in tables.rows("attribute", Attribute)
+        if annotation.name in ATTRIBUTES
     }
     path = table_path(tables.root, tables.version, "sample_annotation")
-    # the frames before and after may lie in samples that are not chosen
-    scenes = {s.scene_token for s in chosen}
-    time = {s.token: s.timestamp for s in tables.rows("sample", Sample) if s.scene_token in scenes}
+    # neighbours, which velocities need, may lie in samples that are not selected
+    scenes = {sample.scene_token for sample in chosen}
+    timestamp_by_sample = {
+        sample.token: sample.timestamp for sample in tables.rows("sample", Sample) if sample.scene_token in scenes
+    }
 
-    numbers: list[F64] = []
-    whole: list[I64] = []
+    float_blocks: list[F64] = []
+    integer_blocks: list[I64] = []
     tokens: list[str] = []
-    before: list[str] = []
-    after: list[str] = []
+    previous_tokens: list[str] = []
+    next_tokens: list[str] = []
     for block in stream(path, _Annotation):
-        kept = [a for a in block if a.sample_token in time and _label(path, a, label_of) >= 0]
-        if not kept:
-            continue
-        numbers.append(np.array([(*a.translation, *a.size, *a.rotation) for a in kept], np.float64))
-        ints = [
-            (
-                index.get(a.sample_token, -1),
-                label_of[a.instance_token],
-                _attribute(path, a, attributes),
-                int(a.visibility_token or 0) if a.visibility_token in VISIBILITY else 0,
-                a.num_lidar_pts + a.num_radar_pts,
-                time[a.sample_token],
-            )
-            for a in kept
+        relevant = [
+            annotation
+            for annotation in block
+            if annotation.sample_token in timestamp_by_sample and _label(path, annotation, label_by_instance) >= 0
         ]
-        whole.append(np.array(ints, np.int64))
-        tokens += [a.token for a in kept]
-        before += [a.prev for a in kept]
-        after += [a.next for a in kept]
-    values = np.concatenate(numbers) if numbers else np.zeros((0, 10))
-    columns = np.concatenate(whole) if whole else np.zeros((0, 6), np.int64)
-    velocity = _velocity(path, tokens, (before, after), values[:, :3], columns[:, 5])
+        if not relevant:
+            continue
+        float_blocks.append(
+            np.array(
+                [(*annotation.translation, *annotation.size, *annotation.rotation) for annotation in relevant],
+                np.float64,
+            )
+        )
+        integer_rows = [
+            (
+                index.get(annotation.sample_token, -1),
+                label_by_instance[annotation.instance_token],
+                _attribute(path, annotation, attributes),
+                int(annotation.visibility_token or 0) if annotation.visibility_token in VISIBILITY else 0,
+                annotation.num_lidar_pts + annotation.num_radar_pts,
+                timestamp_by_sample[annotation.sample_token],
+            )
+            for annotation in relevant
+        ]
+        integer_blocks.append(np.array(integer_rows, np.int64))
+        tokens += [annotation.token for annotation in relevant]
+        previous_tokens += [annotation.prev for annotation in relevant]
+        next_tokens += [annotation.next for annotation in relevant]
+    values = np.concatenate(float_blocks) if float_blocks else np.zeros((0, 10))
+    columns = np.concatenate(integer_blocks) if integer_blocks else np.zeros((0, 6), np.int64)
+    velocity = _velocity(path, tokens, (previous_tokens, next_tokens), values[:, :3], columns[:, 5])
     size = values[:, 3:6][:, size_columns("wlh", "lwh")]
+    # Stable, so that the boxes of a sample stay in table order.
     order = np.argsort(columns[:, 0], kind="stable")
     order = order[columns[order, 0] >= 0]
-    real = order[columns[order, 1] < _RACK_LABEL]
-    rack = order[columns[order, 1] == _RACK_LABEL]
+    box_rows = order[columns[order, 1] < _RACK_LABEL]
+    rack_rows = order[columns[order, 1] == _RACK_LABEL]
     boxes = BoxTable(
-        sample=columns[real, 0].astype(np.int32),
-        label=columns[real, 1].astype(np.int8),
-        centre=values[real, :3],
-        size_lwh=size[real],
-        rotation=values[real, 6:],
-        velocity=velocity[real],
-        attribute=columns[real, 2].astype(np.int8),
-        score=np.full(len(real), -1.0),
-        ego_distance=np.full(len(real), np.nan),
+        sample=columns[box_rows, 0].astype(np.int32),
+        label=columns[box_rows, 1].astype(np.int8),
+        centre=values[box_rows, :3],
+        size_lwh=size[box_rows],
+        rotation=values[box_rows, 6:],
+        velocity=velocity[box_rows],
+        attribute=columns[box_rows, 2].astype(np.int8),
+        score=np.full(len(box_rows), -1.0),
+        ego_distance=np.full(len(box_rows), np.nan),
     )
-    racks = BikeRacks(values[rack, :3], size[rack], values[rack, 6:], velocity[rack], columns[rack, 0].astype(np.int32))
-    return boxes, columns[real, 4].astype(np.int32), columns[real, 3].astype(np.int8), racks
+    racks = BikeRacks(
+        values[rack_rows, :3],
+        size[rack_rows],
+        values[rack_rows, 6:],
+        velocity[rack_rows],
+        columns[rack_rows, 0].astype(np.int32),
+    )
+    return boxes, columns[box_rows, 4].astype(np.int32), columns[box_rows, 3].astype(np.int8), racks
 
 
 def _label(path: Path, a: _Annotation, label_of: Mapping[str, int]) -> int:
@@ -261,23 +300,23 @@ def _attribute(path: Path, a: _Annotation, known: Mapping[str, int]) -> int:
         return -1
     if len(a.attribute_tokens) > 1:
         raise FormatError(f"{path}: annotation {a.token} has more than one attribute")
-    found = known.get(a.attribute_tokens[0], -1)
-    if found < 0:
+    attribute = known.get(a.attribute_tokens[0], -1)
+    if attribute < 0:
         raise FormatError(f"{path}: annotation {a.token}: unknown attribute '{a.attribute_tokens[0]}'")
-    return found
+    return attribute
 
 
 def _velocity(
     path: Path, tokens: Sequence[str], links: tuple[Sequence[str], Sequence[str]], centre: F64, time: I64
 ) -> F64:
-    """Velocity [N, 2] from the frames before and after; NaN for a single frame or frames too far apart in time."""
-    row = dict(zip(tokens, range(len(tokens)), strict=True))
-    row[""] = -1
-    ends = []
-    for side, link in zip(("prev", "next"), links, strict=True):
-        end = np.fromiter(map(row.get, link, repeat(-2)), np.int64, len(tokens))
-        if (end == -2).any():
-            bad = int((end == -2).argmax())
-            raise FormatError(f"{path}: annotation {tokens[bad]}: its {side} is not in its scene")
-        ends.append(end.astype(np.int32))
-    return velocities(centre, time, *ends)[:, :2]
+    """Return velocities [N, 2] from the previous and next annotations; NaN for one alone or too far apart in time."""
+    row_by_token = dict(zip(tokens, range(len(tokens)), strict=True))
+    row_by_token[""] = -1
+    neighbours = []
+    for field_name, link_tokens in zip(("prev", "next"), links, strict=True):
+        neighbour_rows = np.fromiter(map(row_by_token.get, link_tokens, repeat(-2)), np.int64, len(tokens))
+        if (neighbour_rows == -2).any():
+            first_missing = int((neighbour_rows == -2).argmax())
+            raise FormatError(f"{path}: annotation {tokens[first_missing]}: its {field_name} is not in its scene")
+        neighbours.append(neighbour_rows.astype(np.int32))
+    return velocities(centre, time, *neighbours)[:, :2]

@@ -1,7 +1,7 @@
 """A nuScenes folder from typed calls: 13 tables that the official toolkit loads, and the sensor files.
 
 Tokens are digests of names (scene, channel, time), so that the same calls give the same bytes. Chains (prev, next),
-first and last tokens, counts and the samples of sweeps are worked out in `close`, which writes the tables.
+first and last tokens, counts and the samples of sweeps are derived in `close`, which writes the tables.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ IDENTITY: Final[Quaternion] = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """A row of sample_data before its chain is known."""
+    """A row of sample_data whose chain is not yet known."""
 
     row: SampleData
     scene: str
@@ -67,8 +67,8 @@ class _Frame:
 class NuScenesWriter:
     """Collects the records of a version; sensor files are written at once, the tables by `close`.
 
-    As a context manager it closes when the block ends well, and writes no tables otherwise. Its methods raise
-    ValueError for wrong use (an unknown token, a time given twice), and StoreError where a folder cannot be written.
+    As a context manager it closes if the block succeeds, and writes no tables otherwise. Its methods raise
+    ValueError for wrong use (an unknown token, a duplicate time), and StoreError if a folder cannot be written.
     """
 
     def __init__(self, root: Path, version: str = "v1.0-mini") -> None:
@@ -85,8 +85,8 @@ class NuScenesWriter:
         for name in ATTRIBUTES:
             self._add(Attribute(_token("attribute", name), name=name))
         for number, level in enumerate(_LEVELS, start=1):
-            described = f"visibility of whole object is between {level[1:].replace('-', ' and ')}%"
-            self._add(Visibility(str(number), level=level, description=described))
+            description = f"visibility of whole object is between {level[1:].replace('-', ' and ')}%"
+            self._add(Visibility(str(number), level=level, description=description))
 
     def __enter__(self) -> NuScenesWriter:
         return self
@@ -96,12 +96,15 @@ class NuScenesWriter:
             self.close()
 
     def add_scene(self, name: str | None = None, *, description: str = "", location: str = "drawn") -> str:
-        """A scene. Without a name it gets the next one of mini_val, mini_train, then scene-9001 and so on."""
-        taken = {scene.name for scene in self._rows[Scene].values()}
+        """Add a scene. Without a name it gets the next of mini_val, mini_train, then scene-9001 and so on."""
+        used_names = {scene.name for scene in self._rows[Scene].values()}
         if name is None:
-            known = chain(MINI_VAL, MINI_TRAIN, (f"scene-{number:04d}" for number in count(_FIRST_FREE)))
-            name = next(free for free in known if free not in taken)
-        if name in taken:
+            # Names of the official mini splits first, so that the official toolkit finds the scenes in its splits.
+            candidates = chain(
+                MINI_VAL, MINI_TRAIN, (f"scene-{scene_number:04d}" for scene_number in count(_FIRST_FREE))
+            )
+            name = next(candidate for candidate in candidates if candidate not in used_names)
+        if name in used_names:
             raise ValueError(f"scene '{name}' was added before")
         logfile = f"log-{name}"
         log = self._add(Log(_token("log", logfile), logfile, "ssad", "2020-01-01", location))
@@ -132,17 +135,17 @@ class NuScenesWriter:
         """
         if modality not in _FORMATS:
             raise ValueError(f"modality '{modality}' is none of {', '.join(_FORMATS)}")
-        sensor = _token("sensor", channel)
-        if sensor not in self._rows[Sensor]:
-            self._add(Sensor(sensor, channel, modality))
-        token = _token("calibrated_sensor", self._known(Scene, scene).name, channel)
+        sensor_token = _token("sensor", channel)
+        if sensor_token not in self._rows[Sensor]:
+            self._add(Sensor(sensor_token, channel, modality))
+        calibration_token = _token("calibrated_sensor", self._known(Scene, scene).name, channel)
         matrix = tuple(tuple(float(value) for value in row) for row in intrinsic)
-        self._add(CalibratedSensor(token, sensor, _floats(translation), _floats(rotation), matrix))
-        self._mounted[scene, channel] = token, modality
-        return token
+        self._add(CalibratedSensor(calibration_token, sensor_token, _floats(translation), _floats(rotation), matrix))
+        self._mounted[scene, channel] = calibration_token, modality
+        return calibration_token
 
     def add_sample(self, scene: str, timestamp_us: int) -> str:
-        """A key frame of a scene, in any order."""
+        """Add a key frame of a scene, in any order."""
         name = self._known(Scene, scene).name
         return self._add(Sample(_token("sample", name, timestamp_us), timestamp_us, scene))
 
@@ -158,7 +161,7 @@ class NuScenesWriter:
         sample: str | None = None,
         size: tuple[int, int] = (0, 0),
     ) -> str:
-        """Add a file of a sensor: its bytes, or a file to link to (copied where it cannot be linked).
+        """Add a file of a sensor: its bytes, or a file to link to (copied if it cannot be linked).
 
         Args:
             scene: Token of the scene.
@@ -167,7 +170,8 @@ class NuScenesWriter:
             data: Bytes, or the file.
             ego_translation: Position of the ego in the world, m.
             ego_rotation: Orientation of the ego in the world, quaternion.
-            sample: Token of the key frame that it belongs to; None for a sweep, which gets the sample that follows it.
+            sample: Token of the key frame that it belongs to; None for a sweep, which gets the sample that follows
+                it.
             size: Width and height of an image in pixels.
 
         Returns:
@@ -179,9 +183,9 @@ class NuScenesWriter:
         calibration, modality = self._mounted[scene, channel]
         if sample is not None and self._known(Sample, sample).scene_token != scene:
             raise ValueError(f"sample '{sample}' is of another scene")
-        ending, kind = _FORMATS[modality]
+        suffix, kind = _FORMATS[modality]
         folder = "sweeps" if sample is None else "samples"
-        filename = f"{folder}/{channel}/{record.name}__{channel}__{timestamp_us}{ending}"
+        filename = f"{folder}/{channel}/{record.name}__{channel}__{timestamp_us}{suffix}"
         token = _token("sample_data", record.name, channel, timestamp_us)
         row = SampleData(
             token,
@@ -203,7 +207,7 @@ class NuScenesWriter:
         return token
 
     def add_instance(self, scene: str, key: str, *, category: str) -> str:
-        """An object of a scene, such as key 'car-3'; its annotations are added one a sample."""
+        """Add an object of a scene, such as key 'car-3'; its annotations are added one per sample."""
         token = _token("instance", self._known(Scene, scene).name, key)
         self._instance_scene[token] = scene
         return self._add(Instance(token, self._named(Category, category)))
@@ -220,7 +224,21 @@ class NuScenesWriter:
         attributes: Iterable[str] = (),
         lidar_points: int = 0,
     ) -> str:
-        """The box of an object in a key frame: centre and rotation in the global frame, size width, length, height."""
+        """Add the box of an object in a key frame.
+
+        Args:
+            sample: Token of the key frame.
+            instance: Token of the object.
+            translation: Centre in the global frame, m.
+            size: Width, length, height, m.
+            rotation: Orientation in the global frame, quaternion.
+            visibility: Token of the visibility level, '1' to '4'.
+            attributes: Names of the attributes.
+            lidar_points: Number of LiDAR points in the box.
+
+        Returns:
+            Token of the annotation.
+        """
         self._known(Instance, instance)
         if self._instance_scene[instance] != self._known(Sample, sample).scene_token:
             raise ValueError(f"instance '{instance}' and sample '{sample}' are of different scenes")
@@ -241,11 +259,11 @@ class NuScenesWriter:
         )
 
     def set_split(self, name: str, scenes: Iterable[str]) -> None:
-        """A split of splits.json: scene names. Without any, `close` writes all, mini_train and mini_val."""
+        """Set a split of splits.json: scene names. Without any, `close` writes all, mini_train and mini_val."""
         self._splits[name] = list(scenes)
 
     def close(self) -> None:
-        """Work out the chains and write the 13 tables, the maps and splits.json. ValueError for an empty scene."""
+        """Derive the chains and write the 13 tables, the maps and splits.json. ValueError for an empty scene."""
         if not self._rows[Scene]:
             raise ValueError("a version needs at least one scene")
         self._chain_samples()
@@ -255,9 +273,11 @@ class NuScenesWriter:
         for name, kind in TABLES.items():
             _write_table(table_path(self.root, self.version, name), self._rows[kind].values())
         names = [scene.name for scene in self._rows[Scene].values()]
-        parts: Mapping[str, Sequence[str]] = {"all": names, "mini_train": MINI_TRAIN, "mini_val": MINI_VAL}
-        default = {split: [name for name in names if name in members] for split, members in parts.items()}
-        splits = self._splits or {split: members for split, members in default.items() if members}
+        standard_splits: Mapping[str, Sequence[str]] = {"all": names, "mini_train": MINI_TRAIN, "mini_val": MINI_VAL}
+        default_splits = {
+            split: [name for name in names if name in members] for split, members in standard_splits.items()
+        }
+        splits = self._splits or {split: members for split, members in default_splits.items() if members}
         write_atomic(self.root / self.version / "splits.json", dump_json(splits, indent=1) + "\n")
 
     def _add(self, record: TableRecord) -> str:
@@ -274,7 +294,7 @@ class NuScenesWriter:
         return record
 
     def _named(self, kind: type[Category] | type[Attribute], name: str) -> str:
-        """Token of a category or attribute; one that the original does not have is added."""
+        """Return the token of a category or attribute; one that the original does not have is added."""
         token = _token("category" if kind is Category else "attribute", name)
         if token not in self._rows[kind]:
             self._add(kind(token, name=name))
@@ -283,9 +303,9 @@ class NuScenesWriter:
     def _link(self, kind: type[TableRecord], rows: Sequence[Any]) -> None:
         """Store rows of one chain, in time order, with prev and next."""
         for number, row in enumerate(rows):
-            before = rows[number - 1].token if number else ""
-            after = rows[number + 1].token if number + 1 < len(rows) else ""
-            self._rows[kind][row.token] = msgspec.structs.replace(row, prev=before, next=after)
+            previous_token = rows[number - 1].token if number else ""
+            next_token = rows[number + 1].token if number + 1 < len(rows) else ""
+            self._rows[kind][row.token] = msgspec.structs.replace(row, prev=previous_token, next=next_token)
 
     def _chain_samples(self) -> None:
         self._order = {token: [] for token in self._rows[Scene]}
@@ -309,8 +329,8 @@ class NuScenesWriter:
             row = frame.row
             if not row.sample_token:
                 samples = self._order[frame.scene]
-                after = bisect_left([sample.timestamp for sample in samples], row.timestamp)
-                row = msgspec.structs.replace(row, sample_token=samples[min(after, len(samples) - 1)].token)
+                following = bisect_left([sample.timestamp for sample in samples], row.timestamp)
+                row = msgspec.structs.replace(row, sample_token=samples[min(following, len(samples) - 1)].token)
             self._rows[SampleData][row.token] = row
             chains.setdefault((frame.scene, frame.channel), []).append(row)
         for rows in chains.values():
@@ -324,7 +344,7 @@ class NuScenesWriter:
         for token, instance in list(self._rows[Instance].items()):
             rows = sorted(chains.get(token, []), key=lambda row: time[row.sample_token])
             if not rows:
-                del self._rows[Instance][token]  # never seen
+                del self._rows[Instance][token]  # the object never appears in a sample
                 continue
             self._link(SampleAnnotation, rows)
             self._rows[Instance][token] = msgspec.structs.replace(
@@ -335,12 +355,12 @@ class NuScenesWriter:
             )
 
     def _draw_maps(self) -> None:
-        """A blank map for each location: the official toolkit wants one for each log."""
-        places: dict[str, list[str]] = {}
+        """Write a blank map for each location: the official toolkit requires one for each log."""
+        logs_by_location: dict[str, list[str]] = {}
         for log in self._rows[Log].values():
-            places.setdefault(log.location, []).append(log.token)
-        for place, logs in places.items():
-            token = _token("map", place)
+            logs_by_location.setdefault(log.location, []).append(log.token)
+        for location, logs in logs_by_location.items():
+            token = _token("map", location)
             filename = f"maps/{token}.png"
             _, png = cv2.imencode(".png", np.zeros((64, 64), np.uint8))
             write_atomic(self.root / filename, png.tobytes())
@@ -352,19 +372,19 @@ def _token(*key: object) -> str:
 
 
 def _floats(values: Sequence[float]) -> Any:
-    """As a tuple of plain finite numbers. ValueError."""
-    plain = tuple(float(value) for value in values)
-    if not np.isfinite(plain).all():
-        raise ValueError(f"{plain} is not finite")
-    return plain
+    """Return values as a tuple of plain finite numbers. ValueError."""
+    numbers = tuple(float(value) for value in values)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{numbers} is not finite")
+    return numbers
 
 
 def place_file(path: Path, data: bytes | Path) -> None:
-    """Writes bytes, or links to a file, or copies it where it cannot be linked; what was there is replaced.
+    """Write bytes, or link to a file, or copy it if it cannot be linked; an existing file is replaced.
 
     Raises:
-        FormatError: There is no such file.
-        StoreError: The place cannot be written.
+        FormatError: The source file does not exist.
+        StoreError: The target cannot be written.
     """
     if isinstance(data, bytes):
         write_atomic(path, data)
@@ -382,14 +402,14 @@ def place_file(path: Path, data: bytes | Path) -> None:
 
 
 def _write_table(path: Path, rows: Iterable[TableRecord]) -> None:
-    """A JSON list, one record a line, atomically. StoreError."""
+    """Write a JSON list, one record per line, atomically. StoreError."""
     encoder = msgspec.json.Encoder()
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
         separator = b"[\n"
         for row in rows:
-            file.write(separator + encoder.encode(row))
+            stream.write(separator + encoder.encode(row))
             separator = b",\n"
-        file.write(b"\n]\n" if separator == b",\n" else b"[]\n")
+        stream.write(b"\n]\n" if separator == b",\n" else b"[]\n")
 
 
 __all__ = ["IDENTITY", "MINI_TRAIN", "MINI_VAL", "NuScenesWriter"]

@@ -1,1 +1,1 @@
-"""Other people's detectors behind the `Detector` protocol."""
+"""Third-party detectors behind the `Detector` protocol."""

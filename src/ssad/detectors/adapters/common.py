@@ -1,4 +1,4 @@
-"""What 2D detectors share: the frame of a detector, input, truth, choice of detections, sums."""
+"""Shared parts of 2D detectors: base class, input, truth, choice of detections, sums."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ssad.detectors.yolo.assign import Targets, pad_truth
 
 
 class Adapter(nn.Module, ABC):
-    """What every 2D detector has in common.
+    """Base class of 2D detectors.
 
     Args:
-        name: What tables call it.
+        name: Name in tables.
         classes: Names of the classes.
         threshold: Default of `predict`.
 
@@ -38,22 +38,22 @@ class Adapter(nn.Module, ABC):
         self.threshold = check_threshold(name, threshold)
 
     def forward(self, images: Tensor) -> Dense:
-        """As `dense`."""
+        """Return the raw outputs of `dense`."""
         return self.dense(images)
 
     @abstractmethod
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Raw outputs; see `ssad.core.protocols.Detector`."""
+        """Return raw outputs; see `ssad.core.protocols.Detector`."""
 
     @torch.no_grad()
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
-        """Detections of each image, best first, chosen as the source does."""
-        least = check_threshold(self.name, self.threshold if threshold is None else threshold)
+        """Return the detections of each image, best first, selected as in the source."""
+        min_score = check_threshold(self.name, self.threshold if threshold is None else threshold)
         with evaluating(self):
             dense = self.dense(images)
-        return self.choose(dense, least)
+        return self.choose(dense, min_score)
 
     @abstractmethod
     def choose(self, dense: Dense, least: float) -> list[Detections]:
@@ -61,20 +61,20 @@ class Adapter(nn.Module, ABC):
 
 
 def label_owned(owner: Tensor, label: Tensor, crowd: Tensor) -> tuple[Tensor, Tensor]:
-    """What places are that a matcher gave to objects.
+    """Return labels and owners of places from the result of a matcher.
 
     Args:
-        owner: [P] Index of the object of each place; -1 none, -2 in between.
+        owner: [P] Index of the object of each place; -1 for none, -2 for places between the thresholds.
         label: [Q] Classes of the objects.
-        crowd: [Q] Which of them are crowd: their places are ignored.
+        crowd: [Q] Whether an object is a crowd; the places of a crowd are ignored.
 
     Returns:
         Label (-1 background, -2 ignored) and owner (-1 none) [P] as an `Assignment` has them.
     """
     index = owner.clamp(min=0)
-    kind = torch.where(owner >= 0, label[index], owner)
-    kind = torch.where((owner >= 0) & crowd[index], -2, kind)
-    return kind, torch.where(kind >= 0, owner, -1)
+    place_label = torch.where(owner >= 0, label[index], owner)
+    place_label = torch.where((owner >= 0) & crowd[index], -2, place_label)
+    return place_label, torch.where(place_label >= 0, owner, -1)
 
 
 def check_images(name: str, images: Tensor, *, least: int = 1) -> tuple[int, int]:
@@ -90,35 +90,35 @@ def check_images(name: str, images: Tensor, *, least: int = 1) -> tuple[int, int
     """
     shape = images.shape
     if len(shape) != 4 or shape[1] != 3 or not images.is_floating_point() or 0 in shape[2:] or shape[0] < least:
-        kind = str(images.dtype).removeprefix("torch.")
+        dtype_name = str(images.dtype).removeprefix("torch.")
         raise ConfigError(
-            f"{name}: images must be [B, 3, H, W] of floats in [0, 1] (RGB); got {list(images.shape)} of {kind}"
+            f"{name}: images must be [B, 3, H, W] of floats in [0, 1] (RGB); got {list(images.shape)} of {dtype_name}"
         )
     return images.shape[2], images.shape[3]
 
 
 def size_inside(size: tuple[int, int], input_width: int | None) -> tuple[int, int]:
-    """Height and width that a picture of `size` is resized to, before padding (None: as it is)."""
+    """Return height and width to which an image of `size` is resized before padding (None: unchanged)."""
     if input_width is None:
         return size
     return max(1, round(size[0] * input_width / size[1])), input_width
 
 
 def scale_of(inside: tuple[int, int], size: tuple[int, int], like: Tensor) -> Tensor:
-    """[4]: what a box of a picture of `size` is multiplied by to stand in the network's input of size `inside`."""
+    """Return the factors [4] from boxes in an image of `size` to boxes in the network's input of size `inside`."""
     x, y = inside[1] / size[1], inside[0] / size[0]
     return torch.tensor([x, y, x, y], device=like.device, dtype=like.dtype)
 
 
 def resize_and_pad(images: Tensor, inside: tuple[int, int], *, multiple: int, grey: float) -> Tensor:
-    """Images [B, 3, H, W] at the size `inside`, padded at the right and bottom to multiples of so many pixels."""
+    """Resize images [B, 3, H, W] to `inside` and pad right and bottom to a multiple of `multiple` pixels."""
     if inside != tuple(images.shape[2:]):
         images = functional.interpolate(images, inside, mode="bilinear", align_corners=False)
     return functional.pad(images, (0, -inside[1] % multiple, 0, -inside[0] % multiple), value=grey)
 
 
 def check_threshold(name: str, threshold: float) -> float:
-    """The threshold, checked.
+    """Return the threshold after checking it.
 
     Raises:
         ConfigError: It is not in [0, 1).
@@ -147,37 +147,38 @@ def check_truth(name: str, truth: Sequence[Truth], images: int, *, scale: Tensor
 
 
 def log_odds(logit: Tensor) -> Tensor:
-    """The logits whose sigmoid is the softmax of `logit` [..., C]: each class against all others together."""
+    """Return logits whose sigmoid is the softmax of `logit` [..., C]: each class against all others together."""
     index = logit.argmax(-1, keepdim=True)
     largest = torch.zeros_like(logit, dtype=torch.bool).scatter_(-1, index, True)
     # all but the largest have a share of at most one half, so nothing cancels
     share = logit.softmax(-1).masked_fill(largest, 0.0)
-    rest = logit.logsumexp(-1, keepdim=True) + torch.log1p(-share)
-    beside = logit.masked_fill(largest, -torch.inf).logsumexp(-1, keepdim=True)
-    return logit - torch.where(largest, beside, rest)
+    log_remainder = logit.logsumexp(-1, keepdim=True) + torch.log1p(-share)
+    log_others = logit.masked_fill(largest, -torch.inf).logsumexp(-1, keepdim=True)
+    return logit - torch.where(largest, log_others, log_remainder)
 
 
 def suppress(score: Tensor, label: Tensor, box: Tensor, *, iou: float, limit: int, size: tuple[int, int]) -> Detections:
-    """Detections of one image from candidates, best first, by suppression within each class.
+    """Suppress candidates of one image within each class, and return detections, best first.
 
     Args:
         score: Score of each candidate [N].
         label: Class index [N].
-        box: Boxes [N, 4]; they are clipped to the picture.
+        box: Boxes [N, 4]; they are clipped to the image.
         iou: IoU above which the worse of two boxes of a class is dropped.
         limit: Maximum number of detections.
-        size: Height and width of the picture.
+        size: Height and width of the image.
     """
     height, width = size
-    edge = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
-    cut = box.clamp(min=0).minimum(edge)
-    order = score.argsort(descending=True, stable=True)
-    score, label, cut = score[order], label[order], cut[order]
-    keep = batched_nms(cut.double(), score.double(), label, iou)[:limit]
-    return Detections(score[keep], label[keep], cut[keep])
+    limit_corner = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
+    clipped = box.clamp(min=0).minimum(limit_corner)
+    ranking = score.argsort(descending=True, stable=True)
+    score, label, clipped = score[ranking], label[ranking], clipped[ranking]
+    # float64: suppression by class shifts boxes far apart, and float32 would round them there.
+    survivors = batched_nms(clipped.double(), score.double(), label, iou)[:limit]
+    return Detections(score[survivors], label[survivors], clipped[survivors])
 
 
 def sums(value: Tensor, image: Tensor, images: int) -> Tensor:
     """Sums [B] of value [N] by image [N]; no atomic additions, hence the same bits in every run."""
-    member = torch.arange(images, device=image.device)[:, None] == image
-    return torch.where(member, value, torch.zeros_like(value)).sum(1)
+    belongs = torch.arange(images, device=image.device)[:, None] == image
+    return torch.where(belongs, value, torch.zeros_like(value)).sum(1)

@@ -45,8 +45,10 @@ class OneStage(Adapter):
     def __init__(
         self, model: Any, classes: Sequence[str], columns: Sequence[int], *, name: str, threshold: float | None = None
     ) -> None:
-        kinds = {zoo.FCOS: "fcos", zoo.RetinaNet: "retinanet", zoo.ssd.SSD: "ssd"}
-        kind = next((kinds[own] for own in kinds if isinstance(model, own)), None)
+        kind_by_class = {zoo.FCOS: "fcos", zoo.RetinaNet: "retinanet", zoo.ssd.SSD: "ssd"}
+        kind = next(
+            (kind_by_class[model_class] for model_class in kind_by_class if isinstance(model, model_class)), None
+        )
         if kind is None:
             raise ConfigError(f"{name}: a {type(model).__name__} is no FCOS, RetinaNet or SSD of torchvision")
         super().__init__(name, classes, model.score_thresh if threshold is None else threshold)
@@ -56,8 +58,9 @@ class OneStage(Adapter):
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> OneStage:
-        """As any module; the model's resizing stays that of evaluation, which is not random."""
+        """Set the mode of the modules; the model keeps its resizing of evaluation, which is not random."""
         super().train(mode)
+        # In training mode the transform would pick a random size.
         self.model.transform.training = False
         return self
 
@@ -68,6 +71,7 @@ class OneStage(Adapter):
             ConfigError: The images have another shape or type.
         """
         size = check_images(self.name, images)
+        # The model's own transform normalises and resizes, so weights see the input they were trained with.
         batch, _ = self.model.transform(list(images.to(next(self.model.parameters()).dtype)))
         features = list(self.model.backbone(batch.tensors).values())
         heads = {name: full(value) for name, value in self.model.head(features).items()}
@@ -96,29 +100,30 @@ class OneStage(Adapter):
         score = dense.logit.sigmoid()
         if dense.quality is not None:
             score = (score * dense.quality.sigmoid()[..., None]).sqrt()
-        return [self._choose(one, box, dense, least) for one, box in zip(score, dense.box, strict=True)]
+        return [self._choose(image_score, box, dense, least) for image_score, box in zip(score, dense.box, strict=True)]
 
     def _choose(self, score: Tensor, box: Tensor, dense: Dense, least: float) -> Detections:
         limit = int(self.model.topk_candidates)
         if self.kind == "ssd":
             value, place = score.topk(min(limit, len(score)), 0)
             label = torch.arange(score.shape[1], device=score.device).expand_as(place)
-            kept = value > least
-            value, place, label = value[kept], place[kept], label[kept]
+            passes = value > least
+            value, place, label = value[passes], place[passes], label[passes]
         else:
             values, places, labels = [], [], []
             for start, count in _runs(dense.level):
-                part = score[start : start + count].flatten()
-                best, at = part.topk(min(limit, len(part)))
-                at = at[best > least]
-                values.append(part[at])
-                places.append(at // score.shape[1] + start)
-                labels.append(at % score.shape[1])
+                level_scores = score[start : start + count].flatten()
+                top_scores, top_indices = level_scores.topk(min(limit, len(level_scores)))
+                top_indices = top_indices[top_scores > least]
+                values.append(level_scores[top_indices])
+                places.append(top_indices // score.shape[1] + start)
+                labels.append(top_indices % score.shape[1])
             value, place, label = torch.cat(values), torch.cat(places), torch.cat(labels)
-        usable = box[place].isfinite().all(-1)
-        value, place, label = value[usable], place[usable], label[usable]
-        most = int(self.model.detections_per_img)
-        return suppress(value, label, box[place], iou=self.model.nms_thresh, limit=most, size=dense.size)
+        # Suppression of boxes with NaN or infinite sides is undefined.
+        is_finite = box[place].isfinite().all(-1)
+        value, place, label = value[is_finite], place[is_finite], label[is_finite]
+        max_detections = int(self.model.detections_per_img)
+        return suppress(value, label, box[place], iou=self.model.nms_thresh, limit=max_detections, size=dense.size)
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
@@ -129,7 +134,7 @@ class OneStage(Adapter):
         """
         scale = dense.maps["scale"][0]
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
-        owner = torch.stack([self._match(targets, k, dense) for k in range(len(truth))])
+        owner = torch.stack([self._match(targets, image_index, dense) for image_index in range(len(truth))])
         if targets.label.shape[1] == 0:
             return Assignment(owner, owner.clamp(max=-1), tuple(truth), {"box": torch.zeros_like(dense.box)})
         index = owner.clamp(min=0)
@@ -143,66 +148,73 @@ class OneStage(Adapter):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """classification, bbox_regression and FCOS's bbox_ctrness, as the source names and weights them."""
+        """Return classification, bbox_regression and FCOS's bbox_ctrness, named and weighted as in the source."""
         if assignment.label.shape != dense.box.shape[:2]:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
-        images = len(dense.box)
+        image_count = len(dense.box)
         anchors, scale = dense.maps["anchors"][0], dense.maps["scale"][0]
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
         target = assignment.extra["box"].to(scale)[image, place] * scale
         regression = dense.maps["bbox_regression"][0][image, place]
-        found = sums(torch.ones_like(target[:, 0]), image, images)
-        parts = {
+        positives = sums(torch.ones_like(target[:, 0]), image, image_count)
+        loss_sums = {
             "classification": self._class_loss(dense.maps["cls_logits"][0], assignment.label),
-            "bbox_regression": sums(self._box_loss(regression, target, anchors[place]), image, images),
+            "bbox_regression": sums(self._box_loss(regression, target, anchors[place]), image, image_count),
         }
         if self.kind == "fcos":
             quality = dense.maps["bbox_ctrness"][0][image, place, 0]
-            wanted = _centreness(target, anchors[place])
-            each = functional.binary_cross_entropy_with_logits(quality, wanted, reduction="none")
-            parts["bbox_ctrness"] = sums(each, image, images)
-        if reduction == "image" or self.kind == "retinanet":  # RetinaNet takes the mean over images of their own losses
-            own = {name: part / found.clamp(min=1) for name, part in parts.items()}
-            return own if reduction == "image" else {name: part.mean() for name, part in own.items()}
-        return {name: part.sum() / found.sum().clamp(min=1) for name, part in parts.items()}
+            target_quality = _centreness(target, anchors[place])
+            quality_loss = functional.binary_cross_entropy_with_logits(quality, target_quality, reduction="none")
+            loss_sums["bbox_ctrness"] = sums(quality_loss, image, image_count)
+        if reduction == "image" or self.kind == "retinanet":  # RetinaNet averages the images' normalised losses
+            image_losses = {name: loss_sum / positives.clamp(min=1) for name, loss_sum in loss_sums.items()}
+            return (
+                image_losses
+                if reduction == "image"
+                else {name: loss_sum.mean() for name, loss_sum in image_losses.items()}
+            )
+        return {name: loss_sum.sum() / positives.sum().clamp(min=1) for name, loss_sum in loss_sums.items()}
 
     def _class_loss(self, logit: Tensor, label: Tensor) -> Tensor:
-        """Sums [B] over places."""
+        """Return the sum [B] of the class loss over places."""
         column = self.columns[label.clamp(min=0)]
         if self.kind == "ssd":
-            wanted = torch.where(label >= 0, column, 0)
-            each = functional.cross_entropy(logit.transpose(1, 2), wanted, reduction="none")
-            found = label >= 0
-            hard = each.detach().masked_fill(label != -1, -torch.inf)
-            rank = hard.argsort(1, descending=True).argsort(1)
-            chosen = (rank < self.model.neg_to_pos_ratio * found.sum(1, keepdim=True)) & (label == -1)
-            return torch.where(found | chosen, each, 0.0).sum(1)
-        wanted = functional.one_hot(column, logit.shape[-1]).to(logit) * (label >= 0)[..., None]
-        each = sigmoid_focal_loss(logit, wanted, reduction="none").sum(-1)
-        return torch.where(label != -2, each, 0.0).sum(1)
+            target = torch.where(label >= 0, column, 0)
+            place_loss = functional.cross_entropy(logit.transpose(1, 2), target, reduction="none")
+            is_object = label >= 0
+            # Hard negative mining of SSD: only the background with the largest loss counts.
+            negative_loss = place_loss.detach().masked_fill(label != -1, -torch.inf)
+            negative_rank = negative_loss.argsort(1, descending=True).argsort(1)
+            is_hard_negative = (negative_rank < self.model.neg_to_pos_ratio * is_object.sum(1, keepdim=True)) & (
+                label == -1
+            )
+            return torch.where(is_object | is_hard_negative, place_loss, 0.0).sum(1)
+        target = functional.one_hot(column, logit.shape[-1]).to(logit) * (label >= 0)[..., None]
+        place_loss = sigmoid_focal_loss(logit, target, reduction="none").sum(-1)
+        return torch.where(label != -2, place_loss, 0.0).sum(1)
 
     def _box_loss(self, regression: Tensor, target: Tensor, anchors: Tensor) -> Tensor:
-        """Loss [M] of the places that answer for an object."""
+        """Return the box loss [M] of the places assigned to an object."""
         if self.kind == "ssd":
-            wanted = self.model.box_coder.encode_single(target, anchors)
-            return functional.smooth_l1_loss(regression, wanted, reduction="none").sum(-1)
+            encoded_target = self.model.box_coder.encode_single(target, anchors)
+            return functional.smooth_l1_loss(regression, encoded_target, reduction="none").sum(-1)
         head = self.model.head.regression_head
         if self.kind == "fcos" or getattr(head, "_loss_type", "l1") == "giou":
             box = self._decode(regression[None], anchors)[0]
-            result: Tensor = generalized_box_iou_loss(box, target, reduction="none")
-            return result
-        wanted = head.box_coder.encode_single(target, anchors)
-        return functional.l1_loss(regression, wanted, reduction="none").sum(-1)
+            giou_loss: Tensor = generalized_box_iou_loss(box, target, reduction="none")
+            return giou_loss
+        encoded_target = head.box_coder.encode_single(target, anchors)
+        return functional.l1_loss(regression, encoded_target, reduction="none").sum(-1)
 
     def _decode(self, regression: Tensor, anchors: Tensor) -> Tensor:
-        """Boxes [B, P, 4] in the network's input."""
+        """Return boxes [B, P, 4] in the network's input."""
         if self.kind == "fcos":
-            middle, extent = (anchors[:, :2] + anchors[:, 2:]) / 2, anchors[:, 2:] - anchors[:, :2]
+            centre, extent = (anchors[:, :2] + anchors[:, 2:]) / 2, anchors[:, 2:] - anchors[:, :2]
             sides = regression * extent.repeat(1, 2)
-            return torch.cat((middle - sides[..., :2], middle + sides[..., 2:]), -1)
+            return torch.cat((centre - sides[..., :2], centre + sides[..., 2:]), -1)
         coder = self.model.box_coder if self.kind == "ssd" else self.model.head.regression_head.box_coder
-        many = anchors.expand(len(regression), -1, -1).reshape(-1, 4)
-        box: Tensor = coder.decode_single(regression.reshape(-1, 4), many)
+        flat_anchors = anchors.expand(len(regression), -1, -1).reshape(-1, 4)
+        box: Tensor = coder.decode_single(regression.reshape(-1, 4), flat_anchors)
         return box.view_as(regression)
 
     def _match(self, targets: Targets, k: int, dense: Dense) -> Tensor:
@@ -214,43 +226,47 @@ class OneStage(Adapter):
         if self.kind != "fcos":
             owner: Tensor = self.model.proposal_matcher(box_iou(box, anchors))
             return owner
-        middle, extent = (anchors[:, :2] + anchors[:, 2:]) / 2, anchors[:, 2] - anchors[:, 0]
-        away = (middle[:, None] - (box[:, :2] + box[:, 2:]) / 2).abs().amax(-1)
-        sides = torch.cat((middle[:, None] - box[:, :2], box[:, 2:] - middle[:, None]), -1)
+        centre, extent = (anchors[:, :2] + anchors[:, 2:]) / 2, anchors[:, 2] - anchors[:, 0]
+        centre_distance = (centre[:, None] - (box[:, :2] + box[:, 2:]) / 2).abs().amax(-1)
+        sides = torch.cat((centre[:, None] - box[:, :2], box[:, 2:] - centre[:, None]), -1)
+        # A level takes objects whose farthest side is 4 to 8 anchor sizes away; the ends are open.
         low = torch.where(dense.level == 0, 0.0, 4 * extent)
         high = torch.where(dense.level == dense.level[-1], torch.inf, 8 * extent)
         widest = sides.amax(-1)
-        fits = (away < self.model.center_sampling_radius * extent[:, None]) & (sides.amin(-1) > 0)
-        fits &= (widest > low[:, None]) & (widest < high[:, None])
+        is_candidate = (centre_distance < self.model.center_sampling_radius * extent[:, None]) & (sides.amin(-1) > 0)
+        is_candidate &= (widest > low[:, None]) & (widest < high[:, None])
         area = (box[:, 2:] - box[:, :2]).prod(-1)
-        least, index = torch.where(fits, area, torch.inf).min(1)
-        return torch.where(least.isfinite(), index, -1)
+        smallest_area, index = torch.where(is_candidate, area, torch.inf).min(1)
+        return torch.where(smallest_area.isfinite(), index, -1)
 
     def _levels(self, features: list[Tensor], height: int, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Level and stride (in the network's input) of each place."""
-        each = self.model.anchor_generator.num_anchors_per_location()
-        counts = [f.shape[2] * f.shape[3] * a for f, a in zip(features, each, strict=True)]
-        many = torch.tensor(counts, device=device)
-        level = torch.arange(len(counts), device=device).repeat_interleave(many, output_size=sum(counts))
-        stride = torch.tensor([height / f.shape[2] for f in features], device=device)
+        """Return level and stride (in the network's input) of each place."""
+        anchors_per_cell = self.model.anchor_generator.num_anchors_per_location()
+        counts = [
+            feature.shape[2] * feature.shape[3] * anchor_count
+            for feature, anchor_count in zip(features, anchors_per_cell, strict=True)
+        ]
+        place_counts = torch.tensor(counts, device=device)
+        level = torch.arange(len(counts), device=device).repeat_interleave(place_counts, output_size=sum(counts))
+        stride = torch.tensor([height / feature.shape[2] for feature in features], device=device)
         return level, stride[level]
 
 
 def full(value: Tensor) -> Tensor:
-    """In float32 at least."""
+    """Return the value in float32 or finer; half precision is too coarse for boxes and losses."""
     return value.float() if value.dtype in (torch.float16, torch.bfloat16) else value
 
 
 def _runs(level: Tensor) -> list[tuple[int, int]]:
-    """First place and number of places of each level."""
+    """Return the first place and the number of places of each level."""
     counts = torch.bincount(level).tolist()
     starts = torch.tensor([0, *counts]).cumsum(0).tolist()
     return list(zip(starts, counts, strict=False))
 
 
 def _centreness(target: Tensor, anchors: Tensor) -> Tensor:
-    """FCOS's target [M]: how far the place is from the middle of its object."""
-    middle = (anchors[:, :2] + anchors[:, 2:]) / 2
-    low, high = middle - target[:, :2], target[:, 2:] - middle
+    """Return FCOS's target [M] for the distance of a place from the centre of its object."""
+    centre = (anchors[:, :2] + anchors[:, 2:]) / 2
+    low, high = centre - target[:, :2], target[:, 2:] - centre
     share = torch.minimum(low, high) / torch.maximum(low, high)
     return share.prod(-1).sqrt()

@@ -1,4 +1,4 @@
-"""torchvision's detection models by name, with fresh weights or a file's; nothing is downloaded."""
+"""torchvision's detection models by name, with fresh weights or those of a file; nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MODELS = (
     "ssd300_vgg16",
     "ssdlite320_mobilenet_v3_large",
 )
-# their published weights were trained with norms that add nothing to the variance
+# Their published weights were trained with batch norms whose epsilon is 0.
 NO_EPS = ("fasterrcnn_resnet50_fpn", "retinanet_resnet50_fpn")
 
 
@@ -43,15 +43,15 @@ def torchvision_detector(
     seed: int = 0,
     **options: Any,
 ) -> OneStage | TwoStage:
-    """A detection model of torchvision (`MODELS`), frozen and in eval mode.
+    """Build a detection model of torchvision (`MODELS`), frozen and in eval mode.
 
     Args:
         model: Name of the model.
-        classes: Of the weights, without background; None: the 80 of COCO in torchvision's 91 columns.
-        weights: A file as `load_weights` takes it, such as torchvision's own .pth files; None: fresh ones.
-        threshold: Default of `predict`; None: the model's.
-        seed: Of fresh weights.
-        **options: Of torchvision's builder, such as min_size and max_size, the size inside.
+        classes: Classes of the weights, without background; None for the 80 of COCO in torchvision's 91 columns.
+        weights: A file as for `load_weights`, such as torchvision's own .pth files; None for fresh weights.
+        threshold: Default of `predict`; None for the model's.
+        seed: Seed of fresh weights.
+        **options: Options of torchvision's builder, such as min_size and max_size, the size inside.
 
     Raises:
         UnknownNameError: There is no such model.
@@ -61,35 +61,40 @@ def torchvision_detector(
     if model not in MODELS:
         raise unknown_name("torchvision detector", model, MODELS)
     if classes is None:
-        named = list(models.get_model_weights(model).DEFAULT.meta["categories"])
-        columns = [k for k, name in enumerate(named) if name not in ("__background__", "N/A")]
-        count = len(named)
-        classes = [named[k] for k in columns]
+        category_names = list(models.get_model_weights(model).DEFAULT.meta["categories"])
+        columns = [index for index, name in enumerate(category_names) if name not in ("__background__", "N/A")]
+        count = len(category_names)
+        classes = [category_names[index] for index in columns]
     else:
         if not classes or len(set(classes)) != len(classes) or isinstance(classes, str):
             raise ConfigError(f"{model}: classes must be distinct names, at least one")
         columns, count = list(range(1, len(classes) + 1)), len(classes) + 1
     _check_options(model, options)
+    # Fresh weights depend on the seed alone, and the global generator stays unchanged.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            built = getattr(detection, model)(weights=None, weights_backbone=None, num_classes=count, **options)
+            network = getattr(detection, model)(weights=None, weights_backbone=None, num_classes=count, **options)
         except (TypeError, ValueError) as error:
             raise ConfigError(f"torchvision:{model}: {' '.join(str(error).split())}") from None
-    detector = wrap(built, classes, columns, name=f"torchvision:{model}", threshold=threshold)
+    detector = wrap(network, classes, columns, name=f"torchvision:{model}", threshold=threshold)
     if weights is not None:
         fit_torchvision(detector, load_weights(weights), weights)
     return detector
 
 
 def _check_options(model: str, options: Iterable[str]) -> None:
-    """ConfigError: an option that torchvision's builder would let pass without a word."""
-    owners = {"fasterrcnn": detection.FasterRCNN, "fcos": detection.FCOS, "retinanet": detection.RetinaNet}
-    owner = owners.get(model.split("_", maxsplit=1)[0], detection.ssd.SSD)
-    known = {n for f in (getattr(detection, model), owner, GeneralizedRCNNTransform) for n in signature(f).parameters}
+    """Raise ConfigError for an option that torchvision's builder would silently ignore."""
+    model_classes = {"fasterrcnn": detection.FasterRCNN, "fcos": detection.FCOS, "retinanet": detection.RetinaNet}
+    model_class = model_classes.get(model.split("_", maxsplit=1)[0], detection.ssd.SSD)
+    option_names = {
+        parameter_name
+        for builder in (getattr(detection, model), model_class, GeneralizedRCNNTransform)
+        for parameter_name in signature(builder).parameters
+    }
     for key in options:
-        if key not in known:
-            close = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.3)
+        if key not in option_names:
+            close = difflib.get_close_matches(key, sorted(option_names), n=3, cutoff=0.3)
             hint = f"; closest: {', '.join(close)}" if close else ""
             raise ConfigError(f"torchvision:{model}: no option '{key}'{hint}")
 
@@ -97,14 +102,19 @@ def _check_options(model: str, options: Iterable[str]) -> None:
 def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], where: str | Path) -> None:
     """Copy weights with torchvision's own names into the detector.
 
+    Args:
+        detector: The detector.
+        state: Tensors by name.
+        where: Origin of the weights, for messages.
+
     Raises:
-        FormatError: The weights do not fit; `where` names them in the message.
+        FormatError: The weights do not fit.
     """
-    frozen = not any(key.endswith(COUNTER) for key in state)
-    if frozen and detector.name.removeprefix("torchvision:") in NO_EPS:
-        for part in detector.model.modules():
-            if isinstance(part, nn.BatchNorm2d):
-                part.eps = 0.0
+    has_frozen_norms = not any(key.endswith(COUNTER) for key in state)
+    if has_frozen_norms and detector.name.removeprefix("torchvision:") in NO_EPS:
+        for submodule in detector.model.modules():
+            if isinstance(submodule, nn.BatchNorm2d):
+                submodule.eps = 0.0
     if not any(key.startswith("model.") for key in state):
         state = {f"model.{key}": value for key, value in state.items()}
     fit_state(detector, state, where)
@@ -118,14 +128,14 @@ def wrap(
     name: str = "torchvision",
     threshold: float | None = None,
 ) -> OneStage | TwoStage:
-    """A model of torchvision's classes FCOS, RetinaNet, SSD or FasterRCNN that you built yourself, as a detector.
+    """Wrap a user-built FCOS, RetinaNet, SSD or FasterRCNN of torchvision as a detector.
 
     Args:
         model: The model.
         classes: Names of the classes, without background.
-        columns: Columns of the head that belong to the classes; None: 1, 2, ...
-        name: What tables call it.
-        threshold: Default of `predict`; None: the model's.
+        columns: Columns of the head that belong to the classes; None for 1, 2, ...
+        name: Name in tables.
+        threshold: Default of `predict`; None for the model's.
 
     Raises:
         ConfigError: The model is of another class.

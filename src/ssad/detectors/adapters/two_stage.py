@@ -1,12 +1,12 @@
 """Faster R-CNN of torchvision as a detector whose places are its proposals.
 
-What is reduced, so that a two-stage model fits the protocol:
+The two-stage model is adapted to the protocol as follows:
 - Places are the proposals of the first stage, best first, K for every image (`Dense.logit` is -30 in places that an
-  image does not fill). They differ from image to image, so `Dense.place` is the picture's middle and `stride` its
-  larger side. Which boxes are proposed is a choice through which no gradient flows, as in the source.
-- In training the source draws at random the anchors and proposals that count (256 and 512 an image), and adds the true
-  boxes to the proposals. Here every one counts, weighted so that the loss is the expected value over those draws; the
-  truth is not added, but the proposal that overlaps an object most answers for it in any case.
+  image does not fill). They differ from image to image, so `Dense.place` is the centre of the image and `stride` its
+  larger side. No gradient flows through the choice of proposals, as in the source.
+- In training the source samples the anchors and proposals that count (256 and 512 an image), and adds the true boxes
+  to the proposals. Here all of them count, weighted so that the loss is the expected value over the samples. True
+  boxes are not added, but the proposal that overlaps an object most is always assigned to it.
 - Images run one by one: proposals are chosen by rank, and the rounding of a larger batch could change the choice.
 """
 
@@ -28,7 +28,7 @@ from ssad.detectors.adapters.common import Adapter, check_images, check_truth, l
 from ssad.detectors.adapters.torchvision import full
 from ssad.detectors.yolo.assign import Targets
 
-NONE = -30.0  # the logit of a place that is not filled
+NONE = -30.0  # logit of a place without proposal; its sigmoid is 0 but for 1e-13
 SMALLEST = 1e-2
 BETA = 1 / 9
 
@@ -55,7 +55,7 @@ class TwoStage(Adapter):
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> TwoStage:
-        """As any module; resizing and the number of proposals stay those of evaluation."""
+        """Set the mode of the modules; resizing and number of proposals stay those of evaluation."""
         super().train(mode)
         self.model.transform.training = False
         self.model.rpn.training = False
@@ -68,9 +68,14 @@ class TwoStage(Adapter):
             ConfigError: The images have another shape or type.
         """
         size = check_images(self.name, images)
-        rows = [self._one(image) for image in torch.split(images.to(next(self.model.parameters()).dtype), 1)]
-        maps = {name: torch.cat([row[name] for row in rows]) for name in rows[0] if name not in ("anchors", "inside")}
-        anchors, inside = rows[0]["anchors"], rows[0]["inside"].tolist()
+        # One by one, see the module: batching could change the choice of proposals.
+        image_maps = [self._one(image) for image in torch.split(images.to(next(self.model.parameters()).dtype), 1)]
+        maps = {
+            name: torch.cat([maps_of_image[name] for maps_of_image in image_maps])
+            for name in image_maps[0]
+            if name not in ("anchors", "inside")
+        }
+        anchors, inside = image_maps[0]["anchors"], image_maps[0]["inside"].tolist()
         scale = scale_of((inside[0], inside[1]), size, anchors)
         filled = maps["filled"]
         logit = log_odds(maps["class_logits"])[..., self.columns].masked_fill(~filled[..., None], NONE)
@@ -78,16 +83,17 @@ class TwoStage(Adapter):
         boxes = self._boxes(maps["box_regression"], maps["proposals"])
         box = boxes.gather(2, column[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
         count = filled.shape[1]
-        middle = torch.tensor([size[1] / 2, size[0] / 2], device=box.device, dtype=box.dtype)
+        centre = torch.tensor([size[1] / 2, size[0] / 2], device=box.device, dtype=box.dtype)
         features = [name for name in maps if name.startswith("feature")]
         return Dense(
             logit=logit,
             quality=None,
             box=torch.where(filled[..., None], box, 0.0) / scale,
-            place=middle.expand(count, 2),
+            place=centre.expand(count, 2),
             stride=torch.full((count,), float(max(size)), device=box.device),
             level=torch.zeros(count, dtype=torch.int64, device=box.device),
-            maps={n: [v] for n, v in maps.items() if n not in features} | {"anchors": [anchors], "scale": [scale]},
+            maps={map_name: [map_value] for map_name, map_value in maps.items() if map_name not in features}
+            | {"anchors": [anchors], "scale": [scale]},
             features=tuple(maps[name] for name in features),
             size=size,
         )
@@ -100,36 +106,40 @@ class TwoStage(Adapter):
         levels = list(features.values())
         scores, regressions = rpn.head(levels)
         anchors = full(rpn.anchor_generator(batch, levels)[0])
-        counts = [s.shape[1] * s.shape[2] * s.shape[3] for s in scores]
+        counts = [level_scores.shape[1] * level_scores.shape[2] * level_scores.shape[3] for level_scores in scores]
         objectness, regression = concat_box_prediction_layers(scores, regressions)
         objectness, regression = full(objectness), full(regression)
         with torch.no_grad():
             proposals = rpn.box_coder.decode(regression.detach(), [anchors]).view(1, -1, 4)
-            chosen, _ = rpn.filter_proposals(proposals, objectness.detach()[None], batch.image_sizes, counts)
-        pooled = roi.box_head(roi.box_roi_pool(features, [c.to(levels[0].dtype) for c in chosen], batch.image_sizes))
+            selected, _ = rpn.filter_proposals(proposals, objectness.detach()[None], batch.image_sizes, counts)
+        pooled = roi.box_head(
+            roi.box_roi_pool(
+                features, [proposal_boxes.to(levels[0].dtype) for proposal_boxes in selected], batch.image_sizes
+            )
+        )
         logit, boxes = roi.box_predictor(pooled)
-        empty = rpn.post_nms_top_n() - len(chosen[0])
+        empty_count = rpn.post_nms_top_n() - len(selected[0])
 
         def fill(value: Tensor) -> Tensor:
-            return functional.pad(full(value), (0, 0, 0, empty))[None]
+            return functional.pad(full(value), (0, 0, 0, empty_count))[None]
 
-        filled = torch.arange(len(chosen[0]) + empty, device=image.device) < len(chosen[0])
-        found = {
+        filled = torch.arange(len(selected[0]) + empty_count, device=image.device) < len(selected[0])
+        outputs = {
             "class_logits": fill(logit),
             "box_regression": fill(boxes),
-            "proposals": fill(chosen[0]),
+            "proposals": fill(selected[0]),
             "filled": filled[None],
             "objectness": objectness[None, :, 0],
             "rpn_regression": regression[None],
             "anchors": anchors,
             "inside": torch.tensor(batch.image_sizes[0]),
         }
-        return found | {f"feature{k}": value for k, value in enumerate(levels)}
+        return outputs | {f"feature{level}": value for level, value in enumerate(levels)}
 
     def _boxes(self, regression: Tensor, proposals: Tensor) -> Tensor:
-        """Boxes [B, K, columns, 4] in the network's input."""
-        flat = self.model.roi_heads.box_coder.decode(regression.flatten(0, 1), [proposals.reshape(-1, 4)])
-        box: Tensor = flat.view(*regression.shape[:2], -1, 4)
+        """Return the boxes [B, K, columns, 4] of all classes in the network's input."""
+        flat_boxes = self.model.roi_heads.box_coder.decode(regression.flatten(0, 1), [proposals.reshape(-1, 4)])
+        box: Tensor = flat_boxes.view(*regression.shape[:2], -1, 4)
         return box
 
     def choose(self, dense: Dense, least: float) -> list[Detections]:
@@ -138,12 +148,12 @@ class TwoStage(Adapter):
         boxes = boxes / dense.maps["scale"][0]
         roi = self.model.roi_heads
         limit = dense.box.new_tensor([dense.size[1], dense.size[0]] * 2)
-        found = []
+        detections = []
         for score, box, filled in zip(dense.logit.sigmoid(), boxes, dense.maps["filled"][0], strict=True):
-            extent = box.clamp(min=0).minimum(limit)
-            large = ((extent[..., 2:] - extent[..., :2]) * dense.maps["scale"][0][:2] >= SMALLEST).all(-1)
-            place, label = ((score > least) & filled[:, None] & large).nonzero(as_tuple=True)
-            found.append(
+            clipped = box.clamp(min=0).minimum(limit)
+            is_large = ((clipped[..., 2:] - clipped[..., :2]) * dense.maps["scale"][0][:2] >= SMALLEST).all(-1)
+            place, label = ((score > least) & filled[:, None] & is_large).nonzero(as_tuple=True)
+            detections.append(
                 suppress(
                     score[place, label],
                     label,
@@ -153,7 +163,7 @@ class TwoStage(Adapter):
                     size=dense.size,
                 )
             )
-        return found
+        return detections
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
@@ -166,20 +176,27 @@ class TwoStage(Adapter):
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
         label, owner, target = self._second(dense, targets, targets.label)
         rows = []
-        for k, one in enumerate(truth):
-            real = len(one.label)
-            if not real:
-                zero = torch.zeros(len(anchors), dtype=torch.int64, device=anchors.device)
-                rows.append((zero, torch.zeros_like(anchors)))
+        for image_index, image_truth in enumerate(truth):
+            object_count = len(image_truth.label)
+            if not object_count:
+                background = torch.zeros(len(anchors), dtype=torch.int64, device=anchors.device)
+                rows.append((background, torch.zeros_like(anchors)))
                 continue
-            first = self.model.rpn.proposal_matcher(box_iou(targets.box[k, :real], anchors))
-            near, _ = label_owned(first, torch.ones_like(targets.label[k]), targets.crowd[k])
-            rows.append((torch.where(near == -1, 0, near), targets.box[k, first.clamp(min=0)] / scale))
-        near, far = (torch.stack(column) for column in zip(*rows, strict=True))
+            anchor_owner = self.model.rpn.proposal_matcher(box_iou(targets.box[image_index, :object_count], anchors))
+            anchor_label, _ = label_owned(
+                anchor_owner, torch.ones_like(targets.label[image_index]), targets.crowd[image_index]
+            )
+            rows.append(
+                (
+                    torch.where(anchor_label == -1, 0, anchor_label),
+                    targets.box[image_index, anchor_owner.clamp(min=0)] / scale,
+                )
+            )
+        anchor_label, anchor_box = (torch.stack(column) for column in zip(*rows, strict=True))
         extra = {
             "box": target / scale,
-            "anchor_label": near,
-            "anchor_box": far,
+            "anchor_label": anchor_label,
+            "anchor_box": anchor_box,
             "proposals": dense.maps["proposals"][0],
         }
         return Assignment(label, owner, tuple(truth), extra)
@@ -187,18 +204,21 @@ class TwoStage(Adapter):
     def _second(self, dense: Dense, targets: Targets, kinds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Label, owner [B, K] and target [B, K, 4] (in the network's input) of the proposals; kinds [B, Q]: classes."""
         rows = []
-        for k, real in enumerate(targets.real.sum(1).tolist()):
-            filled, proposals = dense.maps["filled"][0][k], dense.maps["proposals"][0][k]
-            if not real:
-                none = torch.full_like(filled, -1, dtype=torch.int64)
-                rows.append((none.masked_fill(~filled, -2), none, torch.zeros_like(proposals)))
+        for image_index, object_count in enumerate(targets.real.sum(1).tolist()):
+            filled, proposals = dense.maps["filled"][0][image_index], dense.maps["proposals"][0][image_index]
+            if not object_count:
+                no_owner = torch.full_like(filled, -1, dtype=torch.int64)
+                rows.append((no_owner.masked_fill(~filled, -2), no_owner, torch.zeros_like(proposals)))
                 continue
-            box = targets.box[k, :real]
+            box = targets.box[image_index, :object_count]
             overlap = box_iou(box, proposals).masked_fill(~filled, 0.0)
             owner = self.model.roi_heads.proposal_matcher(overlap)
-            most, best = overlap.max(1)
-            owner[best[most > 0]] = torch.arange(real, device=owner.device)[most > 0]
-            label, owner = label_owned(owner.masked_fill(~filled, -2), kinds[k], targets.crowd[k])
+            largest_overlap, best_proposal = overlap.max(1)
+            # The source adds true boxes to the proposals instead, so that no object goes unmatched.
+            owner[best_proposal[largest_overlap > 0]] = torch.arange(object_count, device=owner.device)[
+                largest_overlap > 0
+            ]
+            label, owner = label_owned(owner.masked_fill(~filled, -2), kinds[image_index], targets.crowd[image_index])
             rows.append((label, owner, torch.where((owner >= 0)[:, None], box[owner.clamp(min=0)], 0.0)))
         label, owner, target = (torch.stack(column) for column in zip(*rows, strict=True))
         return label, owner, target
@@ -206,72 +226,82 @@ class TwoStage(Adapter):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """Training losses: expected values over the random choices of the source; see the module.
+        """Return the training losses: expected values over the random choices of the source; see the module.
 
-        If the proposals are not those of the assignment because the picture has changed, they are matched anew to the
-        same objects, with the classes that the assignment gives them.
+        If the image has changed and its proposals are not those of the assignment, they are matched again to the same
+        objects, with the classes that the assignment gives them.
 
         Returns:
             loss_classifier, loss_box_reg, loss_objectness and loss_rpn_box_reg.
 
         Raises:
-            ConfigError: The assignment was made for pictures of another number or size.
+            ConfigError: The assignment was made for images of another number or size.
         """
         if assignment.label.shape != dense.box.shape[:2]:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         rpn, roi, maps, scale = self.model.rpn, self.model.roi_heads, dense.maps, dense.maps["scale"][0]
         label, target = assignment.label, assignment.extra["box"].to(scale) * scale
+        # An attack changes the image and thereby the proposals, while its assignment stays fixed.
         if not torch.equal(maps["proposals"][0], assignment.extra["proposals"].to(scale)):
             label, target = self._again(dense, assignment)
         column = torch.where(label >= 0, self.columns[label.clamp(min=0)], 0)
-        kind = functional.cross_entropy(maps["class_logits"][0].transpose(1, 2), column, reduction="none")
+        class_loss = functional.cross_entropy(maps["class_logits"][0].transpose(1, 2), column, reduction="none")
         regression = maps["box_regression"][0].reshape(*label.shape, -1, 4)
         regression = regression.gather(2, column[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
-        second = _smooth(roi.box_coder, regression, target, maps["proposals"][0], label >= 0)
-        near = assignment.extra["anchor_label"]
+        box_loss = _smooth(roi.box_coder, regression, target, maps["proposals"][0], label >= 0)
+        anchor_label = assignment.extra["anchor_label"]
         anchors = maps["anchors"][0].expand(len(label), -1, -1)
-        far = assignment.extra["anchor_box"].to(scale) * scale
-        first = _smooth(rpn.box_coder, maps["rpn_regression"][0], far, anchors, near == 1)
-        logit, wanted = maps["objectness"][0], (near == 1).to(scale)
-        seen = functional.binary_cross_entropy_with_logits(logit, wanted, reduction="none")
-        many = _expected(label >= 0, label == -1, roi.fg_bg_sampler)
-        few = _expected(near == 1, near == 0, rpn.fg_bg_sampler)
+        anchor_box = assignment.extra["anchor_box"].to(scale) * scale
+        rpn_box_loss = _smooth(rpn.box_coder, maps["rpn_regression"][0], anchor_box, anchors, anchor_label == 1)
+        logit, is_object = maps["objectness"][0], (anchor_label == 1).to(scale)
+        objectness_loss = functional.binary_cross_entropy_with_logits(logit, is_object, reduction="none")
+        proposal_weights = _expected(label >= 0, label == -1, roi.fg_bg_sampler)
+        anchor_weights = _expected(anchor_label == 1, anchor_label == 0, rpn.fg_bg_sampler)
         parts = {
-            "loss_classifier": (kind * many[0], many[1]),
-            "loss_box_reg": (second * many[0], many[1]),
-            "loss_objectness": (seen * few[0], few[1]),
-            "loss_rpn_box_reg": (first * few[0], few[1]),
+            "loss_classifier": (class_loss * proposal_weights[0], proposal_weights[1]),
+            "loss_box_reg": (box_loss * proposal_weights[0], proposal_weights[1]),
+            "loss_objectness": (objectness_loss * anchor_weights[0], anchor_weights[1]),
+            "loss_rpn_box_reg": (rpn_box_loss * anchor_weights[0], anchor_weights[1]),
         }
         if reduction == "image":
-            return {name: each.sum(1) / drawn.clamp(min=1) for name, (each, drawn) in parts.items()}
-        return {name: each.sum() / drawn.sum().clamp(min=1) for name, (each, drawn) in parts.items()}
+            return {
+                name: weighted_loss.sum(1) / expected_count.clamp(min=1)
+                for name, (weighted_loss, expected_count) in parts.items()
+            }
+        return {
+            name: weighted_loss.sum() / expected_count.sum().clamp(min=1)
+            for name, (weighted_loss, expected_count) in parts.items()
+        }
 
     @torch.no_grad()
     def _again(self, dense: Dense, assignment: Assignment) -> tuple[Tensor, Tensor]:
-        """Label and target of other proposals than those of the assignment."""
+        """Return label and target of proposals other than those of the assignment."""
         scale = dense.maps["scale"][0]
         truth = assignment.truth
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
-        kinds = targets.label.clone()
+        object_labels = targets.label.clone()
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
-        kinds[image, assignment.owner[image, place]] = assignment.label[image, place]
-        label, _, target = self._second(dense, targets, kinds)
+        object_labels[image, assignment.owner[image, place]] = assignment.label[image, place]
+        label, _, target = self._second(dense, targets, object_labels)
         return label, target
 
 
 def _smooth(coder: Any, regression: Tensor, target: Tensor, boxes: Tensor, found: Tensor) -> Tensor:
     """Smooth L1 [B, K] of the encoded boxes where `found`, 0 elsewhere."""
     image, place = found.nonzero(as_tuple=True)
-    wanted = coder.encode_single(target[image, place], boxes[image, place])
-    each = functional.smooth_l1_loss(regression[image, place], wanted, beta=BETA, reduction="none").sum(-1)
-    return torch.zeros_like(regression[..., 0]).index_put((image, place), each)
+    encoded_target = coder.encode_single(target[image, place], boxes[image, place])
+    box_loss = functional.smooth_l1_loss(regression[image, place], encoded_target, beta=BETA, reduction="none").sum(-1)
+    return torch.zeros_like(regression[..., 0]).index_put((image, place), box_loss)
 
 
 def _expected(found: Tensor, background: Tensor, sampler: Any) -> tuple[Tensor, Tensor]:
     """Chance [B, K] that a random choice takes a place, and how many it takes [B]."""
-    size, most = sampler.batch_size_per_image, int(sampler.batch_size_per_image * sampler.positive_fraction)
-    objects, others = found.sum(1), background.sum(1)
-    near = objects.clamp(max=most)
-    far = torch.minimum(others, size - near)
-    chance = found * (near / objects.clamp(min=1))[:, None] + background * (far / others.clamp(min=1))[:, None]
-    return chance, near + far
+    size, max_objects = sampler.batch_size_per_image, int(sampler.batch_size_per_image * sampler.positive_fraction)
+    object_count, background_count = found.sum(1), background.sum(1)
+    sampled_objects = object_count.clamp(max=max_objects)
+    sampled_background = torch.minimum(background_count, size - sampled_objects)
+    probability = (
+        found * (sampled_objects / object_count.clamp(min=1))[:, None]
+        + background * (sampled_background / background_count.clamp(min=1))[:, None]
+    )
+    return probability, sampled_objects + sampled_background

@@ -60,35 +60,35 @@ def ultralytics_detector(
     input_width: int | None = None,
     seed: int = 0,
 ) -> Ultralytics:
-    """A model by the name of one of the package's own descriptions, such as yolov8n or yolov5nu.
+    """Build a model from one of the package's own model descriptions, such as yolov8n or yolov5nu.
 
     Args:
         model: Name of the description.
         classes: Names of the classes.
-        weights: A file as `load_weights` takes it, including .pt files of the package (only their tensors are read, by
-            their names; nothing in them runs); None: fresh ones.
-        input_width: Width to which pictures are resized inside; None: they are not.
-        seed: Of fresh weights.
+        weights: A file as for `load_weights`, including .pt files of the package (only their tensors are read, by
+            name; nothing in them runs); None for fresh weights.
+        input_width: Width to which images are resized inside; None to keep their size.
+        seed: Seed of fresh weights.
 
     Raises:
-        ConfigError: The package is not installed, or knows no such detection model.
+        ConfigError: The package is not installed, or has no such detection model.
         FormatError: The weights cannot be read, or do not fit.
     """
-    package = load_package()
+    networks = load_package()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            network = package.DetectionModel(f"{model.removesuffix('.yaml')}.yaml", nc=len(classes), verbose=False)
+            network = networks.DetectionModel(f"{model.removesuffix('.yaml')}.yaml", nc=len(classes), verbose=False)
         except Exception as error:  # what the package raises for an unknown name differs between versions
-            text = " ".join(str(error).split())[:100]
-            raise ConfigError(f"ultralytics: no detection model '{model}' could be built: {text}") from None
+            reason = " ".join(str(error).split())[:100]
+            raise ConfigError(f"ultralytics: no detection model '{model}' could be built: {reason}") from None
     detector = Ultralytics(network, classes, name=f"ultralytics:{model}", input_width=input_width)
     with torch.no_grad():
         detector.dense(torch.zeros(1, 3, 64, 64))  # heads of other kinds are refused here
     if weights is not None:
         state = load_weights(weights)
-        named = {key if key.startswith("model.") else f"model.{key}": value for key, value in state.items()}
-        fit_state(detector, {f"network.{key}": value for key, value in named.items()}, weights)
+        prefixed = {key if key.startswith("model.") else f"model.{key}": value for key, value in state.items()}
+        fit_state(detector, {f"network.{key}": value for key, value in prefixed.items()}, weights)
     return detector
 
 
@@ -100,6 +100,7 @@ def load_package() -> Any:
     """
     import cv2
 
+    # Everything that the import changes, see the module.
     held = dict(os.environ)
     folder = tempfile.mkdtemp(prefix="ssad-ultralytics-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -165,12 +166,12 @@ class Ultralytics(Adapter):
         size = check_images(self.name, images)
         inside, scale = size_inside(size, self.input_width), self._scale(size, images.device)
         images = images.to(next(self.network.parameters()).dtype)
-        step = max(32, *self.strides)
-        scores, boxes, features = self._heads(resize_and_pad(images, inside, multiple=step, grey=GREY))
+        multiple = max(32, *self.strides)
+        scores, boxes, features = self._heads(resize_and_pad(images, inside, multiple=multiple, grey=GREY))
         place, stride, level = self._places(features)
         distance = _expectation(boxes) * stride
-        middle = place.T
-        low, high = middle - distance[:, :2], middle + distance[:, 2:]
+        centre = place.T
+        low, high = centre - distance[:, :2], centre + distance[:, 2:]
         return Dense(
             logit=scores.transpose(1, 2),
             quality=None,
@@ -189,15 +190,15 @@ class Ultralytics(Adapter):
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """Task-aligned target assignment (TOOD), which depends on the predictions of the network.
+        """Assign targets by task alignment (TOOD), which depends on the predictions of the network.
 
         Of the cells inside an object, the ten with the largest score^0.5 * CIoU^6 are assigned to it; a cell that
-        several objects claim goes to the one it overlaps most. extra: box [B, P, 4] in pixels of the picture; weight
+        several objects claim goes to the one it overlaps most. extra: box [B, P, 4] in pixels of the image; weight
         [B, P]: target score of each place.
         """
         scale = self._scale(dense.size, dense.box.device).to(dense.box)
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
-        rows = [self._assign_one(dense, targets, k, scale) for k in range(len(truth))]
+        rows = [self._assign_one(dense, targets, image_index, scale) for image_index in range(len(truth))]
         label, owner, box, weight = (torch.stack(column) for column in zip(*rows, strict=True))
         return Assignment(label, owner, tuple(truth), {"box": box / scale, "weight": weight})
 
@@ -205,34 +206,41 @@ class Ultralytics(Adapter):
         self, dense: Dense, targets: Targets, k: int, scale: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Label, owner, box and weight of the places of image k."""
-        real = int(targets.real[k].sum())
+        object_count = int(targets.real[k].sum())
         predicted, place = dense.box[k] * scale, dense.place * scale[:2]
-        none = torch.full(place.shape[:1], -1, dtype=torch.int64, device=place.device)
-        if not real:
-            return none, none, torch.zeros_like(predicted), torch.zeros_like(predicted[:, 0])
-        box, kind, crowd = targets.box[k, :real], targets.label[k, :real], targets.crowd[k, :real]
-        inside = torch.cat((place[:, None] - box[:, :2], box[:, 2:] - place[:, None]), -1).amin(-1) > 1e-9
-        pairs = (len(place), real, 4)
-        overlap = (
-            ciou(predicted[:, None].expand(pairs).reshape(-1, 4), box.expand(pairs).reshape(-1, 4))
-            .clamp(min=0)
-            .view(len(place), real)
+        no_owner = torch.full(place.shape[:1], -1, dtype=torch.int64, device=place.device)
+        if not object_count:
+            return no_owner, no_owner, torch.zeros_like(predicted), torch.zeros_like(predicted[:, 0])
+        box, object_labels, crowd = (
+            targets.box[k, :object_count],
+            targets.label[k, :object_count],
+            targets.crowd[k, :object_count],
         )
-        overlap = overlap * inside
-        aligned = dense.logit[k].sigmoid()[:, kind] ** ALPHA * overlap**BETA
-        best = aligned.topk(min(TOP, len(place)), 0).indices
-        wanted = torch.zeros_like(inside).scatter_(0, best, True) & inside
-        contested = torch.where(wanted, overlap, -1.0)
-        contested[wanted.sum(1) > 1] = overlap[wanted.sum(1) > 1]  # the most overlap of all, as the source does
-        owner = torch.where(wanted.any(1), contested.argmax(1), -1)
+        is_inside = torch.cat((place[:, None] - box[:, :2], box[:, 2:] - place[:, None]), -1).amin(-1) > 1e-9
+        pair_shape = (len(place), object_count, 4)
+        overlap = (
+            ciou(predicted[:, None].expand(pair_shape).reshape(-1, 4), box.expand(pair_shape).reshape(-1, 4))
+            .clamp(min=0)
+            .view(len(place), object_count)
+        )
+        overlap = overlap * is_inside
+        alignment = dense.logit[k].sigmoid()[:, object_labels] ** ALPHA * overlap**BETA
+        best_cells = alignment.topk(min(TOP, len(place)), 0).indices
+        is_claimed = torch.zeros_like(is_inside).scatter_(0, best_cells, True) & is_inside
+        claim_overlap = torch.where(is_claimed, overlap, -1.0)
+        claim_overlap[is_claimed.sum(1) > 1] = overlap[
+            is_claimed.sum(1) > 1
+        ]  # the most overlap of all, as the source does
+        owner = torch.where(is_claimed.any(1), claim_overlap.argmax(1), -1)
         index = owner.clamp(min=0)
-        mine = functional.one_hot(index, real).bool() & (owner >= 0)[:, None]
-        strength = torch.where(mine, aligned, 0.0)
-        norm = torch.where(mine, overlap, 0.0).amax(0) / (strength.amax(0) + 1e-9)
-        weight = (strength * norm).amax(1)
-        label, owner = label_owned(owner, kind, crowd)
-        found = label >= 0
-        return label, owner, torch.where(found[:, None], box[index], 0.0), torch.where(found, weight, 0.0)
+        is_owned = functional.one_hot(index, object_count).bool() & (owner >= 0)[:, None]
+        owned_alignment = torch.where(is_owned, alignment, 0.0)
+        # TOOD: the best place of an object gets its largest overlap as target score.
+        normaliser = torch.where(is_owned, overlap, 0.0).amax(0) / (owned_alignment.amax(0) + 1e-9)
+        weight = (owned_alignment * normaliser).amax(1)
+        label, owner = label_owned(owner, object_labels, crowd)
+        is_object = label >= 0
+        return label, owner, torch.where(is_object[:, None], box[index], 0.0), torch.where(is_object, weight, 0.0)
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
@@ -250,58 +258,61 @@ class Ultralytics(Adapter):
         """
         if assignment.label.shape != dense.box.shape[:2]:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
-        images = len(dense.box)
+        image_count = len(dense.box)
         scale = self._scale(dense.size, dense.box.device).to(dense.box)
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
         weight = assignment.extra["weight"].to(dense.box)[image, place]
         target = assignment.extra["box"].to(dense.box)[image, place] * scale
         predicted = dense.box[image, place] * scale
-        wanted = torch.zeros_like(dense.logit)
-        wanted[image, place, assignment.label[image, place]] = weight
-        every = functional.binary_cross_entropy_with_logits(dense.logit, wanted, reduction="none").sum(-1)
+        target_scores = torch.zeros_like(dense.logit)
+        target_scores[image, place, assignment.label[image, place]] = weight
+        class_loss = functional.binary_cross_entropy_with_logits(dense.logit, target_scores, reduction="none").sum(-1)
         bins = dense.maps["boxes"][0].transpose(1, 2)[image, place]
         stride = dense.stride[place, None] * scale[0]
-        middle = dense.place[place] * scale[:2]
-        sides = torch.cat((middle - target[:, :2], target[:, 2:] - middle), 1) / stride
+        centre = dense.place[place] * scale[:2]
+        sides = torch.cat((centre - target[:, :2], target[:, 2:] - centre), 1) / stride
         parts = {
-            "box": sums(BOX_GAIN * (1 - ciou(predicted, target)) * weight, image, images),
-            "cls": CLASS_GAIN * torch.where(assignment.label != -2, every, 0.0).sum(1),
-            "dfl": sums(DFL_GAIN * _distribution_loss(bins, sides) * weight, image, images),
+            "box": sums(BOX_GAIN * (1 - ciou(predicted, target)) * weight, image, image_count),
+            "cls": CLASS_GAIN * torch.where(assignment.label != -2, class_loss, 0.0).sum(1),
+            "dfl": sums(DFL_GAIN * _distribution_loss(bins, sides) * weight, image, image_count),
         }
-        total = sums(weight, image, images)
+        total = sums(weight, image, image_count)
         if reduction == "image":
             return {name: part / total.clamp(min=1) for name, part in parts.items()}
         return {name: part.sum() / total.sum().clamp(min=1) for name, part in parts.items()}
 
     def _heads(self, images: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Raw class maps [B, C, P], raw distributions of the sides [B, 4 * bins, P], and the maps before the head."""
-        answer: Any = self.network(images)
-        if isinstance(answer, tuple) and len(answer) == 2:
-            answer = answer[1]
+        """Return raw class maps [B, C, P], raw side distributions [B, 4 * bins, P], and the maps before the head."""
+        head_output: Any = self.network(images)
+        # In eval mode the network returns (decoded boxes, raw outputs).
+        if isinstance(head_output, tuple) and len(head_output) == 2:
+            head_output = head_output[1]
         count = len(self.classes)
-        if isinstance(answer, dict) and {"scores", "boxes", "feats"} <= answer.keys():
-            scores, boxes, features = answer["scores"], answer["boxes"], list(answer["feats"])
-        elif isinstance(answer, list) and all(isinstance(part, Tensor) and part.ndim == 4 for part in answer):
-            whole = torch.cat([part.flatten(2) for part in answer], 2)
-            boxes, scores = whole[:, :-count], whole[:, -count:]
-            features = answer
+        if isinstance(head_output, dict) and {"scores", "boxes", "feats"} <= head_output.keys():
+            scores, boxes, features = head_output["scores"], head_output["boxes"], list(head_output["feats"])
+        elif isinstance(head_output, list) and all(
+            isinstance(level_output, Tensor) and level_output.ndim == 4 for level_output in head_output
+        ):
+            flat_outputs = torch.cat([level_output.flatten(2) for level_output in head_output], 2)
+            boxes, scores = flat_outputs[:, :-count], flat_outputs[:, -count:]
+            features = head_output
         else:
             raise ConfigError(f"{self.name}: its head answers in a way that is not known here; use YOLOv8 or YOLO11")
-        cells = sum(part.shape[2] * part.shape[3] for part in features)
+        cells = sum(level_output.shape[2] * level_output.shape[3] for level_output in features)
         if scores.shape[1:] != (count, cells) or boxes.shape[1] % 4 or boxes.shape[1] < 8:
             raise ConfigError(f"{self.name}: its head has other outputs than those of YOLOv8 and YOLO11")
         return scores.float() if scores.dtype is not torch.float64 else scores, boxes.to(scores.dtype), features
 
     def _places(self, features: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Middle [P, 2] (x, y), stride [P] and level [P] of the cells, in the network's input."""
+        """Return centre [P, 2] (x, y), stride [P] and level [P] of the cells, in the network's input."""
         place, stride, level = [], [], []
-        for k, (part, step) in enumerate(zip(features, self.strides, strict=True)):
-            rows, columns = part.shape[2:]
-            y = (torch.arange(rows, device=part.device) + 0.5) * step
-            x = (torch.arange(columns, device=part.device) + 0.5) * step
+        for level_index, (feature, level_stride) in enumerate(zip(features, self.strides, strict=True)):
+            rows, columns = feature.shape[2:]
+            y = (torch.arange(rows, device=feature.device) + 0.5) * level_stride
+            x = (torch.arange(columns, device=feature.device) + 0.5) * level_stride
             place.append(torch.stack((x.expand(rows, columns), y[:, None].expand(rows, columns)), -1).reshape(-1, 2))
-            stride.append(torch.full((rows * columns,), float(step), device=part.device))
-            level.append(torch.full((rows * columns,), k, device=part.device))
+            stride.append(torch.full((rows * columns,), float(level_stride), device=feature.device))
+            level.append(torch.full((rows * columns,), level_index, device=feature.device))
         return torch.cat(place), torch.cat(stride), torch.cat(level)
 
     def _scale(self, size: tuple[int, int], device: torch.device) -> Tensor:
@@ -312,19 +323,23 @@ class Ultralytics(Adapter):
 
 def _expectation(boxes: Tensor) -> Tensor:
     """Distances [B, 4, P] in strides from their distributions [B, 4 * bins, P] (generalised focal loss, eq. 5)."""
-    split = boxes.unflatten(1, (4, -1))  # type: ignore[no-untyped-call]
-    values = torch.arange(split.shape[2], device=boxes.device, dtype=boxes.dtype)
-    result: Tensor = (split.softmax(2) * values[:, None]).sum(2)
-    return result
+    distributions = boxes.unflatten(1, (4, -1))  # type: ignore[no-untyped-call]
+    values = torch.arange(distributions.shape[2], device=boxes.device, dtype=boxes.dtype)
+    expected: Tensor = (distributions.softmax(2) * values[:, None]).sum(2)
+    return expected
 
 
 def _distribution_loss(bins: Tensor, sides: Tensor) -> Tensor:
-    """Distribution focal loss [M] (the same, eq. 6), mean over the four sides: bins [M, 4 * n], sides [M, 4]."""
+    """Return the distribution focal loss [M] (eq. 6), mean over the four sides: bins [M, 4 * n], sides [M, 4]."""
     count = bins.shape[1] // 4
+    # Below the last bin, so that there is always a bin above.
     sides = sides.clamp(0, count - 1 - 0.01)
     low = sides.floor()
-    share = low + 1 - sides
-    logs = bins.view(len(bins), 4, count).log_softmax(-1)
-    at = low.long()[..., None]
-    near, far = logs.gather(-1, at)[..., 0], logs.gather(-1, at + 1)[..., 0]
-    return -(near * share + far * (1 - share)).mean(-1)
+    lower_share = low + 1 - sides
+    log_probabilities = bins.view(len(bins), 4, count).log_softmax(-1)
+    lower_bin = low.long()[..., None]
+    log_lower, log_upper = (
+        log_probabilities.gather(-1, lower_bin)[..., 0],
+        log_probabilities.gather(-1, lower_bin + 1)[..., 0],
+    )
+    return -(log_lower * lower_share + log_upper * (1 - lower_share)).mean(-1)

@@ -1,1 +1,1 @@
-"""Monocular 3D detection as FCOS3D and PGD-Det do it (mmdetection3d 1.4)."""
+"""Monocular 3D detection by FCOS3D and PGD-Det, as in mmdetection3d 1.4."""

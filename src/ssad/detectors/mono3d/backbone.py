@@ -1,4 +1,4 @@
-"""Trunks: ResNet in caffe style with modulated deformable convolutions, and a light one of basic blocks.
+"""Backbones: ResNet in caffe style with modulated deformable convolutions, and a light one of basic blocks.
 
 Sources: He et al. 2016 (caffe style: the stride sits on the first 1 x 1 convolution); Zhu et al. 2019 (DCNv2).
 """
@@ -26,19 +26,28 @@ class DeformConv(nn.Module):
         self.bias = nn.Parameter(torch.zeros(outside)) if bias else None
         self.conv_offset = nn.Conv2d(inside, 27, 3, stride, 1)
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
+        # Zero offsets and masks of 0.5 make it an ordinary convolution with half the weights.
         nn.init.zeros_(self.conv_offset.weight)
         nn.init.zeros_(self.conv_offset.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> [B, O, H / stride, W / stride]."""
+        """Return [B, O, H / stride, W / stride] from [B, C, H, W]."""
+        # Offsets are positions in pixels; mixed precision would round them.
         with torch.autocast(x.device.type, enabled=False):
             if x.dtype in {torch.float16, torch.bfloat16}:
                 x = x.float()
-            shift = self.conv_offset(x)
-            result: Tensor = deform_conv2d(
-                x, shift[:, :18].contiguous(), self.weight, self.bias, self.stride, 1, 1, shift[:, 18:].sigmoid()
+            offsets_and_masks = self.conv_offset(x)
+            output: Tensor = deform_conv2d(
+                x,
+                offsets_and_masks[:, :18].contiguous(),
+                self.weight,
+                self.bias,
+                self.stride,
+                1,
+                1,
+                offsets_and_masks[:, 18:].sigmoid(),
             )
-        return result
+        return output
 
 
 class Bottleneck(nn.Module):
@@ -61,11 +70,11 @@ class Bottleneck(nn.Module):
             )
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> [B, 4 width, H / stride, W / stride]."""
-        kept = x if self.downsample is None else self.downsample(x)
+        """Return [B, 4 width, H / stride, W / stride] from [B, C, H, W]."""
+        shortcut = x if self.downsample is None else self.downsample(x)
         x = functional.relu(self.bn1(self.conv1(x)))
         x = functional.relu(self.bn2(self.conv2(x)))
-        return functional.relu(self.bn3(self.conv3(x)) + kept)
+        return functional.relu(self.bn3(self.conv3(x)) + shortcut)
 
 
 class Basic(nn.Module):
@@ -82,40 +91,42 @@ class Basic(nn.Module):
             self.downsample = nn.Sequential(nn.Conv2d(inside, width, 1, stride, bias=False), nn.BatchNorm2d(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> [B, width, H / stride, W / stride]."""
-        kept = x if self.downsample is None else self.downsample(x)
+        """Return [B, width, H / stride, W / stride] from [B, C, H, W]."""
+        shortcut = x if self.downsample is None else self.downsample(x)
         x = functional.relu(self.bn1(self.conv1(x)))
-        return functional.relu(self.bn2(self.conv2(x)) + kept)
+        return functional.relu(self.bn2(self.conv2(x)) + shortcut)
 
 
 class Backbone(nn.Module):
-    """Images [B, 3, H, W] -> maps at strides 8, 16, 32; `out_channels` says how many channels each has."""
+    """Maps at strides 8, 16 and 32 from images [B, 3, H, W]; `out_channels` holds the channels of each."""
 
     def __init__(self, depth: int, *, width: int = 64) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, width, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
-        inside = width
+        in_channels = width
         for stage in range(4):
-            narrow = width << stage
+            stage_width = width << stage
             blocks: list[nn.Module] = []
-            for k in range(BLOCKS[depth][stage] if depth in BLOCKS else 2):
-                stride = 2 if stage and not k else 1
+            for block_index in range(BLOCKS[depth][stage] if depth in BLOCKS else 2):
+                stride = 2 if stage and not block_index else 1
                 if depth in BLOCKS:
-                    blocks.append(Bottleneck(inside, narrow, stride=stride, deformable=stage >= 2, fit=not k))
-                    inside = 4 * narrow
+                    blocks.append(
+                        Bottleneck(in_channels, stage_width, stride=stride, deformable=stage >= 2, fit=not block_index)
+                    )
+                    in_channels = 4 * stage_width
                 else:
-                    blocks.append(Basic(inside, narrow, stride=stride))
-                    inside = narrow
+                    blocks.append(Basic(in_channels, stage_width, stride=stride))
+                    in_channels = stage_width
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
-        wide = 4 if depth in BLOCKS else 1
-        self.out_channels = tuple(wide * (width << stage) for stage in (1, 2, 3))
-        for part in self.modules():
-            if isinstance(part, nn.Conv2d) and part.bias is None:
-                nn.init.kaiming_normal_(part.weight, mode="fan_out", nonlinearity="relu")
+        expansion = 4 if depth in BLOCKS else 1
+        self.out_channels = tuple(expansion * (width << stage) for stage in (1, 2, 3))
+        for submodule in self.modules():
+            if isinstance(submodule, nn.Conv2d) and submodule.bias is None:
+                nn.init.kaiming_normal_(submodule.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """Maps of the last three stages."""
+        """Return the maps of the last three stages."""
         x = functional.max_pool2d(functional.relu(self.bn1(self.conv1(x))), 3, 2, 1)
         maps = []
         for stage in range(1, 5):
@@ -125,7 +136,7 @@ class Backbone(nn.Module):
 
 
 class Conv(nn.Module):
-    """A convolution under the name `conv`, as the neck's weights are called."""
+    """A convolution under the name `conv`, which the published weights of the neck use."""
 
     def __init__(self, inside: int, outside: int, size: int, stride: int = 1) -> None:
         super().__init__()
@@ -134,25 +145,28 @@ class Conv(nn.Module):
         nn.init.zeros_(self.conv.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> [B, O, H / stride, W / stride]."""
-        result: Tensor = self.conv(x)
-        return result
+        """Return [B, O, H / stride, W / stride] from [B, C, H, W]."""
+        output: Tensor = self.conv(x)
+        return output
 
 
 class Neck(nn.Module):
-    """Feature pyramid (Lin et al. 2017) over three maps; further levels from the last output, with a ReLU between."""
+    """Feature pyramid (Lin et al. 2017) over three maps; further levels follow from the last output, with a ReLU."""
 
     def __init__(self, inside: tuple[int, ...], channels: int, levels: int) -> None:
         super().__init__()
-        self.lateral_convs = nn.ModuleList(Conv(c, channels, 1) for c in inside)
-        self.fpn_convs = nn.ModuleList(Conv(channels, channels, 3, 1 if k < 3 else 2) for k in range(levels))
+        self.lateral_convs = nn.ModuleList(Conv(input_channels, channels, 1) for input_channels in inside)
+        self.fpn_convs = nn.ModuleList(Conv(channels, channels, 3, 1 if level < 3 else 2) for level in range(levels))
 
     def forward(self, maps: list[Tensor]) -> list[Tensor]:
-        """One map a level, finest first."""
-        sides = [side(x) for side, x in zip(self.lateral_convs, maps, strict=True)]
-        for k in (1, 0):
-            sides[k] = sides[k] + functional.interpolate(sides[k + 1], sides[k].shape[2:], mode="nearest")
-        found = [conv(x) for conv, x in zip(self.fpn_convs, sides, strict=False)]
-        for k in range(3, len(self.fpn_convs)):
-            found.append(self.fpn_convs[k](found[-1] if k == 3 else functional.relu(found[-1])))
-        return found
+        """Return one map a level, finest first."""
+        laterals = [lateral_conv(x) for lateral_conv, x in zip(self.lateral_convs, maps, strict=True)]
+        # Top-down: each map receives the coarser one before the next finer map reads it.
+        for level in (1, 0):
+            laterals[level] = laterals[level] + functional.interpolate(
+                laterals[level + 1], laterals[level].shape[2:], mode="nearest"
+            )
+        outputs = [conv(x) for conv, x in zip(self.fpn_convs, laterals, strict=False)]
+        for level in range(3, len(self.fpn_convs)):
+            outputs.append(self.fpn_convs[level](outputs[-1] if level == 3 else functional.relu(outputs[-1])))
+        return outputs

@@ -1,4 +1,4 @@
-"""Everything that makes a monocular 3D detector, and the presets.
+"""Configuration of monocular 3D detectors, and the presets.
 
 Sources: Wang et al., FCOS3D (ICCVW 2021); Wang et al., PGD (CoRL 2021); mmdetection3d 1.4, nuScenes configurations.
 """
@@ -45,47 +45,48 @@ class Mono3DConfig:
 
     Attributes:
         name: Name of the detector.
-        trunk: Depth of the ResNet: 101 or 50 (caffe style, deformable in its last two stages), or 18 for the light one
-            of basic blocks.
+        trunk: Depth of the ResNet: 101 or 50 (caffe style, deformable in its last two stages), or 18 for the
+            light one of basic blocks.
         width: Channels of the first stage of the light trunk.
         channels: Channels of neck and heads.
         strides: Stride of each level.
         ranges: Largest distance from a place to a side of its box (pixels) that each level predicts.
         deformable: Whether the second convolutions of the heads are deformable.
         pgd: Whether to predict 2D boxes and depth bins, and to fuse the bins with the regressed depth (PGD).
-        code_weights: Weights in the loss of offset, depth, size, yaw, velocity (and 2D box).
-        threshold: Least score of a detection.
+        code_weights: Loss weights of offset, depth, size, yaw, velocity (and 2D box).
+        threshold: Minimum score of a detection.
         nms: IoU on the ground above which the worse of two boxes of a class is dropped.
-        image_nms: IoU in the image above which the worse of two boxes of a class is dropped as well: two guesses of one
-            object's depth do not overlap on the ground. None: not used, as in the source.
-        vote: IoU in the image from which a box that is dropped has a say in the place, size, velocity and vectors of
-            the yaw of the one of its class that stays, by its score: places beside each other guess one object's
-            distance, and their mean errs less (Gidaris and Komodakis, ICCV 2015). None: not used, as in the source.
-        fade: How scores fall with depth, 1/m: by exp(-fade depth). Far boxes are less often in their place, and without
+        image_nms: IoU in the image above which the worse of two boxes of a class is also dropped: two estimates
+            of one object's depth do not overlap on the ground. None: not used, as in the source.
+        vote: IoU in the image from which a dropped box contributes, by its score, to the place, size, velocity
+            and yaw vectors of the surviving box of its class: neighbouring places estimate one object's distance,
+            and their mean errs less (Gidaris and Komodakis, ICCV 2015). None: not used, as in the source.
+        fade: Decay of scores with depth, 1/m: exp(-fade depth). Far boxes are misplaced more often, but without
             it score as high as near ones. 0: not used, as in the source.
         sure: Power of PGD's confidence of depth in the score; 1 as in the source.
         before: Places kept of each level before suppression.
         most: Maximum number of detections in an image.
-        input_width: Width to which pictures are resized inside; None: they are not.
-        trained_width: `input_width` while the weights were trained. The trunk halves the rows five times, and what it
-            finds depends on where the horizon lies between the rows that are left; cameras that look level always show
-            it at one height, so that training has met one case only. Pictures of another width get rows above them, so
-            that the horizon lies as in training. None: no rows are added.
-        horizon: Height of the horizon in the pictures of the training, as a share from their top.
-        virtual_focal: Focal length (pixels, after resizing) of the camera for which depth is predicted; the depth is
-            then scaled to the real one. None: no scaling.
+        input_width: Width to which images are resized inside; None to keep their size.
+        trained_width: `input_width` during training. The trunk halves the rows five times, and its output depends
+            on the phase of the horizon among the remaining rows; cameras that look level always show the horizon
+            at one height, so training covers a single phase. Images of another width get rows above them that
+            restore the phase of training. None: no rows are added.
+        horizon: Height of the horizon in the training images, as a share from their top.
+        virtual_focal: Focal length (pixels, after resizing) of the camera for which depth is predicted; the depth
+            is then scaled to the real one. None: no scaling.
         mean: Mean of B, G and R in 0..255.
         std: Standard deviation of B, G and R.
         start: Depth, length, height and width that fresh weights predict; None: 1, as in the source.
-        rays: Whether the regression also sees the viewing direction of each place (tangents to the right of and below
-            the optical axis), so that the line where an object meets the ground tells its distance for any lens.
+        rays: Whether the regression also receives the viewing direction of each place (tangents to the right of
+            and below the optical axis), so that the line where an object meets the ground gives its distance for
+            any lens.
         radius: Radius of centre sampling, in strides.
         dir_offset: Offset of the yaw's direction bins, rad.
-        heading: How the yaw is told. "bins": a number that holds up to half a turn, and a bin of half a turn that says
-            which half, as in the source. Beside the border of the bins (at `dir_offset` and half a turn on) the bin is
-            a guess that turns the box round, and the number has a seam somewhere. "vectors": two vectors, which have
-            neither: one of the direction of twice the yaw, which tells the axis, even of what looks alike from both
-            ends, and one whose part along the axis says which way along it (see `yaw_of_vectors`).
+        heading: Encoding of the yaw. "bins": a number within half a turn, and a bin that selects the half, as in
+            the source. At the border of the bins (at `dir_offset` and half a turn on) the bin is a guess that
+            flips the box, and the number has a discontinuity. "vectors": two vectors, which have neither: one
+            with the direction of twice the yaw, which gives the axis, even of objects that look alike from both
+            ends, and one whose component along the axis gives the direction (see `yaw_of_vectors`).
     """
 
     name: str
@@ -122,7 +123,7 @@ class Mono3DConfig:
             raise ConfigError(f"{self.name}: trunk {self.trunk}; choose 18 (light), 50 or 101")
         if self.channels % 32 or len(self.ranges) != len(self.strides):
             raise ConfigError(f"{self.name}: channels must be a multiple of 32, and each stride needs a range")
-        if any(s != 8 << k for k, s in enumerate(self.strides)) or not 3 <= len(self.strides) <= 5:
+        if any(stride != 8 << level for level, stride in enumerate(self.strides)) or not 3 <= len(self.strides) <= 5:
             raise ConfigError(f"{self.name}: strides are 8, 16, 32 and may go on to 64 and 128, not {self.strides}")
         if self.pgd and self.start is not None:
             raise ConfigError(f"{self.name}: PGD starts from its own mean depth and sizes; leave start out")
@@ -132,11 +133,13 @@ class Mono3DConfig:
             raise ConfigError(f"{self.name}: input_width {self.input_width} is too small; it takes 64 or more")
 
     def changed(self, options: Mapping[str, Any]) -> Mono3DConfig:
-        """With other values. ConfigError: one that there is not."""
-        known = {f.name for f in fields(self)}
+        """Return a copy with other values; raise ConfigError for an unknown option."""
+        option_names = {option.name for option in fields(self)}
         for name in options:
-            if name not in known:
-                raise ConfigError(f"{self.name}: no option '{name}'; there are {', '.join(sorted(known - {'name'}))}")
+            if name not in option_names:
+                raise ConfigError(
+                    f"{self.name}: no option '{name}'; there are {', '.join(sorted(option_names - {'name'}))}"
+                )
         return replace(self, **options)
 
     @property
@@ -147,7 +150,7 @@ class Mono3DConfig:
 
 
 _PGD_WEIGHTS = (1, 1, 0.2, 1, 1, 1, 1, 0.05, 0.05, 0.2, 0.2, 0.2, 0.2)
-# A velocity that weighs 0.05 is hardly learned in a short training: everything seems to stand.
+# With a weight of 0.05 the velocity is hardly learned in a short training: all objects appear to stand still.
 _LIGHT_WEIGHTS = (1, 1, 0.2, 1, 1, 1, 1, 0.2, 0.2)
 FCOS3D = Mono3DConfig("fcos3d")
 PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS)

@@ -1,4 +1,4 @@
-"""From dense maps to boxes: places, projection, yaw, corners."""
+"""Decoding of dense maps to boxes: places, projection, yaw, corners."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-NEAR = 0.1  # m in front of the camera at which corners are held
+NEAR = 0.1  # m; corners nearer to the camera are moved there before projection
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +41,10 @@ class Places:
 
 
 def flatten(maps: dict[str, list[Tensor]]) -> Flat:
-    """Rows of all levels."""
+    """Flatten the maps of all levels to rows."""
 
     def rows(name: str) -> Tensor:
-        return torch.cat([m.flatten(2).transpose(1, 2) for m in maps[name]], 1)
+        return torch.cat([level_map.flatten(2).transpose(1, 2) for level_map in maps[name]], 1)
 
     return Flat(
         rows("cls_scores"),
@@ -57,7 +57,7 @@ def flatten(maps: dict[str, list[Tensor]]) -> Flat:
 
 
 def pick(flat: Flat, image: Tensor, rows: Tensor) -> Flat:
-    """Some places [N] of images [N]."""
+    """Return the rows [N] of images [N]."""
     bins = None if flat.bins is None else flat.bins[image, rows]
     return Flat(
         flat.logit[image, rows],
@@ -70,17 +70,19 @@ def pick(flat: Flat, image: Tensor, rows: Tensor) -> Flat:
 
 
 def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:
-    """Places of maps [B, C, h, w]."""
-    xy, size, level = [], [], []
-    for k, (m, stride) in enumerate(zip(maps, strides, strict=True)):
+    """Return the places of maps [B, C, h, w]."""
+    xy, sizes, level = [], [], []
+    for level_index, (level_map, stride) in enumerate(zip(maps, strides, strict=True)):
         y, x = torch.meshgrid(
-            torch.arange(m.shape[2], device=m.device), torch.arange(m.shape[3], device=m.device), indexing="ij"
+            torch.arange(level_map.shape[2], device=level_map.device),
+            torch.arange(level_map.shape[3], device=level_map.device),
+            indexing="ij",
         )
-        one = torch.stack([x, y], -1).reshape(-1, 2).to(m.dtype) * stride + stride // 2
-        xy.append(one)
-        size.append(torch.full((len(one),), stride, dtype=m.dtype, device=m.device))
-        level.append(torch.full((len(one),), k, dtype=torch.int64, device=m.device))
-    return Places(torch.cat(xy), torch.cat(size), torch.cat(level))
+        positions = torch.stack([x, y], -1).reshape(-1, 2).to(level_map.dtype) * stride + stride // 2
+        xy.append(positions)
+        sizes.append(torch.full((len(positions),), stride, dtype=level_map.dtype, device=level_map.device))
+        level.append(torch.full((len(positions),), level_index, dtype=torch.int64, device=level_map.device))
+    return Places(torch.cat(xy), torch.cat(sizes), torch.cat(level))
 
 
 def unproject(points: Tensor, lens: Tensor, image: Tensor | None = None) -> Tensor:
@@ -94,38 +96,39 @@ def unproject(points: Tensor, lens: Tensor, image: Tensor | None = None) -> Tens
     Returns:
         x, y, z [..., 3], m.
     """
-    u, v, d = points.unbind(-1)
-    full = torch.stack([u * d, v * d, d], -1)
+    u, v, depth = points.unbind(-1)
+    homogeneous = torch.stack([u * depth, v * depth, depth], -1)
+    # inv_ex, unlike inv, does not wait for the GPU to check that the matrix is invertible.
     inverse: Tensor = torch.linalg.inv_ex(lens.double())[0].to(points.dtype)
     if image is not None:
         inverse = inverse[image]
-    return (inverse @ full[..., None])[..., 0]
+    return (inverse @ homogeneous[..., None])[..., 0]
 
 
 def project(points: Tensor, lens: Tensor, *, near: float | None = NEAR) -> Tensor:
     """u, v [..., 2] of points [..., 3] in the camera frame; the depth is held above `near` (None: anything but 0)."""
-    flat = (lens @ points[..., None])[..., 0]
-    depth = flat[..., 2:]
+    homogeneous = (lens @ points[..., None])[..., 0]
+    depth = homogeneous[..., 2:]
     if near is None:
-        return flat[..., :2] / torch.where(depth.abs() < 1e-4, 1e-4, depth)
-    return flat[..., :2] / depth.clamp_min(near)
+        return homogeneous[..., :2] / torch.where(depth.abs() < 1e-4, 1e-4, depth)
+    return homogeneous[..., :2] / depth.clamp_min(near)
 
 
 def vectors_of_yaw(yaw: Tensor) -> Tensor:
-    """Cosine and sine of the yaw and of twice the yaw [..., 4]."""
+    """Return cosine and sine of the yaw and of twice the yaw [..., 4]."""
     return torch.stack([yaw.cos(), yaw.sin(), (2 * yaw).cos(), (2 * yaw).sin()], -1)
 
 
 def yaw_of_vectors(vectors: Tensor, dim: int = -1) -> Tensor:
-    """Yaw (-pi/2 to 3 pi/2) from two vectors along `dim`, which may be of any length.
+    """Return the yaw (-pi/2 to 3 pi/2) from two vectors along `dim`, which may be of any length.
 
-    The second has the direction of twice the yaw, which tells the axis; the first tells which way along it, by the sign
-    of its part along the axis. Twice that part is the logit of that way being the front.
+    The second vector has the direction of twice the yaw and gives the axis. The first gives the direction along
+    it by the sign of its component along the axis; twice this component is the logit of that end being the front.
     """
     cos, sin, cos2, sin2 = vectors.unbind(dim)
     axis = torch.atan2(sin2, cos2) / 2
-    back = axis.cos() * cos + axis.sin() * sin < 0
-    return axis + torch.pi * back.to(axis.dtype)
+    points_back = axis.cos() * cos + axis.sin() * sin < 0
+    return axis + torch.pi * points_back.to(axis.dtype)
 
 
 def global_yaw(local: Tensor, direction: Tensor | None, u: Tensor, lens: Tensor, *, offset: float) -> Tensor:
@@ -136,9 +139,9 @@ def global_yaw(local: Tensor, direction: Tensor | None, u: Tensor, lens: Tensor,
     """
     if direction is None:
         return local + ray_angle(u, lens)
-    turned = local - offset
-    turned = turned - (turned / torch.pi).floor() * torch.pi
-    return turned + offset + torch.pi * direction.to(local.dtype) + ray_angle(u, lens)
+    wrapped = local - offset
+    wrapped = wrapped - (wrapped / torch.pi).floor() * torch.pi
+    return wrapped + offset + torch.pi * direction.to(local.dtype) + ray_angle(u, lens)
 
 
 def ray_angle(u: Tensor, lens: Tensor) -> Tensor:
@@ -159,5 +162,5 @@ def corners(centre: Tensor, size: Tensor, yaw: Tensor) -> Tensor:
 
 
 def hull(points: Tensor) -> Tensor:
-    """x0, y0, x1, y1 [..., 4] of points [..., K, 2]."""
+    """Return the bounding rectangle x0, y0, x1, y1 [..., 4] of points [..., K, 2]."""
     return torch.cat([points.amin(-2), points.amax(-2)], -1)

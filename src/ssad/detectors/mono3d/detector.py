@@ -41,16 +41,16 @@ MULTIPLE = 32
 class Mono3D(nn.Module):
     """A monocular 3D detector; parts and weights carry mmdetection3d's names (backbone, neck, bbox_head).
 
-    It starts frozen and in eval mode. Truth and detections are in the camera frame of the intrinsic that is passed in,
-    which is used as given: a place is column and row times stride plus half the stride, the middle of what its cell
-    covers, counted from the picture's corner as in an intrinsic.
+    It starts frozen and in eval mode. Truth and detections are in the camera frame of the intrinsic that is
+    passed in, which is used as given: a place is column and row times stride plus half the stride, the centre of
+    its cell, counted from the corner of the image as in an intrinsic.
 
-    `Dense`: maps are mmdetection3d's in eval mode, in pixels of the network's input; quality: centreness; box: hull of
-    the projected corners, or PGD's own 2D box, clipped at the border; while training there are none ([B, 0, 4]).
+    `Dense`: maps are mmdetection3d's in eval mode, in pixels of the network's input; quality: centreness; box:
+    hull of the projected corners, or PGD's own 2D box, clipped at the border; empty in training mode ([B, 0, 4]).
 
     Args:
         config: The configuration.
-        seed: Of the fresh weights.
+        seed: Seed of the fresh weights.
     """
 
     task: Literal["2d", "3d"] = "3d"
@@ -60,6 +60,7 @@ class Mono3D(nn.Module):
         self.config = config
         self.name = config.name
         self.classes = MMDET3D_CLASSES
+        # Fresh weights depend on the seed alone, and the global generator stays unchanged.
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
             self.backbone = Backbone(config.trunk, width=config.width)
@@ -70,7 +71,7 @@ class Mono3D(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, images: Tensor, intrinsic: Tensor) -> Dense:
-        """As `dense`."""
+        """Return the raw outputs of `dense`."""
         return self.dense(images, intrinsic)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
@@ -83,58 +84,66 @@ class Mono3D(nn.Module):
         Raises:
             ConfigError: Another shape or type, or no intrinsic.
         """
-        maps, features, lens, size = self._maps(images, intrinsic)
-        scale, above = self._scale(size, lens), self._above(size)
+        maps, features, network_intrinsic, size = self._maps(images, intrinsic)
+        scale, rows_above = self._scale(size, network_intrinsic), self._above(size)
         flat = flatten(maps)
         places = places_of(maps["cls_scores"], self.config.strides)
         with _exact(images):
             if self.training:
                 box = flat.reg.new_zeros((len(images), 0, 4))
             else:
-                solids = self._solids(flat, places.xy, lens[:, None])
-                box = self._boxes(flat, places.xy, solids, lens=lens[:, None], size=size)
+                solids = self._solids(flat, places.xy, network_intrinsic[:, None])
+                box = self._boxes(flat, places.xy, solids, lens=network_intrinsic[:, None], size=size)
         return Dense(
             logit=flat.logit,
             quality=flat.centreness,
             box=box,
-            place=(places.xy - places.xy.new_tensor([0.0, above])) / scale,
+            place=(places.xy - places.xy.new_tensor([0.0, rows_above])) / scale,
             stride=places.stride / scale[0],
             level=places.level,
             size=size,
-            maps={**maps, "intrinsic": [lens]},
+            maps={**maps, "intrinsic": [network_intrinsic]},
             features=tuple(features),
         )
 
     def _maps(
         self, images: Tensor, intrinsic: Tensor | None
     ) -> tuple[dict[str, list[Tensor]], Sequence[Tensor], Tensor, tuple[int, int]]:
-        """Maps of the head, what it reads, intrinsics in the network's input [B, 3, 3], and the picture's size."""
-        size, lens = self._check(images, intrinsic)
-        lens = self._inside(lens, size, self._scale(size, lens))
+        """Return the head's maps, its input, the intrinsics [B, 3, 3] in the network's input, and the image size."""
+        size, network_intrinsic = self._check(images, intrinsic)
+        network_intrinsic = self._inside(network_intrinsic, size, self._scale(size, network_intrinsic))
         features = self.neck(self.backbone(self._prepare(images)))
-        return self.bbox_head(features, self._factor(lens), self._rays(features, lens)), features, lens, size
+        return (
+            self.bbox_head(features, self._factor(network_intrinsic), self._rays(features, network_intrinsic)),
+            features,
+            network_intrinsic,
+            size,
+        )
 
     @torch.no_grad()
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
-        """Detections of each image, best first: score class times centreness (times PGD's confidence of depth)."""
-        least = check_threshold(self.name, self.config.threshold if threshold is None else threshold)
+        """Return the detections of each image, best first.
+
+        The score is class times centreness (times PGD's confidence of depth).
+        """
+        min_score = check_threshold(self.name, self.config.threshold if threshold is None else threshold)
         with evaluating(self):
-            maps, _, lens, size = self._maps(images, intrinsic)  # without the boxes of all places
-        return self._chosen(maps, lens, size, threshold=least, best_first=True)
+            maps, _, network_intrinsic, size = self._maps(images, intrinsic)  # without the boxes of all places
+        return self._chosen(maps, network_intrinsic, size, threshold=min_score, best_first=True)
 
     def select(self, dense: Dense, threshold: float) -> list[Detections]:
-        """Detections of each image in mmdetection3d's order, without the boxes that the source suppresses.
+        """Return the detections of each image in mmdetection3d's order, without boxes that the source suppresses.
 
         They are ordered by class and descending score, or by score alone if there were too many.
 
         Args:
             dense: Raw outputs.
-            threshold: Least score.
+            threshold: Minimum score.
         """
-        maps, lens = _head_maps(dense), dense.maps["intrinsic"][0]
-        return self._chosen(maps, lens, dense.size, threshold=threshold, best_first=False)
+        maps, intrinsic = _head_maps(dense), dense.maps["intrinsic"][0]
+        return self._chosen(maps, intrinsic, dense.size, threshold=threshold, best_first=False)
 
     def _chosen(
         self, maps: dict[str, list[Tensor]], lens: Tensor, size: tuple[int, int], *, threshold: float, best_first: bool
@@ -142,51 +151,57 @@ class Mono3D(nn.Module):
         """Suppression is a chain of small steps and runs on the host; the device is asked once, not for each step."""
         with _exact(lens):
             flat, places = flatten(maps), places_of(maps["cls_scores"], self.config.strides)
-            share = self._shares(flat, lens)
-            kept = self._leading(maps, share.amax(-1))
-            share = share.gather(1, kept[..., None].expand(-1, -1, share.shape[2]))
-            image, place, label = (share > threshold).nonzero(as_tuple=True)
-            rows, score = kept[image, place], share[image, place, label]
-            picked, xy = pick(flat, image, rows), places.xy[rows]
-            solids = centre, extent, yaw = self._solids(picked, xy, lens, image)
-            shown = self._boxes(picked, xy, solids, lens=lens[image], size=size)
-            place3d = torch.cat([centre, extent, picked.reg[:, 7:9], picked.direction], 1)
+            class_scores = self._shares(flat, lens)
+            top_rows = self._leading(maps, class_scores.amax(-1))
+            class_scores = class_scores.gather(1, top_rows[..., None].expand(-1, -1, class_scores.shape[2]))
+            image, place, label = (class_scores > threshold).nonzero(as_tuple=True)
+            rows, score = top_rows[image, place], class_scores[image, place, label]
+            outputs, xy = pick(flat, image, rows), places.xy[rows]
+            solids = centre, extent, yaw = self._solids(outputs, xy, lens, image)
+            image_boxes = self._boxes(outputs, xy, solids, lens=lens[image], size=size)
+            candidates = torch.cat([centre, extent, outputs.reg[:, 7:9], outputs.direction], 1)
             ground = torch.stack([centre[:, 0], centre[:, 2], extent[:, 0], extent[:, 2], -yaw], -1)
-            host = [v.cpu() for v in (image, label, score, shown, ground, place3d)]
-            image, label, score, shown, ground, place3d = host
-            stay = self._suppressed(ground, shown, score, label, image, best_first=best_first)
+            host_columns = [
+                candidate_column.cpu() for candidate_column in (image, label, score, image_boxes, ground, candidates)
+            ]
+            image, label, score, image_boxes, ground, candidates = host_columns
+            survivors = self._suppressed(ground, image_boxes, score, label, image, best_first=best_first)
             values = (
-                self._voted(place3d, shown, score, label, image, stay)
+                self._voted(candidates, image_boxes, score, label, image, survivors)
                 if self.config.vote is not None
-                else place3d[stay]
+                else candidates[survivors]
             )
-            centre, extent, velocity, direction = torch.split(values, [3, 3, 2, picked.direction.shape[1]], 1)
-            of, device = stay.to(lens.device), lens.device
-            yaw = yaw[of]
+            centre, extent, velocity, direction = torch.split(values, [3, 3, 2, outputs.direction.shape[1]], 1)
+            device_rows, device = survivors.to(lens.device), lens.device
+            yaw = yaw[device_rows]
             if self.config.heading == "vectors":
-                yaw = yaw - picked.reg[of, 6] + yaw_of_vectors(direction).to(yaw)
+                # Voting averages vectors, not angles, so the yaw is decoded anew; the viewing angle stays.
+                yaw = yaw - outputs.reg[device_rows, 6] + yaw_of_vectors(direction).to(yaw)
             columns = (
-                score[stay],
-                label[stay],
-                shown[stay],
+                score[survivors],
+                label[survivors],
+                image_boxes[survivors],
                 centre,
                 extent,
                 yaw,
                 velocity,
-                picked.attribute[of].argmax(-1),
+                outputs.attribute[device_rows].argmax(-1),
             )
-            counts = torch.bincount(image[stay], minlength=len(lens)).tolist()
-            parts = zip(*(torch.split(column.to(device), counts) for column in columns), strict=True)
-            return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]
+            counts = torch.bincount(image[survivors], minlength=len(lens)).tolist()
+            image_columns = zip(*(torch.split(column.to(device), counts) for column in columns), strict=True)
+            return [
+                Detections(image_column[0], image_column[1], image_column[2], Solids(*image_column[3:]))
+                for image_column in image_columns
+            ]
 
     def _shares(self, flat: Flat, lens: Tensor) -> Tensor:
         """Scores [B, P, 10]: class times centreness, for PGD-Det times how sure it is of the depth; see also `fade`."""
-        share = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
+        scores = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
         if flat.bins is not None:
-            share = share * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
+            scores = scores * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
         if self.config.fade:
-            share = share * torch.exp(-self.config.fade * self._depth(flat, lens[:, None]).clamp_min(0.0))[..., None]
-        return share
+            scores = scores * torch.exp(-self.config.fade * self._depth(flat, lens[:, None]).clamp_min(0.0))[..., None]
+        return scores
 
     def _depth(self, flat: Flat, lens: Tensor) -> Tensor:
         """Depth [..., P] of places, m; lens [..., 3, 3], one a place or broadcast."""
@@ -210,13 +225,13 @@ class Mono3D(nn.Module):
             One row for each that stays.
         """
         means = [values[:0]]
-        some, count = _runs(image[stay])
-        starts, ends = torch.searchsorted(image, some), torch.searchsorted(image, some, right=True)
-        for rows, start, end in zip(torch.split(stay, count), starts.tolist(), ends.tolist(), strict=True):
-            same = box_iou(shown[rows], shown[start:end]) >= self.config.vote
-            same &= label[rows][:, None] == label[start:end]
-            same[torch.arange(len(rows)), rows - start] = True  # a box without area as well
-            weight = same * score[start:end]
+        images, counts = _runs(image[stay])
+        starts, ends = torch.searchsorted(image, images), torch.searchsorted(image, images, right=True)
+        for rows, start, end in zip(torch.split(stay, counts), starts.tolist(), ends.tolist(), strict=True):
+            supports = box_iou(shown[rows], shown[start:end]) >= self.config.vote
+            supports &= label[rows][:, None] == label[start:end]
+            supports[torch.arange(len(rows)), rows - start] = True  # a box without area as well
+            weight = supports * score[start:end]
             means.append(weight @ values[start:end] / weight.sum(1, keepdim=True))
         return torch.cat(means)
 
@@ -224,13 +239,15 @@ class Mono3D(nn.Module):
         """Places [B, R] of the best of each level, by their best scores [B, P]."""
         rows: list[Tensor] = []
         start = 0
-        for m in maps["cls_scores"]:
-            count = m.shape[2] * m.shape[3]
-            part = best[:, start : start + count]
+        for level_map in maps["cls_scores"]:
+            count = level_map.shape[2] * level_map.shape[3]
+            level_scores = best[:, start : start + count]
             if count > self.config.before:
-                rows.append(part.topk(self.config.before, 1)[1] + start)
+                rows.append(level_scores.topk(self.config.before, 1)[1] + start)
             else:
-                rows.append(torch.arange(start, start + count, device=part.device).expand(len(part), -1))
+                rows.append(
+                    torch.arange(start, start + count, device=level_scores.device).expand(len(level_scores), -1)
+                )
             start += count
         return torch.cat(rows, 1)
 
@@ -247,84 +264,89 @@ class Mono3D(nn.Module):
             image: Their images, ascending.
             best_first: Whether to order by score alone.
         """
+        # One group for each image and class: a single pass suppresses all images.
         rows = rotated_nms(ground, score, image * len(self.classes) + label, threshold=self.config.nms)
         if self.config.image_nms is not None:
             rows = self._suppressed_in_images(rows, shown, score, label, image)
-        first = image[rows]
-        long = torch.bincount(first)[first] > self.config.most
-        # by score alone within an image where it is asked for or there are too many, else as they are
-        place = torch.where(long | best_first, -score[rows].double(), torch.arange(len(rows)).double())
-        order = place.argsort(stable=True)
-        order = order[first[order].argsort(stable=True)]
-        rows, first = rows[order], first[order]
-        kept = torch.arange(len(rows)) - torch.searchsorted(first, first) < self.config.most
-        return rows[kept]
+        row_image = image[rows]
+        is_full = torch.bincount(row_image)[row_image] > self.config.most
+        # Within an image: by score alone if requested or if there are too many, else in the order of the classes.
+        sort_key = torch.where(is_full | best_first, -score[rows].double(), torch.arange(len(rows)).double())
+        ranking = sort_key.argsort(stable=True)
+        ranking = ranking[row_image[ranking].argsort(stable=True)]
+        rows, row_image = rows[ranking], row_image[ranking]
+        is_within_limit = torch.arange(len(rows)) - torch.searchsorted(row_image, row_image) < self.config.most
+        return rows[is_within_limit]
 
     def _suppressed_in_images(self, rows: Tensor, shown: Tensor, score: Tensor, label: Tensor, image: Tensor) -> Tensor:
         """Rows (image by image) without those whose boxes in the image overlap too much with better ones."""
         assert self.config.image_nms is not None
-        parts = [rows[:0]]
-        for part in torch.split(rows, _runs(image[rows])[1]):
-            if len(part) > 1:
-                part = part[batched_nms(shown[part], score[part], label[part], self.config.image_nms).sort()[0]]  # noqa: PLW2901
-            parts.append(part)
-        return torch.cat(parts)
+        kept_rows = [rows[:0]]
+        for image_rows in torch.split(rows, _runs(image[rows])[1]):
+            remaining_rows = image_rows
+            if len(image_rows) > 1:
+                order = batched_nms(
+                    shown[image_rows], score[image_rows], label[image_rows], self.config.image_nms
+                ).sort()[0]
+                remaining_rows = image_rows[order]
+            kept_rows.append(remaining_rows)
+        return torch.cat(kept_rows)
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """The target assignment of the source; extra: see `ssad.detectors.mono3d.targets`.
+        """Assign targets as in the source; extra: see `ssad.detectors.mono3d.targets`.
 
         Raises:
             ConfigError: The truth does not fit.
         """
         if len(truth) != len(dense.logit):
             raise ConfigError(f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.logit)}")
-        lens = dense.maps["intrinsic"][0]
+        intrinsic = dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
-        with _exact(lens):
+        with _exact(intrinsic):
             return assign(
-                self.config, places, truth, lens, self._scale(dense.size, lens), above=self._above(dense.size)
+                self.config, places, truth, intrinsic, self._scale(dense.size, intrinsic), above=self._above(dense.size)
             )
 
     @torch.no_grad()
     def doubted(self, dense: Dense, assignment: Assignment, *, doubt: float) -> Assignment:
-        """The assignment with centreness that falls with the error of the depth that a place predicts now.
+        """Return the assignment with centreness reduced by the error of the currently predicted depth.
 
-        What is learned from it ranks boxes by how well they lie, as IoU-Net does it (Jiang et al., ECCV 2018).
+        A centreness learned from it ranks boxes by how well they are placed, as in IoU-Net (Jiang et al., ECCV 2018).
 
         Args:
             dense: Raw outputs.
-            assignment: Of these pictures.
+            assignment: Assignment of these images.
             doubt: Error of the depth at which centreness falls to 1/e, m.
         """
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
         with _exact(dense.logit):
             depth = self._depth(pick(flatten(_head_maps(dense)), image, place), dense.maps["intrinsic"][0][image])
-        wrong = (depth - assignment.extra["reg"][image, place, 2]).abs()
+        depth_error = (depth - assignment.extra["reg"][image, place, 2]).abs()
         centreness = assignment.extra["centreness"].clone()
-        centreness[image, place] *= torch.exp(-wrong / doubt)
+        centreness[image, place] *= torch.exp(-depth_error / doubt)
         return replace(assignment, extra={**assignment.extra, "centreness": centreness})
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """See `ssad.detectors.mono3d.losses`.
+        """Return the training losses; see `ssad.detectors.mono3d.losses`.
 
         Raises:
-            ConfigError: The assignment was made for pictures of another number or size.
+            ConfigError: The assignment was made for images of another number or size.
         """
         if assignment.label.shape != dense.logit.shape[:2]:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
-        lens = dense.maps["intrinsic"][0]
+        intrinsic = dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
-        with _exact(lens):
+        with _exact(intrinsic):
             return losses(
                 self.config,
                 flatten(_head_maps(dense)),
                 places,
                 assignment,
-                lens,
-                factor=self._factor(lens),
+                intrinsic,
+                factor=self._factor(intrinsic),
                 fuse=self.bbox_head.fuse,
                 reduction=reduction,
             )
@@ -334,11 +356,11 @@ class Mono3D(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Centre, size, yaw [..., P, ...] of places; lens [..., 3, 3] (broadcast), or one an image and image [P]."""
         centre2d = xy - flat.reg[..., :2]
-        own = lens if image is None else lens[image]
-        depth = self._depth(flat, own)
+        place_intrinsic = lens if image is None else lens[image]
+        depth = self._depth(flat, place_intrinsic)
         centre = unproject(torch.cat([centre2d, depth[..., None]], -1), lens, image)
         direction = flat.direction.argmax(-1) if self.config.heading == "bins" else None
-        yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], own, offset=self.config.dir_offset)
+        yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], place_intrinsic, offset=self.config.dir_offset)
         return centre, flat.reg[..., 3:6], yaw
 
     def _boxes(
@@ -356,9 +378,10 @@ class Mono3D(nn.Module):
     def _check(self, images: Tensor, intrinsic: Tensor | None) -> tuple[tuple[int, int], Tensor]:
         size = check_images(self.name, images)
         if intrinsic is None or intrinsic.shape != (len(images), 3, 3):
-            got = "none" if intrinsic is None else str(list(intrinsic.shape))
-            raise ConfigError(f"{self.name}: a 3D detector needs the cameras' intrinsic [B, 3, 3]; got {got}")
+            received = "none" if intrinsic is None else str(list(intrinsic.shape))
+            raise ConfigError(f"{self.name}: a 3D detector needs the cameras' intrinsic [B, 3, 3]; got {received}")
         focal = intrinsic[:, [0, 1], [0, 1]]
+        # On a GPU this check would wait for all queued work.
         if intrinsic.device.type == "cpu" and not bool(intrinsic.isfinite().all() & (focal > 0).all()):
             raise ConfigError(f"{self.name}: an intrinsic has no focal length above 0, or holds NaN")
         return size, intrinsic.to(images.device, self._dtype())
@@ -370,7 +393,7 @@ class Mono3D(nn.Module):
         return scale_of(size_inside(size, self.config.input_width), size, like)[:2]
 
     def _above(self, size: tuple[int, int]) -> int:
-        """Rows that are added above the resized picture, see `Mono3DConfig.trained_width`."""
+        """Return the number of rows added above the resized image, see `Mono3DConfig.trained_width`."""
         trained = self.config.trained_width
         if trained is None or self.config.input_width == trained:
             return 0
@@ -393,36 +416,39 @@ class Mono3D(nn.Module):
         """Tangents [B, 2, h, w] of each place of each level, to the right and down, times 4 (about 1 at the border)."""
         if not self.config.rays:
             return None
-        found = []
-        for m, stride in zip(maps, self.config.strides, strict=True):
+        level_rays = []
+        for level_map, stride in zip(maps, self.config.strides, strict=True):
             x, y = (
-                stride * (torch.arange(n, device=m.device, dtype=lens.dtype) + 0.5) for n in (m.shape[3], m.shape[2])
+                stride * (torch.arange(length, device=level_map.device, dtype=lens.dtype) + 0.5)
+                for length in (level_map.shape[3], level_map.shape[2])
             )
             right = (x - lens[:, 0, 2:]) / lens[:, 0, :1]
             down = (y - lens[:, 1, 2:]) / lens[:, 1, 1:2]
-            shape = (len(m), m.shape[2], m.shape[3])
-            found.append(4.0 * torch.stack([right[:, None].expand(shape), down[:, :, None].expand(shape)], 1))
-        return found
+            shape = (len(level_map), level_map.shape[2], level_map.shape[3])
+            level_rays.append(4.0 * torch.stack([right[:, None].expand(shape), down[:, :, None].expand(shape)], 1))
+        return level_rays
 
     def _prepare(self, images: Tensor) -> Tensor:
-        """BGR in 0..255, less the mean, padded with 0 at the right and bottom, and above (see `_above`)."""
+        """Normalise images as BGR in 0..255 less the mean, and pad with 0 right, below and above."""
         images = images.to(self._dtype())
         size = (images.shape[2], images.shape[3])
         resized = size_inside(size, self.config.input_width)
         if resized != size:
-            small = resized[0] < size[0]
-            images = functional.interpolate(images, resized, mode="bilinear", align_corners=False, antialias=small)
+            is_downscaled = resized[0] < size[0]
+            images = functional.interpolate(
+                images, resized, mode="bilinear", align_corners=False, antialias=is_downscaled
+            )
         mean, std = self.get_buffer("mean"), self.get_buffer("std")
         images = (images.flip(1) * 255 - mean) / std
-        above = self._above(size)
-        return functional.pad(images, (0, -resized[1] % MULTIPLE, above, -(resized[0] + above) % MULTIPLE))
+        rows_above = self._above(size)
+        return functional.pad(images, (0, -resized[1] % MULTIPLE, rows_above, -(resized[0] + rows_above) % MULTIPLE))
 
 
 def _runs(ascending: Tensor) -> tuple[Tensor, list[int]]:
-    """The numbers that occur among whole numbers in ascending order, and how often each does."""
-    count = torch.bincount(ascending)
-    some = count.nonzero()[:, 0]
-    return some, count[some].tolist()
+    """Return the distinct values of ascending whole numbers, and the count of each."""
+    counts = torch.bincount(ascending)
+    values = counts.nonzero()[:, 0]
+    return values, counts[values].tolist()
 
 
 def _head_maps(dense: Dense) -> dict[str, list[Tensor]]:
@@ -430,5 +456,5 @@ def _head_maps(dense: Dense) -> dict[str, list[Tensor]]:
 
 
 def _exact(like: Tensor) -> torch.autocast:
-    """No mixed precision within the block: boxes and losses need all their digits."""
+    """Disable mixed precision within the block: boxes and losses need all their digits."""
     return torch.autocast(like.device.type, enabled=False)

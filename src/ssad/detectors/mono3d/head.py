@@ -1,4 +1,4 @@
-"""The dense head that all levels share: towers, branches, and the decoding that happens inside it."""
+"""Dense head shared by all levels: towers, branches, and the decoding inside the head."""
 
 from __future__ import annotations
 
@@ -17,11 +17,15 @@ from ssad.detectors.mono3d.config import BASE_DEPTHS, BASE_DIMS, Mono3DConfig
 from ssad.detectors.mono3d.decode import yaw_of_vectors
 
 BINS, BIN = 6, 10.0  # depth bins of PGD, their spacing in m
-YAW = 3  # which part of the regression it is
+YAW = 3  # index of the yaw among the parts of the regression
 
 
 class Unit(nn.Module):
-    """Convolution, group norm, ReLU. compiled: the last two are one compiled function while it trains on a GPU."""
+    """Convolution, group norm, ReLU.
+
+    Attributes:
+        compiled: Whether the last two run as one compiled function while training on a GPU.
+    """
 
     compiled = False
 
@@ -38,8 +42,8 @@ class Unit(nn.Module):
         self.gn = nn.GroupNorm(32, outside)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> [B, O, H, W]."""
-        norm = self.gn  # called by its function: the module refuses a map of one place
+        """Return [B, O, H, W] from [B, C, H, W]."""
+        norm = self.gn  # called by its function, since the module refuses a map of one place
         if self.compiled and self.training and x.is_cuda:
             fused: Tensor = _compiled_norm()(self.conv(x), norm.weight, norm.bias, norm.num_groups, norm.eps)
             return fused
@@ -48,16 +52,16 @@ class Unit(nn.Module):
 
 
 def group_norm_relu(x: Tensor, weight: Tensor, bias: Tensor, groups: int, eps: float) -> Tensor:
-    """Group norm and ReLU of a map [B, C, H, W] in channels-last memory, written so that a compiler can fuse them.
+    """Apply group norm and ReLU to a map [B, C, H, W] in channels-last memory, in a form that a compiler can fuse.
 
-    PyTorch's own group norm copies such a map to another layout and, in mixed precision, to 32 bits. Statistics are
-    taken in 32 bits.
+    PyTorch's own group norm copies such a map to another layout and, in mixed precision, to 32 bits. Statistics
+    are computed in 32 bits.
 
     Args:
         x: The map.
         weight: Scale of each channel [C].
         bias: Shift of each channel [C].
-        groups: How many groups; they divide C.
+        groups: Number of groups, a divisor of C.
         eps: Added to the variance.
 
     Returns:
@@ -66,22 +70,22 @@ def group_norm_relu(x: Tensor, weight: Tensor, bias: Tensor, groups: int, eps: f
     Source: Wu and He, Group Normalization (ECCV 2018).
     """
     values = x.permute(0, 2, 3, 1).float()
-    share = x.shape[1] // groups
+    group_size = x.shape[1] // groups
 
-    def of_groups(each: Tensor) -> Tensor:
-        return each.view(len(x), groups, share).mean(2)
+    def mean_of_groups(each: Tensor) -> Tensor:
+        return each.view(len(x), groups, group_size).mean(2)
 
-    mean = of_groups(values.mean((1, 2)))
-    variance = (of_groups((values * values).mean((1, 2))) - mean * mean).clamp_min(0.0)
-    scale = torch.rsqrt(variance + eps).repeat_interleave(share, 1) * weight
-    shift = bias - mean.repeat_interleave(share, 1) * scale
+    mean = mean_of_groups(values.mean((1, 2)))
+    variance = (mean_of_groups((values * values).mean((1, 2))) - mean * mean).clamp_min(0.0)
+    scale = torch.rsqrt(variance + eps).repeat_interleave(group_size, 1) * weight
+    shift = bias - mean.repeat_interleave(group_size, 1) * scale
     values = functional.relu(values * scale[:, None, None] + shift[:, None, None])
     return values.to(x.dtype).permute(0, 3, 1, 2)
 
 
 @cache
 def _compiled_norm() -> Callable[..., Any]:
-    """`group_norm_relu`, compiled when it is first used, for maps of any size."""
+    """Return `group_norm_relu` compiled for maps of any size; compiled at its first call."""
     return torch.compile(group_norm_relu, dynamic=True)
 
 
@@ -94,13 +98,14 @@ class Scale(nn.Module):
 
 
 def _full(x: Tensor) -> Tensor:
-    """At least 32 bits a number: what is read off the maps must not be rounded by mixed precision."""
+    """Return values in at least 32 bits, so that mixed precision does not round what is read off the maps."""
     return x.float() if x.dtype in {torch.float16, torch.bfloat16} else x
 
 
 def _last(inside: int, outside: int, *, rare: bool = False) -> nn.Conv2d:
     conv = nn.Conv2d(inside, outside, 1)
     nn.init.normal_(conv.weight, std=0.01)
+    # The sigmoid of -ln 99 is 0.01.
     nn.init.constant_(conv.bias, -math.log(99.0) if rare else 0.0)  # type: ignore[arg-type]
     return conv
 
@@ -114,31 +119,37 @@ class Head(nn.Module):
     def __init__(self, config: Mono3DConfig) -> None:
         super().__init__()
         self.config = config
-        c = config.channels
-        for name, inside in (("cls_convs", c), ("reg_convs", c + 2 if config.rays else c)):
-            self.add_module(name, nn.ModuleList([Unit(inside, c), Unit(c, c, deformable=config.deformable)]))
-        self.conv_cls_prev = nn.ModuleList([Unit(c, c)])
-        self.conv_cls = _last(c, len(MMDET3D_CLASSES), rare=True)
+        channels = config.channels
+        for name, in_channels in (("cls_convs", channels), ("reg_convs", channels + 2 if config.rays else channels)):
+            self.add_module(
+                name,
+                nn.ModuleList([Unit(in_channels, channels), Unit(channels, channels, deformable=config.deformable)]),
+            )
+        self.conv_cls_prev = nn.ModuleList([Unit(channels, channels)])
+        self.conv_cls = _last(channels, len(MMDET3D_CLASSES), rare=True)
         self.conv_reg_prevs = nn.ModuleList(
-            nn.ModuleList([] if k == 4 else [Unit(c, c)]) for k in range(len(config.groups))
+            nn.ModuleList([] if part_index == 4 else [Unit(channels, channels)])
+            for part_index in range(len(config.groups))
         )
-        self.conv_regs = nn.ModuleList(_last(c, size) for size in config.groups)
+        self.conv_regs = nn.ModuleList(_last(channels, size) for size in config.groups)
         if config.heading == "bins":
-            self.conv_dir_cls_prev = nn.ModuleList([Unit(c, c)])
-            self.conv_dir_cls = _last(c, 2, rare=True)
+            self.conv_dir_cls_prev = nn.ModuleList([Unit(channels, channels)])
+            self.conv_dir_cls = _last(channels, 2, rare=True)
         else:
-            self.heading_convs = nn.ModuleList([Unit(c + 2 if config.rays else c, c), Unit(c, c)])
-        self.conv_attr_prev = nn.ModuleList([Unit(c, c)])
-        self.conv_attr = _last(c, len(MMDET3D_ATTRIBUTES), rare=True)
-        narrow = max(c // 4, 32)
-        self.conv_centerness_prev = nn.ModuleList([Unit(c, narrow)])
-        self.conv_centerness = _last(narrow, 1)
+            self.heading_convs = nn.ModuleList(
+                [Unit(channels + 2 if config.rays else channels, channels), Unit(channels, channels)]
+            )
+        self.conv_attr_prev = nn.ModuleList([Unit(channels, channels)])
+        self.conv_attr = _last(channels, len(MMDET3D_ATTRIBUTES), rare=True)
+        centreness_channels = max(channels // 4, 32)
+        self.conv_centerness_prev = nn.ModuleList([Unit(channels, centreness_channels)])
+        self.conv_centerness = _last(centreness_channels, 1)
         self.scales = nn.ModuleList(
             nn.ModuleList(Scale() for _ in range(4 if config.pgd else 3)) for _ in config.strides
         )
         if config.pgd:
-            self.conv_depth_cls_prev = nn.ModuleList([Unit(c, c)])
-            self.conv_depth_cls = _last(c, BINS, rare=True)
+            self.conv_depth_cls_prev = nn.ModuleList([Unit(channels, channels)])
+            self.conv_depth_cls = _last(channels, BINS, rare=True)
             self.fuse_lambda = nn.Parameter(torch.tensor(1e-4))
         if config.start is not None:
             with torch.no_grad():
@@ -163,69 +174,69 @@ class Head(nn.Module):
             bbox_preds has its yaw (see `yaw_of_vectors`) [B, 2 or 4, h, w]; attr_preds; centernesses; and for PGD
             depth_cls_preds.
         """
-        found: dict[str, list[Tensor]] = {}
-        for level, x in enumerate(maps):
-            for name, value in self._level(level, x, lens, None if rays is None else rays[level]).items():
-                found.setdefault(name, []).append(value)
-        return found
+        maps_by_name: dict[str, list[Tensor]] = {}
+        for level, feature in enumerate(maps):
+            for name, value in self._level(level, feature, lens, None if rays is None else rays[level]).items():
+                maps_by_name.setdefault(name, []).append(value)
+        return maps_by_name
 
     def _level(self, level: int, x: Tensor, lens: Tensor | None, rays: Tensor | None) -> dict[str, Tensor]:
-        seen = x if rays is None else torch.cat([x, rays.to(x)], 1)
-        kinds, boxes = x, seen
+        regression_input = x if rays is None else torch.cat([x, rays.to(x)], 1)
+        class_feature, box_feature = x, regression_input
         for unit in self.get_submodule("cls_convs").children():
-            kinds = unit(kinds)
+            class_feature = unit(class_feature)
         for unit in self.get_submodule("reg_convs").children():
-            boxes = unit(boxes)
-        logit = _full(self.conv_cls(self.conv_cls_prev[0](kinds)))
-        heading = boxes
+            box_feature = unit(box_feature)
+        logit = _full(self.conv_cls(self.conv_cls_prev[0](class_feature)))
+        heading_feature = box_feature
         if self.config.heading == "vectors":
-            heading = seen
+            heading_feature = regression_input
             for unit in self.heading_convs:
-                heading = unit(heading)
+                heading_feature = unit(heading_feature)
         parts = []
-        for k, (prev, last) in enumerate(zip(self.conv_reg_prevs, self.conv_regs, strict=True)):
-            value = heading if k == YAW else boxes
-            for unit in prev.children():
-                value = unit(value)
-            parts.append(_full(last(value)))
+        for part_index, (tower, output_conv) in enumerate(zip(self.conv_reg_prevs, self.conv_regs, strict=True)):
+            part_feature = heading_feature if part_index == YAW else box_feature
+            for unit in tower.children():
+                part_feature = unit(part_feature)
+            parts.append(_full(output_conv(part_feature)))
         if self.config.heading == "bins":
-            direction = _full(self.conv_dir_cls(self.conv_dir_cls_prev[0](boxes)))
+            direction = _full(self.conv_dir_cls(self.conv_dir_cls_prev[0](box_feature)))
         else:
             direction, parts[YAW] = parts[YAW], yaw_of_vectors(parts[YAW], 1)[:, None]
-        found = {
+        level_maps = {
             "cls_scores": logit,
             "bbox_preds": self._decode(level, parts, logit, lens),
             "dir_cls_preds": direction,
-            "attr_preds": _full(self.conv_attr(self.conv_attr_prev[0](kinds))),
-            "centernesses": _full(self.conv_centerness(self.conv_centerness_prev[0](boxes))),
+            "attr_preds": _full(self.conv_attr(self.conv_attr_prev[0](class_feature))),
+            "centernesses": _full(self.conv_centerness(self.conv_centerness_prev[0](box_feature))),
         }
         if self.config.pgd:
-            found["depth_cls_preds"] = _full(self.conv_depth_cls(self.conv_depth_cls_prev[0](boxes)))
-        return found
+            level_maps["depth_cls_preds"] = _full(self.conv_depth_cls(self.conv_depth_cls_prev[0](box_feature)))
+        return level_maps
 
     def _decode(self, level: int, parts: list[Tensor], logit: Tensor, lens: Tensor | None) -> Tensor:
         """Offsets times stride, depth and size in metres."""
-        factor = list(self.scales[level].parameters())
+        scales = list(self.scales[level].parameters())
         stride = self.config.strides[level]
-        offset = parts[0] * factor[0] * stride
-        depth, size = parts[1] * factor[1], (parts[2] * factor[2]).exp()
+        offset = parts[0] * scales[0] * stride
+        depth, size = parts[1] * scales[1], (parts[2] * scales[2]).exp()
         if self.config.pgd:
-            kind = logit.argmax(1)
-            prior = self.base_depths.to(depth)[kind]
+            best_class = logit.argmax(1)
+            prior = self.base_depths.to(depth)[best_class]
             depth = prior[..., 0][:, None] + depth * prior[..., 1][:, None]
-            size = self.base_dims.to(size)[kind].permute(0, 3, 1, 2) * size
+            size = self.base_dims.to(size)[best_class].permute(0, 3, 1, 2) * size
         else:
             depth = depth.exp()
         if lens is not None:
             depth = depth * lens[:, None, None, None]
         if self.config.pgd:
-            parts = [*parts[:5], (parts[5] * factor[3]).relu() * stride]
+            parts = [*parts[:5], (parts[5] * scales[3]).relu() * stride]
         return torch.cat([offset, depth, size, *parts[3:]], 1)
 
     def fuse(self, depth: Tensor, bins: Tensor, lens: Tensor | None = None) -> Tensor:
         """PGD's depth [...] from the regressed one and the logits of the bins [..., 6]; lens [...] as in `forward`."""
-        likely = bins.softmax(-1) @ (BIN * torch.arange(BINS, dtype=bins.dtype, device=bins.device))
+        bin_depth = bins.softmax(-1) @ (BIN * torch.arange(BINS, dtype=bins.dtype, device=bins.device))
         if lens is not None:
-            likely = likely * lens
-        share = self.fuse_lambda.sigmoid()
-        return share * depth + (1 - share) * likely
+            bin_depth = bin_depth * lens
+        weight = self.fuse_lambda.sigmoid()
+        return weight * depth + (1 - weight) * bin_depth

@@ -51,61 +51,71 @@ def losses(
     image, place = (label >= 0).nonzero(as_tuple=True)
     total = _Sum(image, len(label), reduction)
     target = assignment.extra["reg"][image, place].to(flat.reg.dtype)
-    near = assignment.extra["centreness"][image, place].to(flat.reg.dtype)
-    found = {"cls": total.classes(flat.logit, label)}
-    reg = flat.reg[image, place]
+    centreness = assignment.extra["centreness"][image, place].to(flat.reg.dtype)
+    loss_by_name = {"cls": total.classes(flat.logit, label)}
+    regression = flat.reg[image, place]
     stride = places.stride[place]
-    weights = reg.new_tensor(config.code_weights)
-    unit = factor[image] if factor is not None else torch.ones_like(stride)
+    code_weights = regression.new_tensor(config.code_weights)
+    depth_unit = factor[image] if factor is not None else torch.ones_like(stride)
 
     def smooth(value: Tensor, wanted: Tensor, first: int) -> Tensor:
-        each = functional.smooth_l1_loss(value, wanted, beta=BETA, reduction="none")
-        return total.mean((each * weights[first : first + value.shape[1]]).sum(1))
+        elements = functional.smooth_l1_loss(value, wanted, beta=BETA, reduction="none")
+        return total.mean((elements * code_weights[first : first + value.shape[1]]).sum(1))
 
-    depth = reg[:, 2]
+    depth = regression[:, 2]
     bins = None if flat.bins is None else flat.bins[image, place]
     if bins is not None:
-        depth = fuse(depth, bins, unit if factor is not None else None)
-    found["offset"] = smooth(reg[:, :2] / stride[:, None], target[:, :2], 0)
-    found["depth"] = smooth((depth / unit)[:, None], (target[:, 2] / unit)[:, None], 2)
-    found["size"] = smooth(reg[:, 3:6], target[:, 3:6], 3)
-    moved, known = target[:, 7:9], target[:, 7:9].isfinite()
-    found["velo"] = smooth(torch.where(known, reg[:, 7:9], 0.0), torch.where(known, moved, 0.0), 7)
-    true, direction = target[:, 6], flat.direction[image, place]
+        depth = fuse(depth, bins, depth_unit if factor is not None else None)
+    loss_by_name["offset"] = smooth(regression[:, :2] / stride[:, None], target[:, :2], 0)
+    loss_by_name["depth"] = smooth((depth / depth_unit)[:, None], (target[:, 2] / depth_unit)[:, None], 2)
+    loss_by_name["size"] = smooth(regression[:, 3:6], target[:, 3:6], 3)
+    velocity, is_known = target[:, 7:9], target[:, 7:9].isfinite()
+    loss_by_name["velo"] = smooth(
+        torch.where(is_known, regression[:, 7:9], 0.0), torch.where(is_known, velocity, 0.0), 7
+    )
+    true_yaw, direction = target[:, 6], flat.direction[image, place]
     if config.heading == "vectors":
-        way, axis = torch.split(vectors_of_yaw(true), 2, 1)
-        off = functional.smooth_l1_loss(direction[:, 2:], axis, beta=BETA, reduction="none")
-        found["axis"] = total.mean(off.sum(1) * weights[6])
-        told = (label[image, place][:, None] != label.new_tensor(_ALIKE)).all(1).to(reg.dtype)
-        found["side"] = total.mean(functional.softplus(-2.0 * (direction[:, :2] * way).sum(1)) * told)
+        front_vector, axis = torch.split(vectors_of_yaw(true_yaw), 2, 1)
+        axis_loss = functional.smooth_l1_loss(direction[:, 2:], axis, beta=BETA, reduction="none")
+        loss_by_name["axis"] = total.mean(axis_loss.sum(1) * code_weights[6])
+        # Objects that look alike from both ends have an axis, but no front to learn.
+        has_front = (label[image, place][:, None] != label.new_tensor(_ALIKE)).all(1).to(regression.dtype)
+        loss_by_name["side"] = total.mean(
+            functional.softplus(-2.0 * (direction[:, :2] * front_vector).sum(1)) * has_front
+        )
     else:
-        said = reg[:, 6]
-        found["rotsin"] = smooth((said.sin() * true.cos())[:, None], (said.cos() * true.sin())[:, None], 6)
-        turned = true - config.dir_offset
-        turned = turned - (turned / (2 * torch.pi)).floor() * 2 * torch.pi
-        side = (turned / torch.pi).floor().long().clamp(0, 1)
-        found["dir"] = total.mean(functional.cross_entropy(direction, side, reduction="none"))
-    kind = functional.cross_entropy(
+        predicted_yaw = regression[:, 6]
+        # The difference of the two is the sine of the angle between the yaws; the bin decides the half-turn.
+        loss_by_name["rotsin"] = smooth(
+            (predicted_yaw.sin() * true_yaw.cos())[:, None], (predicted_yaw.cos() * true_yaw.sin())[:, None], 6
+        )
+        wrapped = true_yaw - config.dir_offset
+        wrapped = wrapped - (wrapped / (2 * torch.pi)).floor() * 2 * torch.pi
+        direction_bin = (wrapped / torch.pi).floor().long().clamp(0, 1)
+        loss_by_name["dir"] = total.mean(functional.cross_entropy(direction, direction_bin, reduction="none"))
+    attribute_loss = functional.cross_entropy(
         flat.attribute[image, place], assignment.extra["attribute"][image, place], reduction="none"
     )
-    found["attr"] = total.mean(kind * near, near)
-    centre = functional.binary_cross_entropy_with_logits(flat.centreness[image, place], near, reduction="none")
-    found["centerness"] = total.mean(centre)
+    loss_by_name["attr"] = total.mean(attribute_loss * centreness, centreness)
+    centreness_loss = functional.binary_cross_entropy_with_logits(
+        flat.centreness[image, place], centreness, reduction="none"
+    )
+    loss_by_name["centerness"] = total.mean(centreness_loss)
     if config.pgd:
-        found["bbox2d"] = smooth(reg[:, 9:] / stride[:, None], target[:, 9:], 9)
-        bin_of = direction.argmax(-1) if config.heading == "bins" else None
-        each = _consistency(
+        loss_by_name["bbox2d"] = smooth(regression[:, 9:] / stride[:, None], target[:, 9:], 9)
+        predicted_bin = direction.argmax(-1) if config.heading == "bins" else None
+        box_consistency = _consistency(
             config,
             places.xy[place],
-            reg,
+            regression,
             depth=depth,
-            direction=bin_of,
+            direction=predicted_bin,
             target=target,
             stride=stride,
             lens=lens[image],
         )
-        found["consistency"] = total.mean(each * weights[9:].mean())
-    return found
+        loss_by_name["consistency"] = total.mean(box_consistency * code_weights[9:].mean())
+    return loss_by_name
 
 
 def _consistency(
@@ -132,44 +142,45 @@ def _consistency(
     # vectors have a loss that is smooth everywhere; the angle between them is steep where they are short
     local = reg[:, 6] if direction is not None else reg[:, 6].detach()
     yaw = global_yaw(local, direction, centre2d[:, 0], lens, offset=config.dir_offset)
-    shown = hull(project(corners(centre, reg[:, 3:6], yaw), lens[:, None], near=None))
-    return 1 - _generalised_iou(shown, torch.cat([xy - reg[:, 9:11], xy + reg[:, 11:13]], 1))
+    projected_box = hull(project(corners(centre, reg[:, 3:6], yaw), lens[:, None], near=None))
+    return 1 - _generalised_iou(projected_box, torch.cat([xy - reg[:, 9:11], xy + reg[:, 11:13]], 1))
 
 
 def _generalised_iou(a: Tensor, b: Tensor) -> Tensor:
     """GIoU [M] (Rezatofighi et al. 2019) of boxes [M, 4] in pairs."""
-    common = (torch.minimum(a[:, 2:], b[:, 2:]) - torch.maximum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
-    whole = (torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
-    union = (a[:, 2:] - a[:, :2]).prod(1) + (b[:, 2:] - b[:, :2]).prod(1) - common
-    union, whole = union.clamp_min(1e-6), whole.clamp_min(1e-6)
-    return common / union - (whole - union) / whole
+    intersection = (torch.minimum(a[:, 2:], b[:, 2:]) - torch.maximum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
+    enclosing = (torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
+    union = (a[:, 2:] - a[:, :2]).prod(1) + (b[:, 2:] - b[:, :2]).prod(1) - intersection
+    union, enclosing = union.clamp_min(1e-6), enclosing.clamp_min(1e-6)
+    return intersection / union - (enclosing - union) / enclosing
 
 
 class _Sum:
-    """Sums over positives `image` [M] of B images, normalised over the batch or in each image."""
+    """Reduces losses of the positives [M] of B images, over the batch or for each image."""
 
     def __init__(self, image: Tensor, images: int, reduction: Reduction) -> None:
         self.image, self.images, self.whole = image, images, reduction == "batch"
 
     def total(self, values: Tensor) -> Tensor:
-        """Sum of [M], over the batch or each image."""
+        """Sum values [M] over the batch or over each image."""
         if self.whole:
             return values.sum()
         return values.new_zeros(self.images).index_add(0, self.image, values)
 
     def mean(self, values: Tensor, weight: Tensor | None = None) -> Tensor:
-        """Sum of values over the sum of weights (default: how many); 0 without positives."""
+        """Divide the sum of values by the sum of weights (default: the number of values); 0 without positives."""
         return self.total(values) / self.total(torch.ones_like(values) if weight is None else weight).clamp_min(1e-12)
 
     def classes(self, logit: Tensor, label: Tensor) -> Tensor:
-        """Focal loss (gamma 2, alpha 0.25) over positives and images."""
-        wanted = functional.one_hot((label + 1).clamp_min(0), logit.shape[-1] + 1)[..., 1:].to(logit.dtype)
-        share = logit.sigmoid()
-        wrong = wanted * (1 - share) + (1 - wanted) * share
-        alpha = 0.25 * wanted + 0.75 * (1 - wanted)
-        each = functional.binary_cross_entropy_with_logits(logit, wanted, reduction="none") * alpha * wrong**2
-        each = (each * (label > -2)[..., None]).sum((1, 2))
+        """Return the focal loss (gamma 2, alpha 0.25) over positives and images."""
+        target = functional.one_hot((label + 1).clamp_min(0), logit.shape[-1] + 1)[..., 1:].to(logit.dtype)
+        probability = logit.sigmoid()
+        error = target * (1 - probability) + (1 - target) * probability
+        alpha = 0.25 * target + 0.75 * (1 - target)
+        focal_loss = functional.binary_cross_entropy_with_logits(logit, target, reduction="none") * alpha * error**2
+        # Ignored places (-2) were clamped to background above.
+        focal_loss = (focal_loss * (label > -2)[..., None]).sum((1, 2))
         positives = torch.bincount(self.image, minlength=self.images)
         if self.whole:
-            return each.sum() / (positives.sum() + self.images)
-        return each / (positives + 1)
+            return focal_loss.sum() / (positives.sum() + self.images)
+        return focal_loss / (positives + 1)

@@ -1,4 +1,4 @@
-"""From the cameras of one moment to boxes in the world: the second suppression of the nuScenes export."""
+"""Merging of the boxes of several cameras in the world: the second suppression of the nuScenes export."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ssad.core.rotations import matrix_to_quaternion
 from ssad.core.types import F64, I32
 from ssad.detectors.mono3d.nms import rotated_nms
 
-# m from the ego within which a label is reported
+# m from the ego within which a class is reported
 REACH = np.array([RANGES[name] for name in MMDET3D_CLASSES])
 OVERLAP, LEAST, MOST = 0.05, 0.01, 500
 
@@ -60,15 +60,16 @@ def merge_cameras(
     if not len(found):
         return _empty()
     columns = []
-    for one, to_ego, to_world in zip(found, cam_to_ego, ego_to_global, strict=True):
-        if one.solid is None:
+    for camera_detections, to_ego, to_world in zip(found, cam_to_ego, ego_to_global, strict=True):
+        if camera_detections.solid is None:
             raise ConfigError("merge_cameras: detections without 3D boxes")
-        solid = one.solid
+        solid = camera_detections.solid
         centre, size, yaw, velocity = (
-            v.detach().cpu().double().numpy() for v in (solid.centre, solid.size_lhw, solid.yaw, solid.velocity)
+            values.detach().cpu().double().numpy()
+            for values in (solid.centre, solid.size_lhw, solid.yaw, solid.velocity)
         )
-        score, label = one.score.detach().cpu().double().numpy(), one.label.cpu().numpy()
-        near = (score > LEAST) & (_distance(centre, to_ego) <= REACH[label])
+        score, label = camera_detections.score.detach().cpu().double().numpy(), camera_detections.label.cpu().numpy()
+        in_range = (score > LEAST) & (_distance(centre, to_ego) <= REACH[label])
         pose = to_world @ to_ego
         rows = (
             centre @ pose[:3, :3].T + pose[:3, 3],
@@ -79,27 +80,35 @@ def merge_cameras(
             label,
             solid.attribute.cpu().numpy(),
         )
-        columns.append(tuple(r[near] for r in rows))
-    world, size, axes, velocity, score, label, attribute = (np.concatenate(c) for c in zip(*columns, strict=True))
-    ahead = int(np.argmax([pose[0, 2] for pose in cam_to_ego]))  # its optical axis points along the ego's x
-    pose = ego_to_global[ahead] @ cam_to_ego[ahead]
-    centre = (world - pose[:3, 3]) @ pose[:3, :3]
-    turned = pose[:3, :3].T @ axes
-    yaw = np.arctan2(turned[:, 0, 1], turned[:, 0, 0])
-    near = np.flatnonzero(_distance(centre, cam_to_ego[ahead]) <= REACH[label])
-    ground = torch.from_numpy(np.column_stack([centre[:, [0, 2]], size[:, [0, 2]], -yaw])[near])
-    kept = rotated_nms(ground, torch.from_numpy(score[near]), torch.from_numpy(label[near]), threshold=OVERLAP)
-    rows = near[kept.numpy()]
+        columns.append(tuple(column[in_range] for column in rows))
+    world_centre, size, axes, velocity, score, label, attribute = (
+        np.concatenate(parts) for parts in zip(*columns, strict=True)
+    )
+    front_camera = int(np.argmax([pose[0, 2] for pose in cam_to_ego]))  # its optical axis points along the ego's x
+    pose = ego_to_global[front_camera] @ cam_to_ego[front_camera]
+    centre = (world_centre - pose[:3, 3]) @ pose[:3, :3]
+    camera_frame_axes = pose[:3, :3].T @ axes
+    # The source stores boxes upright in the front camera, which keeps the yaw alone.
+    yaw = np.arctan2(camera_frame_axes[:, 0, 1], camera_frame_axes[:, 0, 0])
+    in_range = np.flatnonzero(_distance(centre, cam_to_ego[front_camera]) <= REACH[label])
+    ground = torch.from_numpy(np.column_stack([centre[:, [0, 2]], size[:, [0, 2]], -yaw])[in_range])
+    survivors = rotated_nms(
+        ground, torch.from_numpy(score[in_range]), torch.from_numpy(label[in_range]), threshold=OVERLAP
+    )
+    rows = in_range[survivors.numpy()]
     if len(rows) > MOST:
         rows = rows[np.argsort(-score[rows], kind="stable")[:MOST]]
-    moved = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
-    names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows], attribute[rows], strict=True))
+    world_velocity = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
+    names = tuple(
+        _attribute(int(class_index), int(attribute_index))
+        for class_index, attribute_index in zip(label[rows], attribute[rows], strict=True)
+    )
     rotation = matrix_to_quaternion(pose[:3, :3] @ camera_axes(yaw[rows]))
     return DetectedBoxes(
-        world[rows],
+        world_centre[rows],
         size[rows][:, size_columns("lhw", "lwh")],
         rotation,
-        moved[:, :2],
+        world_velocity[:, :2],
         score[rows],
         label[rows].astype(np.int32),
         names,
@@ -107,21 +116,29 @@ def merge_cameras(
 
 
 def _empty() -> DetectedBoxes:
-    none = np.zeros((0, 3))
-    return DetectedBoxes(none, none, np.zeros((0, 4)), none[:, :2], none[:, 0], np.zeros(0, np.int32), ())
+    empty_vectors = np.zeros((0, 3))
+    return DetectedBoxes(
+        empty_vectors,
+        empty_vectors,
+        np.zeros((0, 4)),
+        empty_vectors[:, :2],
+        empty_vectors[:, 0],
+        np.zeros(0, np.int32),
+        (),
+    )
 
 
 def _distance(centre: F64, to_ego: F64) -> F64:
-    """Distances [N] on the ground from the ego to points [N, 3] of a camera's frame."""
+    """Return the distances [N] on the ground from the ego to points [N, 3] of a camera's frame."""
     return np.asarray(np.linalg.norm((centre @ to_ego[:3, :3].T + to_ego[:3, 3])[:, :2], axis=1))
 
 
 def _flat(velocity: F64) -> F64:
-    """Velocities [N, 3] of x and z [N, 2] in a camera's frame."""
+    """Return velocities [N, 3] from x and z [N, 2] in a camera's frame."""
     return np.stack([velocity[:, 0], np.zeros(len(velocity)), velocity[:, 1]], -1)
 
 
 def _attribute(label: int, attribute: int) -> str:
-    """The attribute's name where it fits the class, else the class's usual one."""
-    name, usual = MMDET3D_ATTRIBUTES[attribute], USUAL_ATTRIBUTE[MMDET3D_CLASSES[label]]
-    return name if name.split(".")[0] == usual.split(".")[0] else usual
+    """Return the attribute's name if it fits the class, else the class's default."""
+    name, class_default = MMDET3D_ATTRIBUTES[attribute], USUAL_ATTRIBUTE[MMDET3D_CLASSES[label]]
+    return name if name.split(".")[0] == class_default.split(".")[0] else class_default

@@ -1,4 +1,4 @@
-"""Target assignment: which object each location should predict, and with which values."""
+"""Target assignment: the object that each place should predict, and its values."""
 
 from __future__ import annotations
 
@@ -37,28 +37,35 @@ def assign(
     Raises:
         ConfigError: The truth has no 3D boxes.
     """
-    for k, one in enumerate(truth):
-        if one.solid is None:
-            raise ConfigError(f"{config.name}: the truth of image {k} has no 3D boxes")
-        if one.label.device.type == "cpu" and bool(((one.label < 0) | (one.label >= len(MMDET3D_CLASSES))).any()):
-            raise ConfigError(f"{config.name}: a label of image {k} is none of the ten classes")
+    for image_index, image_truth in enumerate(truth):
+        if image_truth.solid is None:
+            raise ConfigError(f"{config.name}: the truth of image {image_index} has no 3D boxes")
+        # On a GPU this check would wait for all queued work.
+        if image_truth.label.device.type == "cpu" and bool(
+            ((image_truth.label < 0) | (image_truth.label >= len(MMDET3D_CLASSES))).any()
+        ):
+            raise ConfigError(f"{config.name}: a label of image {image_index} is none of the ten classes")
     count = len(places.stride)
     device, dtype = places.xy.device, places.xy.dtype
-    if not any(len(one.label) for one in truth):
-        none = torch.full((len(truth), count), -1, dtype=torch.int64, device=device)
-        reg = torch.zeros((len(truth), count, 13), dtype=dtype, device=device)
+    if not any(len(image_truth.label) for image_truth in truth):
+        no_label = torch.full((len(truth), count), -1, dtype=torch.int64, device=device)
+        regression = torch.zeros((len(truth), count, 13), dtype=dtype, device=device)
         extra = {
-            "reg": reg,
-            "attribute": torch.full_like(none, NO_ATTRIBUTE),
-            "centreness": reg[..., 0].clone(),
+            "reg": regression,
+            "attribute": torch.full_like(no_label, NO_ATTRIBUTE),
+            "centreness": regression[..., 0].clone(),
         }
-        return Assignment(none, none.clone(), tuple(truth), extra)
+        return Assignment(no_label, no_label.clone(), tuple(truth), extra)
     label, owner, extra = _all(config, places, _pad(truth, device, dtype), lens, scale, above=above)
     return Assignment(label, owner, tuple(truth), extra)
 
 
 class _Padded(NamedTuple):
-    """Objects of B images side by side, Q of each; real [B, Q]: those that are there and are no crowd."""
+    """Objects of B images side by side, Q of each.
+
+    Attributes:
+        real: [B, Q] Whether a row holds an object that is no crowd.
+    """
 
     real: Tensor
     label: Tensor
@@ -71,22 +78,25 @@ class _Padded(NamedTuple):
 
 
 def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _Padded:
-    solids = [one.solid for one in truth if one.solid is not None]
+    solids = [image_truth.solid for image_truth in truth if image_truth.solid is not None]
 
     def side_by_side(values: Sequence[Tensor]) -> Tensor:
-        one = pad_sequence(list(values), batch_first=True).to(device)
-        return one.to(dtype) if one.is_floating_point() else one
+        padded = pad_sequence(list(values), batch_first=True).to(device)
+        return padded.to(dtype) if padded.is_floating_point() else padded
 
-    real = [torch.ones_like(one.label, dtype=torch.bool) if one.crowd is None else ~one.crowd for one in truth]
+    real = [
+        torch.ones_like(image_truth.label, dtype=torch.bool) if image_truth.crowd is None else ~image_truth.crowd
+        for image_truth in truth
+    ]
     return _Padded(
         side_by_side(real),
-        side_by_side([one.label for one in truth]),
-        side_by_side([one.box for one in truth]),
-        side_by_side([s.centre for s in solids]),
-        side_by_side([s.size_lhw for s in solids]),
-        side_by_side([s.yaw for s in solids]),
-        side_by_side([s.velocity for s in solids]),
-        side_by_side([s.attribute for s in solids]),
+        side_by_side([image_truth.label for image_truth in truth]),
+        side_by_side([image_truth.box for image_truth in truth]),
+        side_by_side([solid.centre for solid in solids]),
+        side_by_side([solid.size_lhw for solid in solids]),
+        side_by_side([solid.yaw for solid in solids]),
+        side_by_side([solid.velocity for solid in solids]),
+        side_by_side([solid.attribute for solid in solids]),
     )
 
 
@@ -96,40 +106,41 @@ def _all(
     """Label and owner [B, P] of every place, and what it should say."""
     centre = project(objects.centre, lens[:, None])  # [B, Q, 2] in the network's input
     box = objects.box * scale.to(objects.box).repeat(2) + objects.box.new_tensor([0.0, above]).repeat(2)
-    away = places.xy[:, None] - centre[:, None]  # [B, P, Q, 2]
+    centre_offset = places.xy[:, None] - centre[:, None]  # [B, P, Q, 2]
     xy = places.xy[:, None]
     sides = torch.cat([xy - box[:, None, :, :2], box[:, None, :, 2:] - xy], -1)
+    # The first range starts below 0, so that it includes every small object.
     limit = places.xy.new_tensor([-1.0, *config.ranges])
     widest = sides.amax(-1)
-    fits = (widest >= limit[places.level][:, None]) & (widest <= limit[places.level + 1][:, None])
-    fits &= (away.abs() < config.radius * places.stride[:, None, None]).all(-1) & objects.real[:, None]
-    least, nearest = torch.where(fits, away.norm(dim=-1), FAR).min(2)
-    found = least < FAR
+    is_candidate = (widest >= limit[places.level][:, None]) & (widest <= limit[places.level + 1][:, None])
+    is_candidate &= (centre_offset.abs() < config.radius * places.stride[:, None, None]).all(-1) & objects.real[:, None]
+    nearest_distance, nearest = torch.where(is_candidate, centre_offset.norm(dim=-1), FAR).min(2)
+    is_object = nearest_distance < FAR
 
-    def of(values: Tensor) -> Tensor:
-        """Those of the nearest object, [B, P, ...]."""
+    def gather_nearest(values: Tensor) -> Tensor:
+        """Return the values [B, P, ...] of the nearest object."""
         index = nearest.reshape(*nearest.shape, *(1,) * (values.ndim - 2)).expand(-1, -1, *values.shape[2:])
         return values.gather(1, index)
 
-    picked = places.xy - of(centre)
+    offset = places.xy - gather_nearest(centre)
     stride = places.stride[:, None]
-    near = of(box)
+    nearest_box = gather_nearest(box)
     local = objects.yaw - torch.atan2(objects.centre[..., 0], objects.centre[..., 2])
-    reg = torch.cat(
+    regression = torch.cat(
         [
-            picked / stride,
-            of(objects.centre)[..., 2:],
-            of(objects.size_lhw),
-            of(local)[..., None],
-            of(objects.velocity),
-            torch.cat([places.xy - near[..., :2], near[..., 2:] - places.xy], -1) / stride,
+            offset / stride,
+            gather_nearest(objects.centre)[..., 2:],
+            gather_nearest(objects.size_lhw),
+            gather_nearest(local)[..., None],
+            gather_nearest(objects.velocity),
+            torch.cat([places.xy - nearest_box[..., :2], nearest_box[..., 2:] - places.xy], -1) / stride,
         ],
         -1,
     )
-    relative = picked.norm(dim=-1) / (1.414 * config.radius * places.stride)
+    relative_distance = offset.norm(dim=-1) / (1.414 * config.radius * places.stride)
     extra = {
-        "reg": torch.where(found[..., None], reg, torch.zeros_like(reg)),
-        "attribute": torch.where(found, of(objects.attribute), NO_ATTRIBUTE),
-        "centreness": torch.where(found, torch.exp(-2.5 * relative), torch.zeros_like(relative)),
+        "reg": torch.where(is_object[..., None], regression, torch.zeros_like(regression)),
+        "attribute": torch.where(is_object, gather_nearest(objects.attribute), NO_ATTRIBUTE),
+        "centreness": torch.where(is_object, torch.exp(-2.5 * relative_distance), torch.zeros_like(relative_distance)),
     }
-    return torch.where(found, of(objects.label), -1), torch.where(found, nearest, -1), extra
+    return torch.where(is_object, gather_nearest(objects.label), -1), torch.where(is_object, nearest, -1), extra

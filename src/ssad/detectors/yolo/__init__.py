@@ -1,1 +1,1 @@
-"""YOLOv3 and YOLOv5: anchors with objectness, written from the papers and the published layer tables."""
+"""YOLOv3 and YOLOv5 detectors with anchors and objectness, written from the papers and published layer tables."""

@@ -1,4 +1,4 @@
-"""Target assignment: to the best anchor (YOLOv3), or to all anchors that fit and the neighbouring cells (YOLOv5).
+"""Target assignment: to the best anchor (YOLOv3), or to all fitting anchors and the neighbouring cells (YOLOv5).
 
 Boxes are in pixels of the network's own input. Nothing here is differentiable.
 """
@@ -22,7 +22,15 @@ BACKGROUND, IGNORED = -1, -2
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """Objects of all images, filled up to Q: label [B, Q], box [B, Q, 4], real [B, Q] (not filling), crowd [B, Q]."""
+    """Objects of all images, padded to Q.
+
+    Attributes:
+        label: [B, Q].
+        box: [B, Q, 4].
+        real: [B, Q] Whether a row is an object, not padding.
+        crowd: [B, Q] Whether an object is a crowd.
+        crowded: Whether the truth distinguishes crowds at all.
+    """
 
     label: Tensor
     box: Tensor
@@ -32,35 +40,38 @@ class Targets:
 
 
 def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets:
-    """Truth of all images, padded to the same number of objects.
+    """Pad the truth of all images to the same number of objects.
 
     Args:
         truth: Truth of each image.
-        scale: Factor of the boxes [4]; the result has its device and dtype.
+        scale: Factors of the boxes [4]; the result has its device and dtype.
         classes: Number of classes.
 
     Raises:
         ConfigError: A label is out of range, a box is not finite or empty, or the shapes do not match.
     """
     labels, boxes, crowds = [], [], []
-    for image, one in enumerate(truth):
-        count = len(one.label)
-        if one.box.shape != (count, 4) or (one.crowd is not None and one.crowd.shape != (count,)):
-            raise ConfigError(f"truth of image {image}: label [Q], box [Q, 4] and crowd [Q] must go together")
-        labels.append(one.label.to(scale.device, torch.int64))
-        boxes.append(one.box.detach().to(scale.device, scale.dtype))
-        crowd = one.crowd if one.crowd is not None else torch.zeros(count, dtype=torch.bool)
+    for image_index, image_truth in enumerate(truth):
+        count = len(image_truth.label)
+        if image_truth.box.shape != (count, 4) or (
+            image_truth.crowd is not None and image_truth.crowd.shape != (count,)
+        ):
+            raise ConfigError(f"truth of image {image_index}: label [Q], box [Q, 4] and crowd [Q] must go together")
+        labels.append(image_truth.label.to(scale.device, torch.int64))
+        boxes.append(image_truth.box.detach().to(scale.device, scale.dtype))
+        crowd = image_truth.crowd if image_truth.crowd is not None else torch.zeros(count, dtype=torch.bool)
         crowds.append(crowd.to(scale.device, torch.bool))
     label, box, crowd, real = _padded(labels, boxes, crowds)
-    wrong = (label < 0) | (label >= classes)
-    wrong |= ~(box.isfinite().all(-1) & (box[..., 2:] > box[..., :2]).all(-1))
-    if bool((wrong & real).any()):
-        image, row = (int(index) for index in (wrong & real).nonzero()[0])
+    is_invalid = (label < 0) | (label >= classes)
+    is_invalid |= ~(box.isfinite().all(-1) & (box[..., 2:] > box[..., :2]).all(-1))
+    if bool((is_invalid & real).any()):
+        image_index, row = (int(index) for index in (is_invalid & real).nonzero()[0])
         raise ConfigError(
-            f"truth of image {image}, object {row}: label {int(label[image, row])}, box {box[image, row].tolist()}; "
+            f"truth of image {image_index}, object {row}: label {int(label[image_index, row])}, "
+            f"box {box[image_index, row].tolist()}; "
             f"labels go from 0 to {classes - 1}, boxes are finite x1 < x2, y1 < y2"
         )
-    return Targets(label, box * scale, real, crowd, any(one.crowd is not None for one in truth))
+    return Targets(label, box * scale, real, crowd, any(image_truth.crowd is not None for image_truth in truth))
 
 
 def _padded(*columns: list[Tensor]) -> tuple[Tensor, ...]:
@@ -68,120 +79,126 @@ def _padded(*columns: list[Tensor]) -> tuple[Tensor, ...]:
 
     Few steps for all images: one for each image is what a GPU would wait for.
     """
-    counts = torch.tensor([len(one) for one in columns[0]])
+    counts = torch.tensor([len(image_values) for image_values in columns[0]])
     real = torch.arange(int(counts.max())) < counts[:, None]
     place = real.view(-1).nonzero()[:, 0].to(columns[0][0].device, non_blocking=True)
-    found = []
+    padded_columns = []
     for column in columns:
         rows = torch.cat(column)
-        whole = rows.new_zeros(real.numel(), *rows.shape[1:])
-        whole[place] = rows
-        found.append(whole.view(*real.shape, *rows.shape[1:]))
-    return (*found, real.to(place.device, non_blocking=True))
+        padded = rows.new_zeros(real.numel(), *rows.shape[1:])
+        padded[place] = rows
+        padded_columns.append(padded.view(*real.shape, *rows.shape[1:]))
+    return (*padded_columns, real.to(place.device, non_blocking=True))
 
 
 def match_best(targets: Targets, grid: Grid, places: int) -> Tensor:
-    """Target assignment of YOLOv3: each object to the anchor of its shape, at the cell that contains its middle.
+    """Assign each object to the anchor of its shape, at the cell that contains its centre (YOLOv3).
 
-    Of all anchors it is the one with the largest IoU when the middles coincide. Of two objects at one place, the one
+    Of all anchors, the one with the largest IoU at a common centre is taken. Of two objects at one place, the one
     with the better shape wins.
 
     Args:
         targets: Objects of all images.
-        grid: Places of the pictures.
+        grid: Places of the images.
         places: Number of places P.
 
     Returns:
         Owner [B, P]: index of the object, -1 for none.
     """
-    size, middle = _size_and_middle(targets.box)
-    shape = _shape_iou(size, grid.anchors.flatten(0, 1))
-    quality, best = shape.max(-1)
-    count = grid.anchors.shape[1]
-    level, anchor = best // count, best % count
+    size, centre = _size_and_middle(targets.box)
+    shape_overlap = _shape_iou(size, grid.anchors.flatten(0, 1))
+    quality, best_anchor = shape_overlap.max(-1)
+    anchor_count = grid.anchors.shape[1]
+    level, anchor = best_anchor // anchor_count, best_anchor % anchor_count
     rows, columns, start, stride = _levels(grid)
-    cell = (middle / stride[level][..., None]).floor().long()
-    x = cell[..., 0].clamp(min=0).minimum(columns[level] - 1)
-    y = cell[..., 1].clamp(min=0).minimum(rows[level] - 1)
-    place = start[level] + (anchor * rows[level] + y) * columns[level] + x
+    cell = (centre / stride[level][..., None]).floor().long()
+    column = cell[..., 0].clamp(min=0).minimum(columns[level] - 1)
+    row = cell[..., 1].clamp(min=0).minimum(rows[level] - 1)
+    place = start[level] + (anchor * rows[level] + row) * columns[level] + column
     return _settle(targets, place[..., None], quality[..., None], targets.real[..., None], places)
 
 
 def match_near(targets: Targets, grid: Grid, places: int) -> Tensor:
-    """Target assignment of YOLOv5: each object to all anchors that fit, at its own cell and two neighbouring ones.
+    """Assign each object to all fitting anchors, at its own cell and two neighbouring ones (YOLOv5).
 
     An anchor fits if its width and height are within a factor of four of the object's. The cells are the one that
-    contains the middle, the nearest one beside it, and the nearest one above or below it, as far as they are on the
-    map. Of several objects at one place, the one closest to the anchor in shape wins.
+    contains the centre, the nearest one beside it, and the nearest one above or below it, as far as they are on
+    the map. Of several objects at one place, the one closest to the anchor in shape wins.
 
     Args:
         targets: Objects of all images.
-        grid: Places of the pictures.
+        grid: Places of the images.
         places: Number of places P.
 
     Returns:
         Owner [B, P]: index of the object, -1 for none.
     """
-    size, middle = _size_and_middle(targets.box)
+    size, centre = _size_and_middle(targets.box)
+    # [B, Q, L, A, 2]: every object against every anchor of every level.
     ratio = size[:, :, None, None] / grid.anchors
     fits = torch.maximum(ratio, 1 / ratio).amax(-1) < MAX_RATIO  # [B, Q, L, A]
     quality = _shape_iou(size, grid.anchors.flatten(0, 1)).view_as(fits)
     rows, columns, start, stride = _levels(grid)
     last = torch.stack((columns, rows), -1) - 1
-    at = middle[:, :, None] / stride[:, None]  # [B, Q, L, 2]
-    cell = at.floor().long().clamp(min=0).minimum(last)
-    part = at - cell
-    step = (part > 0.5).long() - (part < 0.5).long()
-    beside = cell + step
-    inside = (step != 0) & (beside >= 0) & (beside <= last)
-    x = torch.stack((cell[..., 0], beside[..., 0], cell[..., 0]), -1)  # [B, Q, L, 3]
-    y = torch.stack((cell[..., 1], cell[..., 1], beside[..., 1]), -1)
-    valid = torch.cat((torch.ones_like(inside[..., :1]), inside), -1)
+    cell_position = centre[:, :, None] / stride[:, None]  # [B, Q, L, 2]
+    cell = cell_position.floor().long().clamp(min=0).minimum(last)
+    fraction = cell_position - cell
+    step = (fraction > 0.5).long() - (fraction < 0.5).long()
+    neighbour = cell + step
+    on_map = (step != 0) & (neighbour >= 0) & (neighbour <= last)
+    x = torch.stack((cell[..., 0], neighbour[..., 0], cell[..., 0]), -1)  # [B, Q, L, 3]
+    y = torch.stack((cell[..., 1], cell[..., 1], neighbour[..., 1]), -1)
+    valid = torch.cat((torch.ones_like(on_map[..., :1]), on_map), -1)
     anchor = torch.arange(grid.anchors.shape[1], device=size.device)[:, None]
-    wide, high = columns[:, None, None], rows[:, None, None]
-    place = start[:, None, None] + (anchor * high + y[..., None, :]) * wide + x[..., None, :]  # [B, Q, L, A, 3]
-    good = fits[..., None] & valid[..., None, :] & targets.real[:, :, None, None, None]
+    map_columns, map_rows = columns[:, None, None], rows[:, None, None]
+    place = (
+        start[:, None, None] + (anchor * map_rows + y[..., None, :]) * map_columns + x[..., None, :]
+    )  # [B, Q, L, A, 3]
+    is_candidate = fits[..., None] & valid[..., None, :] & targets.real[:, :, None, None, None]
     return _settle(
-        targets, place.flatten(2), quality[..., None].expand(place.shape).flatten(2), good.flatten(2), places
+        targets, place.flatten(2), quality[..., None].expand(place.shape).flatten(2), is_candidate.flatten(2), places
     )
 
 
 def label_places(
     targets: Targets, owner: Tensor, predicted: Tensor, *, ignore_objects: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Labels and target boxes of all places.
+    """Return labels and target boxes of all places.
 
-    Places that belong to a crowd object are ignored, and so is background whose predicted box overlaps a crowd object
-    by an IoU of more than 0.5.
+    Places that belong to a crowd object are ignored, and so is background whose predicted box overlaps a crowd
+    object by an IoU of more than 0.5.
 
     Args:
         targets: Objects of all images.
         owner: Index of the object that each place is assigned to [B, P], -1 for none.
         predicted: Predicted boxes [B, P, 4].
-        ignore_objects: Whether background is ignored where its predicted box overlaps any object that much (YOLOv3).
+        ignore_objects: Whether background is ignored where its predicted box overlaps any object that much
+            (YOLOv3).
 
     Returns:
         Label [B, P] (-1 background, -2 ignored), owner [B, P] and target box [B, P, 4] (zeros without an owner).
     """
     batch, places = owner.shape
     if targets.label.shape[1] == 0:
-        nothing = predicted.new_zeros(batch, places, 4)
-        return torch.full_like(owner, BACKGROUND), owner, nothing
-    owned, index = owner >= 0, owner.clamp(min=0)
-    label = torch.where(owned, targets.label.gather(1, index), BACKGROUND)
-    label = torch.where(owned & targets.crowd.gather(1, index), IGNORED, label)
+        no_boxes = predicted.new_zeros(batch, places, 4)
+        return torch.full_like(owner, BACKGROUND), owner, no_boxes
+    has_owner, index = owner >= 0, owner.clamp(min=0)
+    label = torch.where(has_owner, targets.label.gather(1, index), BACKGROUND)
+    label = torch.where(has_owner & targets.crowd.gather(1, index), IGNORED, label)
     if ignore_objects or targets.crowded:
-        hiding = targets.real if ignore_objects else targets.real & targets.crowd
-        first = hiding.long().argsort(dim=1, descending=True, stable=True)[:, : int(hiding.sum(1).max())]
-        near = _touches(predicted, targets.box.gather(1, first[..., None].expand(-1, -1, 4)), hiding.gather(1, first))
-        label = torch.where((label == BACKGROUND) & near, IGNORED, label)
+        hides = targets.real if ignore_objects else targets.real & targets.crowd
+        hiding_index = hides.long().argsort(dim=1, descending=True, stable=True)[:, : int(hides.sum(1).max())]
+        is_hidden = _touches(
+            predicted, targets.box.gather(1, hiding_index[..., None].expand(-1, -1, 4)), hides.gather(1, hiding_index)
+        )
+        label = torch.where((label == BACKGROUND) & is_hidden, IGNORED, label)
     owner = torch.where(label >= 0, owner, -1)
     box = targets.box.gather(1, index[..., None].expand(-1, -1, 4))
     return label, owner, torch.where((label >= 0)[..., None], box, torch.zeros_like(box))
 
 
 def _levels(grid: Grid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows, columns, first place and stride of each level, [L] each."""
+    """Return rows, columns, first place and stride of each level, [L] each."""
     device = grid.cell.device
     shape = torch.tensor(grid.shapes, device=device)
     stride = torch.tensor(grid.strides, device=device, dtype=grid.cell.dtype)
@@ -193,9 +210,9 @@ def _size_and_middle(box: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _shape_iou(size: Tensor, anchors: Tensor) -> Tensor:
-    """IoU [..., A] of sizes [..., 2] and anchors [A, 2] with the same middle."""
-    both = torch.minimum(size[..., None, :], anchors).prod(-1)
-    return both / (size.prod(-1, keepdim=True) + anchors.prod(-1) - both).clamp(min=1e-9)
+    """Return the IoU [..., A] of sizes [..., 2] and anchors [A, 2] about a common centre."""
+    intersection = torch.minimum(size[..., None, :], anchors).prod(-1)
+    return intersection / (size.prod(-1, keepdim=True) + anchors.prod(-1) - intersection).clamp(min=1e-9)
 
 
 def _settle(targets: Targets, place: Tensor, quality: Tensor, good: Tensor, places: int) -> Tensor:
@@ -206,17 +223,18 @@ def _settle(targets: Targets, place: Tensor, quality: Tensor, good: Tensor, plac
     """
     batch = len(place)
     image, row, slot = good.nonzero(as_tuple=True)
-    key = image * places + place[image, row, slot]
-    value = quality[image, row, slot] - 2.0 * targets.crowd[image, row]
+    place_key = image * places + place[image, row, slot]
+    # Quality is an IoU of at most 1, so 2 puts every crowd object below all others.
+    priority = quality[image, row, slot] - 2.0 * targets.crowd[image, row]
     # ranks are unique, so the largest rank at a place names its winner
-    order = (-value).argsort(stable=True)
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(order), 0, -1, device=order.device)
-    best = torch.zeros(batch * places, dtype=torch.int64, device=place.device)
-    best.scatter_reduce_(0, key, rank, "amax")
-    owner = torch.full_like(best, -1)
-    won = best > 0
-    owner[won] = row[order[len(order) - best[won]]]
+    ranking = (-priority).argsort(stable=True)
+    rank = torch.empty_like(ranking)
+    rank[ranking] = torch.arange(len(ranking), 0, -1, device=ranking.device)
+    best_rank = torch.zeros(batch * places, dtype=torch.int64, device=place.device)
+    best_rank.scatter_reduce_(0, place_key, rank, "amax")
+    owner = torch.full_like(best_rank, -1)
+    is_owned = best_rank > 0
+    owner[is_owned] = row[ranking[len(ranking) - best_rank[is_owned]]]
     return owner.view(batch, places)
 
 
@@ -224,8 +242,8 @@ def _touches(predicted: Tensor, box: Tensor, hiding: Tensor) -> Tensor:
     """Whether a predicted box [B, P, 4] overlaps one of the objects [B, Q, 4] that hide [B, Q] by IoU > 0.5. [B, P]."""
     low = torch.maximum(predicted[:, :, None, :2], box[:, None, :, :2])
     high = torch.minimum(predicted[:, :, None, 2:], box[:, None, :, 2:])
-    both = (high - low).clamp_(min=0).prod(-1)
+    intersection = (high - low).clamp_(min=0).prod(-1)
     area = (predicted[..., 2:] - predicted[..., :2]).prod(-1)
-    real = (box[..., 2:] - box[..., :2]).prod(-1)
-    union = area[:, :, None] + real[:, None] - both
-    return ((both > IGNORE_IOU * union) & hiding[:, None]).any(-1)
+    object_area = (box[..., 2:] - box[..., :2]).prod(-1)
+    union = area[:, :, None] + object_area[:, None] - intersection
+    return ((intersection > IGNORE_IOU * union) & hiding[:, None]).any(-1)

@@ -1,6 +1,6 @@
-"""From raw maps to boxes and back, and from scores to detections.
+"""Decoding of raw maps to boxes, and selection of detections from scores.
 
-Here boxes are in pixels of the network's own input unless said otherwise. A place is a cell with one of its anchors;
+Boxes are in pixels of the network's own input unless stated otherwise. A place is a cell with one of its anchors;
 places run over levels (finest first), anchors, rows, columns.
 """
 
@@ -23,17 +23,17 @@ MAX_CANDIDATES = 30_000
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The places of a picture.
+    """The places of an image.
 
     Attributes:
         cell: Column and row [P, 2].
         anchor: Width and height in pixels [P, 2].
-        stride: Of each place [P], pixels.
-        level: Of each place [P].
+        stride: Stride of each place [P], pixels.
+        level: Level of each place [P].
         shapes: Rows and columns of each level.
         start: First place of each level.
         anchors: Width and height in pixels [L, A, 2].
-        strides: Of each level, pixels.
+        strides: Stride of each level, pixels.
     """
 
     cell: Tensor
@@ -47,7 +47,7 @@ class Grid:
 
 
 def make_grid(shapes: Sequence[tuple[int, int]], strides: Sequence[int], anchors: Tensor) -> Grid:
-    """Places of maps with these rows and columns; anchors [L, A, 2] give device and dtype."""
+    """Return the places of maps with these rows and columns; anchors [L, A, 2] give device and dtype."""
     count = anchors.shape[1]
     device, dtype = anchors.device, anchors.dtype
     cells, sizes, start = [], [], [0]
@@ -57,8 +57,9 @@ def make_grid(shapes: Sequence[tuple[int, int]], strides: Sequence[int], anchors
         cells.append(torch.stack((x, y), -1).reshape(1, -1, 2).expand(count, -1, 2).reshape(-1, 2))
         sizes.append(level[:, None].expand(-1, rows * columns, 2).reshape(-1, 2))
         start.append(start[-1] + count * rows * columns)
-    many = torch.tensor([end - first for first, end in pairwise(start)], device=device)
-    level = torch.arange(len(strides), device=device).repeat_interleave(many, output_size=start[-1])
+    # output_size below spares a GPU from waiting for the counts.
+    place_counts = torch.tensor([end - begin for begin, end in pairwise(start)], device=device)
+    level = torch.arange(len(strides), device=device).repeat_interleave(place_counts, output_size=start[-1])
     stride = torch.tensor(strides, device=device, dtype=dtype)[level]
     return Grid(
         torch.cat(cells), torch.cat(sizes), stride, level, tuple(shapes), tuple(start[:-1]), anchors, tuple(strides)
@@ -66,14 +67,14 @@ def make_grid(shapes: Sequence[tuple[int, int]], strides: Sequence[int], anchors
 
 
 def flatten(maps: Sequence[Tensor], anchors: int) -> Tensor:
-    """Raw maps [B, A * K, h, w] as [B, P, K], in float32 at least."""
-    parts = []
-    for part in maps:
-        full = part.float() if part.dtype in {torch.float16, torch.bfloat16} else part
-        batch, channels, rows, columns = full.shape
-        split = full.reshape(batch, anchors, channels // anchors, rows * columns)
-        parts.append(split.transpose(2, 3).reshape(batch, anchors * rows * columns, channels // anchors))
-    return torch.cat(parts, 1)
+    """Flatten raw maps [B, A * K, h, w] to [B, P, K], in float32 at least."""
+    rows_by_level = []
+    for level_map in maps:
+        float_map = level_map.float() if level_map.dtype in {torch.float16, torch.bfloat16} else level_map
+        batch, channels, rows, columns = float_map.shape
+        by_anchor = float_map.reshape(batch, anchors, channels // anchors, rows * columns)
+        rows_by_level.append(by_anchor.transpose(2, 3).reshape(batch, anchors * rows * columns, channels // anchors))
+    return torch.cat(rows_by_level, 1)
 
 
 def to_corners(middle: Tensor, size: Tensor) -> Tensor:
@@ -82,56 +83,58 @@ def to_corners(middle: Tensor, size: Tensor) -> Tensor:
 
 
 def decode(rule: str, raw: Tensor, grid: Grid) -> Tensor:
-    """Boxes [..., P, 4] from the first four raw numbers [..., P, 4].
+    """Return boxes [..., P, 4] from the first four raw numbers [..., P, 4].
 
-    v3 (paper, section 2.1): middle (sigmoid(t) + cell) * stride, size anchor * exp(t), with t at most ln 1000.
-    v5 (published formulas): middle (2 sigmoid(t) - 0.5 + cell) * stride, size anchor * (2 sigmoid(t))^2.
+    v3 (paper, section 2.1): centre (sigmoid(t) + cell) * stride, size anchor * exp(t), with t at most ln 1000.
+    v5 (published formulas): centre (2 sigmoid(t) - 0.5 + cell) * stride, size anchor * (2 sigmoid(t))^2.
     """
     stride = grid.stride[:, None]
     if rule == "v3":
-        middle = (raw[..., :2].sigmoid() + grid.cell) * stride
-        return to_corners(middle, grid.anchor * raw[..., 2:].clamp(max=MAX_LOG_SIZE).exp())
-    share = 2 * raw.sigmoid()
-    return to_corners((share[..., :2] - 0.5 + grid.cell) * stride, grid.anchor * share[..., 2:] ** 2)
+        centre = (raw[..., :2].sigmoid() + grid.cell) * stride
+        return to_corners(centre, grid.anchor * raw[..., 2:].clamp(max=MAX_LOG_SIZE).exp())
+    doubled = 2 * raw.sigmoid()
+    return to_corners((doubled[..., :2] - 0.5 + grid.cell) * stride, grid.anchor * doubled[..., 2:] ** 2)
 
 
 def select(
     score: Tensor, box: Tensor, *, threshold: float, iou: float, limit: int, size: tuple[int, int]
 ) -> list[Detections]:
-    """Detections of each image, by suppression within each class.
+    """Return the detections of each image after suppression within each class.
 
-    Candidates of all images are brought to the host at once, where suppression, a chain of small steps, runs.
+    Candidates of all images are moved to the host at once, where suppression, a chain of small steps, runs.
 
     Args:
-        score: Scores [B, P, C]; each class of each place above the threshold is a candidate, up to the 30,000 best of
-            an image.
-        box: Boxes [B, P, 4]; they are clipped to the picture.
+        score: Scores [B, P, C]; each class of each place above the threshold is a candidate, up to the 30,000
+            best of an image.
+        box: Boxes [B, P, 4]; they are clipped to the image.
         threshold: Scores must be above it.
         iou: IoU above which the worse of two boxes of a class is dropped.
         limit: Maximum number of detections.
-        size: Height and width of the picture.
+        size: Height and width of the image.
 
     Returns:
         The detections, best first.
     """
-    # NaN is above nothing, so broken weights give no detections instead of boxes that are none
+    # NaN compares as false, so broken weights give no detections instead of invalid boxes
     usable = (score > threshold) & box.isfinite().all(-1, keepdim=True)
     image, place, label = usable.nonzero(as_tuple=True)
     values, boxes = score[image, place, label].cpu(), box[image, place].cpu()
-    count = torch.bincount(image.cpu(), minlength=len(score)).tolist()
-    chosen, first = [], 0
+    candidate_counts = torch.bincount(image.cpu(), minlength=len(score)).tolist()
+    kept_rows, first_row = [], 0
     label = label.cpu()
-    for many in count:
-        own = slice(first, first + many)
-        rows = first + values[own].argsort(descending=True, stable=True)[:MAX_CANDIDATES]
+    for candidate_count in candidate_counts:
+        image_rows = slice(first_row, first_row + candidate_count)
+        rows = first_row + values[image_rows].argsort(descending=True, stable=True)[:MAX_CANDIDATES]
         # float64: suppression by class shifts boxes far apart, and float32 would round them there
-        if many > 1:
+        if candidate_count > 1:
             rows = rows[batched_nms(boxes[rows].double(), values[rows].double(), label[rows], iou)]
-        chosen.append(rows[:limit])
-        first += many
-    keep = torch.cat([torch.zeros(0, dtype=torch.int64), *chosen])
+        kept_rows.append(rows[:limit])
+        first_row += candidate_count
+    survivors = torch.cat([torch.zeros(0, dtype=torch.int64), *kept_rows])
     height, width = size
-    edge = torch.tensor([width, height, width, height], dtype=box.dtype)
-    columns = values[keep], label[keep], boxes[keep].clamp(min=0).minimum(edge)
-    parts = zip(*(torch.split(v.to(box.device), [len(rows) for rows in chosen]) for v in columns), strict=True)
-    return [Detections(*part) for part in parts]
+    limit_corner = torch.tensor([width, height, width, height], dtype=box.dtype)
+    columns = values[survivors], label[survivors], boxes[survivors].clamp(min=0).minimum(limit_corner)
+    columns_by_image = zip(
+        *(torch.split(column.to(box.device), [len(rows) for rows in kept_rows]) for column in columns), strict=True
+    )
+    return [Detections(*image_columns) for image_columns in columns_by_image]

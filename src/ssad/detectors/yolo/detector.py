@@ -75,16 +75,16 @@ class Yolo(Adapter):
             ConfigError: The images have another shape or type.
         """
         size = check_images(self.name, images, least=0)
-        inside = size_inside(size, self.input_width)
+        input_size = size_inside(size, self.input_width)
         images = images.to(next(self.network.parameters()).dtype)
-        raw, neck = self.network(resize_and_pad(images, inside, multiple=MULTIPLE, grey=self.spec.grey))
-        grid = self._grid([(part.shape[2], part.shape[3]) for part in raw])
-        values = flatten(raw, self.anchors.shape[1])
-        scale = self._scale(size, values)
-        box = decode(self.spec.rule, values[..., :4], grid) / scale
+        raw, neck = self.network(resize_and_pad(images, input_size, multiple=MULTIPLE, grey=self.spec.grey))
+        grid = self._grid([(level_map.shape[2], level_map.shape[3]) for level_map in raw])
+        flat_raw = flatten(raw, self.anchors.shape[1])
+        scale = self._scale(size, flat_raw)
+        box = decode(self.spec.rule, flat_raw[..., :4], grid) / scale
         return Dense(
-            logit=values[..., 5:],
-            quality=values[..., 4],
+            logit=flat_raw[..., 5:],
+            quality=flat_raw[..., 4],
             box=box,
             place=(grid.cell + 0.5) * grid.stride[:, None] / scale[:2],
             stride=grid.stride / scale[0],
@@ -102,10 +102,12 @@ class Yolo(Adapter):
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """The detector's own assignment; extra: box [B, P, 4], the target in pixels of the picture, zeros without one.
+        """Assign targets by the rule of the detector.
+
+        extra: box [B, P, 4], the target in pixels of the image, zeros without one.
 
         Raises:
-            ConfigError: The truth does not belong to the images, or is broken (labels out of range, empty boxes).
+            ConfigError: The truth does not belong to the images, or is invalid (labels out of range, empty boxes).
         """
         scale = self._scale(dense.size, dense.box)
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
@@ -118,17 +120,17 @@ class Yolo(Adapter):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """Training losses box, obj and cls; see `losses_v3` and `losses_v5`.
+        """Return the training losses box, obj and cls; see `losses_v3` and `losses_v5`.
 
         Raises:
-            ConfigError: The assignment was made for other pictures.
+            ConfigError: The assignment was made for other images.
         """
         if dense.quality is None or assignment.label.shape != dense.quality.shape:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         grid = self._grid_of(dense)
         scale = self._scale(dense.size, dense.box)
         raw = flatten(dense.maps["raw"], self.anchors.shape[1])
-        answers = Answers(
+        loss_inputs = Answers(
             raw[..., :4],
             dense.box * scale,
             dense.quality,
@@ -137,13 +139,13 @@ class Yolo(Adapter):
             assignment.extra["box"].to(scale) * scale,
             self._padded(dense.size),
         )
-        kind: Reduction = reduction
+        loss_reduction: Reduction = reduction
         if self.spec.rule == "v3":
-            return losses_v3(answers, grid, box_loss=self.spec.box_loss, reduction=kind)
-        return losses_v5(answers, grid, reduction=kind)
+            return losses_v3(loss_inputs, grid, box_loss=self.spec.box_loss, reduction=loss_reduction)
+        return losses_v5(loss_inputs, grid, reduction=loss_reduction)
 
     def _padded(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the network's input."""
+        """Return height and width of the network's input."""
         height, width = size_inside(size, self.input_width)
         return -(-height // MULTIPLE) * MULTIPLE, -(-width // MULTIPLE) * MULTIPLE
 
@@ -151,10 +153,11 @@ class Yolo(Adapter):
         return scale_of(size_inside(size, self.input_width), size, like)
 
     def _grid(self, shapes: list[tuple[int, int]]) -> Grid:
+        # Half precision would round anchors and cells of large images.
         anchors = self.anchors
         return make_grid(
             shapes, self.spec.strides, anchors.float() if anchors.dtype in {torch.float16, torch.bfloat16} else anchors
         )
 
     def _grid_of(self, dense: Dense) -> Grid:
-        return self._grid([(part.shape[2], part.shape[3]) for part in dense.maps["raw"]])
+        return self._grid([(level_map.shape[2], level_map.shape[3]) for level_map in dense.maps["raw"]])

@@ -23,13 +23,13 @@ class ConvUnit(nn.Module):
         self.activation: nn.Module = nn.SiLU() if smooth else nn.LeakyReLU(0.1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The activated map."""
-        result: Tensor = self.activation(self.norm(self.conv(x)))
-        return result
+        """Return the activated map."""
+        output: Tensor = self.activation(self.norm(self.conv(x)))
+        return output
 
 
 class Residual(nn.Module):
-    """1x1 to `hidden` channels, 3x3 back to as many as came in; the input is added when `add`."""
+    """1x1 to `hidden` channels, 3x3 back to the input's channels; the input is added if `add`."""
 
     def __init__(self, channels: int, hidden: int, *, smooth: bool, add: bool = True) -> None:
         super().__init__()
@@ -38,9 +38,9 @@ class Residual(nn.Module):
         self.add = add
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, c, h, w] -> [B, c, h, w]."""
-        y: Tensor = self.expand(self.reduce(x))
-        return x + y if self.add else y
+        """Return a map [B, c, h, w] of the input's shape."""
+        residual: Tensor = self.expand(self.reduce(x))
+        return x + residual if self.add else residual
 
 
 class C3(nn.Module):
@@ -55,9 +55,9 @@ class C3(nn.Module):
         self.blocks = nn.Sequential(*(Residual(half, half, smooth=True, add=add) for _ in range(repeats)))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, i, h, w] -> [B, o, h, w]."""
-        result: Tensor = self.merge(torch.cat((self.blocks(self.through(x)), self.past(x)), 1))
-        return result
+        """Return [B, o, h, w] from [B, i, h, w]."""
+        output: Tensor = self.merge(torch.cat((self.blocks(self.through(x)), self.past(x)), 1))
+        return output
 
 
 class SPPF(nn.Module):
@@ -70,19 +70,20 @@ class SPPF(nn.Module):
         self.merge = ConvUnit(4 * half, outputs, smooth=True)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, i, h, w] -> [B, o, h, w]."""
+        """Return [B, o, h, w] from [B, i, h, w]."""
         maps = [self.reduce(x)]
+        # Chained 5x5 poolings equal poolings of 5, 9 and 13, at a lower cost.
         for _ in range(3):
             maps.append(functional.max_pool2d(maps[-1], 5, stride=1, padding=2))
-        result: Tensor = self.merge(torch.cat(maps, 1))
-        return result
+        output: Tensor = self.merge(torch.cat(maps, 1))
+        return output
 
 
 def pool_same(x: Tensor) -> Tensor:
-    """2x2 pooling of stride 1 that keeps the size, as darknet does: one row and column more at the right and bottom."""
+    """Pool 2x2 with stride 1 and keep the size, as darknet does: pads one row and column at the bottom and right."""
     return functional.max_pool2d(functional.pad(x, (0, 1, 0, 1), value=-torch.inf), 2, stride=1)
 
 
 def upsample(x: Tensor) -> Tensor:
-    """Twice the size, nearest neighbour."""
+    """Double the size by nearest neighbour."""
     return functional.interpolate(x, scale_factor=2.0, mode="nearest")

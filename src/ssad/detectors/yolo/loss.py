@@ -47,17 +47,18 @@ class Answers:
 def ciou(box: Tensor, target: Tensor) -> Tensor:
     """Complete IoU [N] of pairs of boxes [N, 4] (Zheng et al. 2020): IoU less distance and difference of aspect."""
     eps = 1e-7
-    low, high = torch.maximum(box[:, :2], target[:, :2]), torch.minimum(box[:, 2:], target[:, 2:])
-    both = (high - low).clamp(min=0).prod(-1)
-    size, real = box[:, 2:] - box[:, :2], target[:, 2:] - target[:, :2]
-    overlap = both / (size.prod(-1) + real.prod(-1) - both + eps)
-    hull = torch.maximum(box[:, 2:], target[:, 2:]) - torch.minimum(box[:, :2], target[:, :2])
-    apart = ((box[:, :2] + box[:, 2:] - target[:, :2] - target[:, 2:]) ** 2).sum(-1) / 4
-    angle = torch.atan(real[:, 0] / (real[:, 1] + eps)) - torch.atan(size[:, 0] / (size[:, 1] + eps))
+    lower, upper = torch.maximum(box[:, :2], target[:, :2]), torch.minimum(box[:, 2:], target[:, 2:])
+    intersection = (upper - lower).clamp(min=0).prod(-1)
+    size, target_size = box[:, 2:] - box[:, :2], target[:, 2:] - target[:, :2]
+    overlap = intersection / (size.prod(-1) + target_size.prod(-1) - intersection + eps)
+    enclosing_size = torch.maximum(box[:, 2:], target[:, 2:]) - torch.minimum(box[:, :2], target[:, :2])
+    centre_distance = ((box[:, :2] + box[:, 2:] - target[:, :2] - target[:, 2:]) ** 2).sum(-1) / 4
+    angle = torch.atan(target_size[:, 0] / (target_size[:, 1] + eps)) - torch.atan(size[:, 0] / (size[:, 1] + eps))
     aspect = 4 / math.pi**2 * angle**2
+    # The weight is a constant for the gradient, as in the paper's reference.
     with torch.no_grad():
         weight = aspect / (1 - overlap + aspect + eps)
-    return overlap - apart / ((hull**2).sum(-1) + eps) - weight * aspect
+    return overlap - centre_distance / ((enclosing_size**2).sum(-1) + eps) - weight * aspect
 
 
 def losses_v3(answers: Answers, grid: Grid, *, box_loss: str, reduction: Reduction) -> dict[str, Tensor]:
@@ -70,23 +71,23 @@ def losses_v3(answers: Answers, grid: Grid, *, box_loss: str, reduction: Reducti
     """
     image, place = (answers.label >= 0).nonzero(as_tuple=True)
     target = answers.target[image, place]
-    share = (target[:, 2:] - target[:, :2]).prod(-1) / (answers.size[0] * answers.size[1])
+    image_share = (target[:, 2:] - target[:, :2]).prod(-1) / (answers.size[0] * answers.size[1])
     if box_loss == "squares":
         raw = answers.raw[image, place]
-        part = (target[:, :2] + target[:, 2:]) / 2 / grid.stride[place, None] - grid.cell[place]
-        size = ((target[:, 2:] - target[:, :2]) / grid.anchor[place]).log()
-        box = 0.5 * (((raw[:, :2].sigmoid() - part) ** 2).sum(-1) + ((raw[:, 2:] - size) ** 2).sum(-1))
+        loss_part = (target[:, :2] + target[:, 2:]) / 2 / grid.stride[place, None] - grid.cell[place]
+        log_size = ((target[:, 2:] - target[:, :2]) / grid.anchor[place]).log()
+        box = 0.5 * (((raw[:, :2].sigmoid() - loss_part) ** 2).sum(-1) + ((raw[:, 2:] - log_size) ** 2).sum(-1))
     else:
         box = 1 - ciou(answers.box[image, place], target)
-    found = (answers.label >= 0).to(answers.objectness.dtype)
-    counted = answers.label != -2
-    every = cross_entropy(answers.objectness, found, reduction="none")
-    parts = {
-        "box": sums(box * (2 - share), image, len(found)),
-        "obj": torch.where(counted, every, 0.0).sum(1),
-        "cls": sums(_class_loss(answers, image, place).sum(-1), image, len(found)),
+    is_object = (answers.label >= 0).to(answers.objectness.dtype)
+    is_counted = answers.label != -2
+    objectness_loss = cross_entropy(answers.objectness, is_object, reduction="none")
+    loss_parts = {
+        "box": sums(box * (2 - image_share), image, len(is_object)),
+        "obj": torch.where(is_counted, objectness_loss, 0.0).sum(1),
+        "cls": sums(_class_loss(answers, image, place).sum(-1), image, len(is_object)),
     }
-    return parts if reduction == "image" else {name: part.mean() for name, part in parts.items()}
+    return loss_parts if reduction == "image" else {name: loss_part.mean() for name, loss_part in loss_parts.items()}
 
 
 def losses_v5(answers: Answers, grid: Grid, *, reduction: Reduction) -> dict[str, Tensor]:
@@ -99,24 +100,24 @@ def losses_v5(answers: Answers, grid: Grid, *, reduction: Reduction) -> dict[str
     image, place = (answers.label >= 0).nonzero(as_tuple=True)
     overlap = ciou(answers.box[image, place], answers.target[image, place])
     # the means at a level run over the batch's objects, or over the image's
-    group = image * levels + grid.level[place]
-    kind = _class_loss(answers, image, place).mean(-1)
-    count = sums(torch.ones_like(overlap), group, batch * levels).view(batch, levels)
-    box = sums(1 - overlap, group, batch * levels).view(batch, levels)
-    cls = sums(kind, group, batch * levels).view(batch, levels)
-    wanted = torch.zeros_like(answers.objectness)
-    wanted[image, place] = overlap.detach().clamp(min=0)
-    every = cross_entropy(answers.objectness, wanted, reduction="none")
-    every = torch.where(answers.label != -2, every, 0.0)
-    weight = torch.tensor(BALANCE[:levels], device=every.device, dtype=every.dtype)
-    obj = torch.stack([every[:, part].mean(1) for part in _levels(grid)], -1) * weight
+    level_group = image * levels + grid.level[place]
+    class_loss = _class_loss(answers, image, place).mean(-1)
+    object_count = sums(torch.ones_like(overlap), level_group, batch * levels).view(batch, levels)
+    box = sums(1 - overlap, level_group, batch * levels).view(batch, levels)
+    cls = sums(class_loss, level_group, batch * levels).view(batch, levels)
+    target_objectness = torch.zeros_like(answers.objectness)
+    target_objectness[image, place] = overlap.detach().clamp(min=0)
+    objectness_loss = cross_entropy(answers.objectness, target_objectness, reduction="none")
+    objectness_loss = torch.where(answers.label != -2, objectness_loss, 0.0)
+    weight = torch.tensor(BALANCE[:levels], device=objectness_loss.device, dtype=objectness_loss.dtype)
+    obj = torch.stack([objectness_loss[:, level_places].mean(1) for level_places in _levels(grid)], -1) * weight
     if reduction == "batch":
-        count, box, cls, obj = count.sum(0), box.sum(0), cls.sum(0), obj.mean(0)
-    count = count.clamp(min=1)
+        object_count, box, cls, obj = object_count.sum(0), box.sum(0), cls.sum(0), obj.mean(0)
+    object_count = object_count.clamp(min=1)
     return {
-        "box": 0.05 * (box / count).sum(-1),
+        "box": 0.05 * (box / object_count).sum(-1),
         "obj": answers.size[0] * answers.size[1] / 640**2 * obj.sum(-1),
-        "cls": 0.5 * answers.logit.shape[-1] / 80 * (cls / count).sum(-1),
+        "cls": 0.5 * answers.logit.shape[-1] / 80 * (cls / object_count).sum(-1),
     }
 
 
@@ -124,10 +125,10 @@ def _class_loss(answers: Answers, image: Tensor, place: Tensor) -> Tensor:
     """Cross-entropy [N, C] of the class logits at these places against their labels."""
     logit = answers.logit[image, place]
     classes = torch.arange(logit.shape[-1], device=logit.device)
-    wanted = (answers.label[image, place][:, None] == classes).to(logit.dtype)
-    return cross_entropy(logit, wanted, reduction="none")
+    target = (answers.label[image, place][:, None] == classes).to(logit.dtype)
+    return cross_entropy(logit, target, reduction="none")
 
 
 def _levels(grid: Grid) -> list[slice]:
-    """The places of each level."""
-    return [slice(first, end) for first, end in pairwise((*grid.start, len(grid.stride)))]
+    """Return the places of each level."""
+    return [slice(begin, end) for begin, end in pairwise((*grid.start, len(grid.stride)))]

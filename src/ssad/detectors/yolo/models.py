@@ -1,7 +1,7 @@
-"""The networks: Darknet-53 with the three heads of YOLOv3, YOLOv3-tiny, and YOLOv5 6.0 with its multiples.
+"""Networks: Darknet-53 with the three heads of YOLOv3, YOLOv3-tiny, and YOLOv5 6.0 with its multiples.
 
 Each takes [B, 3, H, W] with H and W multiples of 32 and returns two tuples of maps, finest first: the raw head maps
-[B, A * (5 + C), h, w] (for each anchor: x, y, w, h, objectness, classes) and the neck maps from which they are made.
+[B, A * (5 + C), h, w] (for each anchor: x, y, w, h, objectness, classes) and the neck maps that the heads read.
 Modules are registered in the order in which darknet stores its layers.
 """
 
@@ -24,7 +24,7 @@ Maps = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class YoloSpec:
-    """What defines one of these detectors.
+    """Definition of a YOLO detector.
 
     Attributes:
         name: Name of the detector.
@@ -67,16 +67,16 @@ class YoloSpec:
             raise ConfigError(f"YOLO '{self.name}': network '{self.network}' has the strides {STRIDES[self.network]}")
 
     def channels(self, count: int) -> int:
-        """So many channels of the published table at this width, a multiple of 8."""
+        """Scale a channel count of the published table by the width, to a multiple of 8."""
         return max(8, math.ceil(count * self.width / 8) * 8)
 
     def repeats(self, count: int) -> int:
-        """So many repeats of the published table at this depth."""
+        """Scale a repeat count of the published table by the depth."""
         return max(1, round(count * self.depth))
 
 
 class Darknet53(nn.Module):
-    """The trunk of YOLOv3 (paper, table 1) without its classifier. Returns the maps of strides 8, 16, 32."""
+    """Trunk of YOLOv3 (paper, table 1) without its classifier; returns maps of strides 8, 16, 32."""
 
     def __init__(self, spec: YoloSpec) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ class Darknet53(nn.Module):
         self.channels = tuple(channels[3:])
 
     def forward(self, x: Tensor) -> Maps:
-        """[B, 3, H, W] -> three maps."""
+        """Return three maps from [B, 3, H, W]."""
         x = self.stem(x)
         maps = []
         for stage in self.stages:
@@ -100,7 +100,7 @@ class Darknet53(nn.Module):
 
 
 class V3Level(nn.Module):
-    """One of YOLOv3's three heads: the way in from the coarser one, five convolutions, one more, the raw map."""
+    """One of YOLOv3's three heads: input from the coarser head, five convolutions, one more, the raw map."""
 
     def __init__(self, inputs: int, coarser: int, width: int, outputs: int) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ class V3Level(nn.Module):
         self.output = nn.Conv2d(2 * width, outputs, 1)
 
     def forward(self, x: Tensor, coarser: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """The raw map, the map it is made from, and what the next finer head takes."""
+        """Return the raw map, the map it is computed from, and the input of the next finer head."""
         if self.lateral is not None and coarser is not None:
             x = torch.cat((upsample(self.lateral(coarser)), x), 1)
         body = self.body(x)
@@ -138,18 +138,18 @@ class V3Network(nn.Module):
         )
 
     def forward(self, x: Tensor) -> tuple[Maps, Maps]:
-        """Raw maps and neck maps, finest first."""
+        """Return raw maps and neck maps, finest first."""
         raw: list[Tensor] = []
         neck: list[Tensor] = []
-        last = None
+        coarser_feature = None
         for level, feature in zip(self.levels, reversed(self.trunk(x)), strict=True):
-            output, before, last = level(feature, last)
+            output, neck_map, coarser_feature = level(feature, coarser_feature)
             raw.insert(0, output)
-            neck.insert(0, before)
+            neck.insert(0, neck_map)
         return tuple(raw), tuple(neck)
 
     def outputs(self) -> list[nn.Conv2d]:
-        """The convolutions that make the raw maps, finest first."""
+        """Return the convolutions that produce the raw maps, finest first."""
         return [level.output for level in reversed(self.levels)]  # type: ignore[misc]
 
 
@@ -168,7 +168,7 @@ class TinyNetwork(nn.Module):
         self.fine_output = nn.Conv2d(channels[5], outputs, 1)
 
     def forward(self, x: Tensor) -> tuple[Maps, Maps]:
-        """Raw maps and neck maps, finest first."""
+        """Return raw maps and neck maps, finest first."""
         fine = x
         for index, conv in enumerate(self.trunk):
             x = conv(x)
@@ -177,6 +177,7 @@ class TinyNetwork(nn.Module):
             if index < 5:
                 x = functional.max_pool2d(x, 2)
             elif index == 5:
+                # The sixth pooling has stride 1: the coarse level stays at stride 32.
                 x = pool_same(x)
         x = self.reduce(x)
         coarse_neck = self.coarse(x)
@@ -184,39 +185,39 @@ class TinyNetwork(nn.Module):
         return (self.fine_output(fine_neck), self.coarse_output(coarse_neck)), (fine_neck, coarse_neck)
 
     def outputs(self) -> list[nn.Conv2d]:
-        """The convolutions that make the raw maps, finest first."""
+        """Return the convolutions that produce the raw maps, finest first."""
         return [self.fine_output, self.coarse_output]
 
 
 class CSPNetwork(nn.Module):
-    """YOLOv5 6.0 (published layer table): C3 trunk, SPPF, a path down and one up again, 1x1 heads."""
+    """YOLOv5 6.0 (published layer table): C3 trunk, SPPF, a top-down and a bottom-up path, 1x1 heads."""
 
     def __init__(self, spec: YoloSpec, outputs: int) -> None:
         super().__init__()
         c1, c2, c3, c4, c5 = (spec.channels(count) for count in (64, 128, 256, 512, 1024))
-        few = spec.repeats(3)
+        repeats = spec.repeats(3)
         self.stem = ConvUnit(3, c1, kernel=6, stride=2, padding=2, smooth=True)
         self.down2 = ConvUnit(c1, c2, kernel=3, stride=2, smooth=True)
-        self.stage2 = C3(c2, c2, repeats=few)
+        self.stage2 = C3(c2, c2, repeats=repeats)
         self.down3 = ConvUnit(c2, c3, kernel=3, stride=2, smooth=True)
         self.stage3 = C3(c3, c3, repeats=spec.repeats(6))
         self.down4 = ConvUnit(c3, c4, kernel=3, stride=2, smooth=True)
         self.stage4 = C3(c4, c4, repeats=spec.repeats(9))
         self.down5 = ConvUnit(c4, c5, kernel=3, stride=2, smooth=True)
-        self.stage5 = C3(c5, c5, repeats=few)
+        self.stage5 = C3(c5, c5, repeats=repeats)
         self.pool = SPPF(c5, c5)
         self.lateral5 = ConvUnit(c5, c4, smooth=True)
-        self.top4 = C3(2 * c4, c4, repeats=few, add=False)
+        self.top4 = C3(2 * c4, c4, repeats=repeats, add=False)
         self.lateral4 = ConvUnit(c4, c3, smooth=True)
-        self.neck3 = C3(2 * c3, c3, repeats=few, add=False)
+        self.neck3 = C3(2 * c3, c3, repeats=repeats, add=False)
         self.up4 = ConvUnit(c3, c3, kernel=3, stride=2, smooth=True)
-        self.neck4 = C3(2 * c3, c4, repeats=few, add=False)
+        self.neck4 = C3(2 * c3, c4, repeats=repeats, add=False)
         self.up5 = ConvUnit(c4, c4, kernel=3, stride=2, smooth=True)
-        self.neck5 = C3(2 * c4, c5, repeats=few, add=False)
+        self.neck5 = C3(2 * c4, c5, repeats=repeats, add=False)
         self.heads = nn.ModuleList(nn.Conv2d(channels, outputs, 1) for channels in (c3, c4, c5))
 
     def forward(self, x: Tensor) -> tuple[Maps, Maps]:
-        """Raw maps and neck maps, finest first."""
+        """Return raw maps and neck maps, finest first."""
         map3 = self.stage3(self.down3(self.stage2(self.down2(self.stem(x)))))
         map4 = self.stage4(self.down4(map3))
         lateral5 = self.lateral5(self.pool(self.stage5(self.down5(map4))))
@@ -225,10 +226,10 @@ class CSPNetwork(nn.Module):
         neck4 = self.neck4(torch.cat((self.up4(neck3), lateral4), 1))
         neck5 = self.neck5(torch.cat((self.up5(neck4), lateral5), 1))
         neck = (neck3, neck4, neck5)
-        return tuple(head(part) for head, part in zip(self.heads, neck, strict=True)), neck
+        return tuple(head(neck_map) for head, neck_map in zip(self.heads, neck, strict=True)), neck
 
     def outputs(self) -> list[nn.Conv2d]:
-        """The convolutions that make the raw maps, finest first."""
+        """Return the convolutions that produce the raw maps, finest first."""
         return list(self.heads)  # type: ignore[arg-type]
 
 
@@ -242,25 +243,27 @@ STRIDES = {"darknet53": (8, 16, 32), "tiny": (16, 32), "csp": (8, 16, 32)}
 
 
 def build_network(spec: YoloSpec, classes: int, *, seed: int = 0) -> Network:
-    """A network with fresh weights that depend on the seed alone; the global generator is left as it is.
+    """Return a network with fresh weights that depend on the seed alone; the global generator is left unchanged.
 
-    Convolutions: He's normal by fan-out; heads: small, with biases that expect 8 objects in a picture of 640 x 640
-    (objectness) and one class in so many (class logits), so that training from nothing starts without a burst.
+    Convolutions: He's normal by fan-out; heads: small, with biases that expect 8 objects in an image of 640 x 640
+    (objectness) and one class among all (class logits), so that training from scratch starts without a burst.
     """
+    # On the meta device the constructors draw no numbers from the global generator.
     with torch.device("meta"):
         network = NETWORKS[spec.network](spec, len(spec.anchors[0]) * (5 + classes))
     network.to_empty(device="cpu")
-    source = torch.Generator().manual_seed(seed32("yolo", spec.name, seed))
+    generator = torch.Generator().manual_seed(seed32("yolo", spec.name, seed))
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
-            nn.init.kaiming_normal_(module.weight, a=0.1, mode="fan_out", generator=source)
+            nn.init.kaiming_normal_(module.weight, a=0.1, mode="fan_out", generator=generator)
         elif isinstance(module, nn.BatchNorm2d):
             module.reset_parameters()
     for head, stride in zip(network.outputs(), spec.strides, strict=True):
-        nn.init.normal_(head.weight, std=0.01, generator=source)
+        nn.init.normal_(head.weight, std=0.01, generator=generator)
         if head.bias is not None:
             bias = torch.zeros(len(spec.anchors[0]), 5 + classes)
             bias[:, 4] = math.log(8 / (640 / stride) ** 2)
+            # The published initialisation; 0.99 keeps a single class finite.
             bias[:, 5:] = math.log(0.6 / (classes - 0.99))
             head.bias.data.copy_(bias.flatten())
     return network

@@ -1,4 +1,4 @@
-"""Careful drivers: the models by which regulators judge whether a collision could have been avoided."""
+"""Careful drivers: the models by which regulators judge whether a collision was avoidable."""
 
 from ssad.drivers.careful.encounter import Encounter
 from ssad.drivers.careful.models import MODELS, CarefulModel, careful_model, react

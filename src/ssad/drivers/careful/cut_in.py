@@ -1,4 +1,4 @@
-"""A car cuts in before four careful drivers: thousands of encounters on a straight road at once, without a world."""
+"""Cut-ins before careful drivers: thousands of encounters on a straight road at once, without a world."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ CHUNK = 4096  # encounters at a time, so that they stay in the cache
 
 @dataclass(frozen=True)
 class CutIns:
-    """Cut-ins [N]: two cars of one size; the other keeps its speed, and moves across until it is in front.
+    """Cut-ins [N] of two cars of one size; the other car keeps its speed and moves sideways until it is in front.
 
     Attributes:
-        speed: Of the driver, m/s.
-        lead: Of the other, m/s.
+        speed: Speed of the driver, m/s.
+        lead: Speed of the other car, m/s.
         gap: m from the driver's front to the other's rear at the start.
-        approach: Speed of the other across, m/s.
+        approach: Lateral speed of the other car, m/s.
         lateral: m between the sides of both at the start: 1.6 in lanes of 3.5 m, 1.85 in lanes of 3.75 m.
-        length: Of a car, m.
-        width: Of a car, m.
+        length: Length of a car, m.
+        width: Width of a car, m.
     """
 
     speed: F64
@@ -38,28 +38,28 @@ class CutIns:
     width: float = 1.9
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of encounters."""
         return len(self.speed)
 
 
 def grid(
     pairs: Iterable[tuple[float, float]], gaps: Iterable[float], *, lateral: float = 1.6, sideways: int = 18
 ) -> CutIns:
-    """All combinations.
+    """Return all combinations of speeds, gaps and lateral speeds.
 
     Args:
         pairs: Speeds of the driver and the other, km/h.
         gaps: m.
         lateral: m between the sides at the start.
-        sideways: How many lateral speeds, from 0 in steps of 0.1 m/s.
+        sideways: Number of lateral speeds, from 0 in steps of 0.1 m/s.
 
     Returns:
         The encounters.
     """
-    speeds, space = np.array(list(pairs), np.float64) / 3.6, np.array(list(gaps), np.float64)
-    index = np.meshgrid(np.arange(len(speeds)), space, 0.1 * np.arange(sideways), indexing="ij")
-    pair, gap, across = (part.ravel() for part in index)
-    return CutIns(speeds[pair.astype(int), 0], speeds[pair.astype(int), 1], gap, across, lateral)
+    speeds, gap_values = np.array(list(pairs), np.float64) / 3.6, np.array(list(gaps), np.float64)
+    axes = np.meshgrid(np.arange(len(speeds)), gap_values, 0.1 * np.arange(sideways), indexing="ij")
+    speed_pair, gap, lateral_speed = (axis.ravel() for axis in axes)
+    return CutIns(speeds[speed_pair.astype(int), 0], speeds[speed_pair.astype(int), 1], gap, lateral_speed, lateral)
 
 
 def slower(speeds: Iterable[int], least: int = 10) -> list[tuple[int, int]]:
@@ -68,47 +68,57 @@ def slower(speeds: Iterable[int], least: int = 10) -> list[tuple[int, int]]:
 
 
 def crashes(model: CarefulModel, cases: CutIns, *, seconds: float = 60.0) -> Bool:
-    """Drive a model through cut-ins.
+    """Drive a model through cut-ins and return which ones end in a crash.
 
-    Both bodies are boxes: to be run into from the side while alongside counts too. A crash ends the encounter.
+    Both bodies are boxes: a side contact while alongside counts too. A crash ends the encounter.
 
     Args:
-        model: Who drives.
+        model: The driver model.
         cases: The encounters [N].
-        seconds: How long they are followed.
+        seconds: Duration of each encounter, s.
 
     Returns:
-        [N] whether they touch.
+        [N] True where the cars touch.
     """
-    out = np.zeros(len(cases), bool)
+    crashed = np.zeros(len(cases), bool)
     for first in range(0, len(cases), CHUNK):
-        part = slice(first, first + CHUNK)
-        out[part] = _crashes(model, cases, part, round(seconds / STEP))
-    return out
+        chunk = slice(first, first + CHUNK)
+        crashed[chunk] = _crashes(model, cases, chunk, round(seconds / STEP))
+    return crashed
 
 
 def _crashes(model: CarefulModel, cases: CutIns, part: slice, steps: int) -> Bool:
-    """`crashes` for some of the cases; those that are decided drop out."""
-    speed, lead, gap, approach = (a[part].copy() for a in (cases.speed, cases.lead, cases.gap, cases.approach))
+    """Simulate some of the cases; decided ones drop out."""
+    speed, lead, gap, approach = (
+        column[part].copy() for column in (cases.speed, cases.lead, cases.gap, cases.approach)
+    )
     rows = np.arange(len(speed))
-    out, brake, memory = np.zeros(len(rows), bool), np.zeros(len(rows)), calm((len(rows),))
-    lateral, both = np.full(len(rows), cases.lateral), 2.0 * cases.length
+    crashed, brake, memory = np.zeros(len(rows), bool), np.zeros(len(rows)), calm((len(rows),))
+    lateral, joint_length = np.full(len(rows), cases.lateral), 2.0 * cases.length
     for _ in range(steps):
-        moving = np.where(lateral > -cases.width, approach, 0.0)
-        moved = cases.lateral - lateral
-        stays_on, length = np.full(len(rows), np.inf), np.full(len(rows), both)
-        e = Encounter(speed, -brake, gap, lead, lateral, moving, stays_on, length, moved)
-        brake, memory = react(model, e, memory, STEP)
-        after = np.maximum(speed - brake * STEP, 0.0)
-        gap = gap + (lead - 0.5 * (speed + after)) * STEP
-        speed, lateral = after, np.maximum(lateral - moving * STEP, -cases.width)
-        hit = (lateral < 1e-9) & (gap < 0.0) & (gap > -both)
-        out[rows[hit]] = True
-        # who is past, or no faster than the other in its lane, is out of it
-        on = ~hit & (gap > -both) & ~((lateral <= 0.0) & (speed <= lead)) & (approach > 0.0)
-        rows, brake = rows[on], brake[on]
-        speed, lead, gap, approach, lateral = speed[on], lead[on], gap[on], approach[on], lateral[on]
-        memory = Reaction(memory.since[on], memory.brake[on])
+        lateral_speed = np.where(lateral > -cases.width, approach, 0.0)
+        lateral_travel = cases.lateral - lateral
+        distance_to_leave, passing_length = np.full(len(rows), np.inf), np.full(len(rows), joint_length)
+        encounter = Encounter(
+            speed, -brake, gap, lead, lateral, lateral_speed, distance_to_leave, passing_length, lateral_travel
+        )
+        brake, memory = react(model, encounter, memory, STEP)
+        next_speed = np.maximum(speed - brake * STEP, 0.0)
+        gap = gap + (lead - 0.5 * (speed + next_speed)) * STEP
+        speed, lateral = next_speed, np.maximum(lateral - lateral_speed * STEP, -cases.width)
+        hit = (lateral < 1e-9) & (gap < 0.0) & (gap > -joint_length)
+        crashed[rows[hit]] = True
+        # a driver that is past, or not faster than the other car in its lane, is safe
+        undecided = ~hit & (gap > -joint_length) & ~((lateral <= 0.0) & (speed <= lead)) & (approach > 0.0)
+        rows, brake = rows[undecided], brake[undecided]
+        speed, lead, gap, approach, lateral = (
+            speed[undecided],
+            lead[undecided],
+            gap[undecided],
+            approach[undecided],
+            lateral[undecided],
+        )
+        memory = Reaction(memory.since[undecided], memory.brake[undecided])
         if not len(rows):
             break
-    return out
+    return crashed

@@ -1,4 +1,4 @@
-"""What a careful driver judges: one other road user, in the frame of the path that the driver keeps."""
+"""Encounters that careful drivers judge: one other road user in the frame of the driver's path."""
 
 from __future__ import annotations
 
@@ -40,32 +40,33 @@ class Encounter:
     moved: F64
 
     def closing(self) -> F64:
-        """Speed at which the gap falls, m/s."""
+        """Return the speed at which the gap falls, m/s."""
         return self.speed - self.lead
 
     def time_to_reach(self) -> F64:
-        """TTC, s, along the path: until the gap is closed; infinite where it does not fall, 0 where it is closed."""
+        """Return the TTC along the path, s: 0 for a closed gap, infinite for one that does not fall."""
         closing = self.closing()
-        safe = np.where(closing > 0.0, closing, 1.0)
-        return np.where(closing > 0.0, np.maximum(self.gap, 0.0) / safe, np.where(self.gap <= 0.0, 0.0, np.inf))
+        # np.where evaluates both branches: the divisor must not be 0.
+        divisor = np.where(closing > 0.0, closing, 1.0)
+        return np.where(closing > 0.0, np.maximum(self.gap, 0.0) / divisor, np.where(self.gap <= 0.0, 0.0, np.inf))
 
     def time_to_pass(self) -> F64:
-        """Until the driver is past the other with all its length, s: the gross longitudinal headway of the FSM."""
+        """Return the time until the driver is past the other, s: the gross longitudinal headway of the FSM."""
         closing = self.closing()
-        safe = np.where(closing > 0.0, closing, 1.0)
-        return np.where(closing > 0.0, np.maximum(self.gap + self.length, 0.0) / safe, np.inf)
+        divisor = np.where(closing > 0.0, closing, 1.0)
+        return np.where(closing > 0.0, np.maximum(self.gap + self.length, 0.0) / divisor, np.inf)
 
     def time_to_enter(self) -> F64:
-        """Until the other is in the way, s: 0 if it is, infinite if it does not come."""
-        safe = np.where(self.approach > 0.0, self.approach, 1.0)
-        comes = np.where(self.approach > 0.0, np.maximum(self.lateral, 0.0) / safe, np.inf)
-        return np.where(self.lateral <= 0.0, 0.0, comes)
+        """Return the time until the other is in the path, s: 0 if it is, infinite if it does not approach."""
+        divisor = np.where(self.approach > 0.0, self.approach, 1.0)
+        arrival = np.where(self.approach > 0.0, np.maximum(self.lateral, 0.0) / divisor, np.inf)
+        return np.where(self.lateral <= 0.0, 0.0, arrival)
 
     def time_to_leave(self) -> F64:
-        """Until the other has crossed the path and left it, s."""
-        safe = np.where(self.approach > 0.0, self.approach, 1.0)
-        return np.where(self.approach > 0.0, self.through / safe, np.inf)
+        """Return the time until the other has crossed and left the path, s."""
+        divisor = np.where(self.approach > 0.0, self.approach, 1.0)
+        return np.where(self.approach > 0.0, self.through / divisor, np.inf)
 
     def ahead(self) -> Bool:
-        """Whether the driver is not yet past, and gets nearer."""
+        """Return True where the driver is not yet past the other and gets nearer."""
         return np.asarray((self.gap > -self.length) & (self.closing() > 0.0))

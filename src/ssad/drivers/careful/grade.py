@@ -1,4 +1,4 @@
-"""How avoidable was a collision? The same encounter again, with careful drivers at the wheel once the danger exists."""
+"""Avoidability of collisions: the same encounter again, with careful drivers in control once the danger exists."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from ssad.world.world import World
 Verdict = Literal["avoidable", "limit", "unavoidable"]
 Drive = tuple[Episode, LaneGraph, EpisodeTrace]
 """What was driven, its town, and how."""
-HORIZON = 4.0  # s: danger exists while both, going straight on at their speeds, would touch within it
-EARLIEST = 6.0  # s before the contact that danger is looked for
-FLICKER = 3  # steps that a danger may be gone for and yet be the same
-SCENES = 1024  # of one world, of those that try manoeuvres
-AFTER = 5.0  # s after the contact that somebody must stay clear for
+HORIZON = 4.0  # s: danger exists while both agents, at constant velocity, would touch within it
+EARLIEST = 6.0  # s before the contact from which danger is searched
+FLICKER = 3  # steps that a danger may be interrupted
+SCENES = 1024  # scenes per world in the search over manoeuvres
+AFTER = 5.0  # s after the contact without collision that count as staying clear
 
 
 @dataclass(frozen=True)
 class Grade:
-    """How avoidable the first collision of a drive was.
+    """Avoidability of the first collision of a drive.
 
     Attributes:
-        verdict: `avoidable` (a careful model stays clear), `limit` (none does, but some manoeuvre), `unavoidable`
-            (nothing that was tried).
-        avoids: By the short name of a careful model: whether it stays clear.
-        danger: s at which the danger begins, and the models take the wheel.
-        contact: s of the contact.
-        agent: Number of who was hit; -1: nobody known.
-        exact: Whether the replay was the recorded drive to the bit, up to the takeover.
+        verdict: `avoidable` (a careful model stays clear), `limit` (no model, but some manoeuvre does), `unavoidable`
+            (nothing does).
+        avoids: Short name of a careful model -> True if it stays clear.
+        danger: s at which the danger begins and the models take over.
+        contact: Time of the contact, s.
+        agent: Index of the agent that was hit; -1: unknown.
+        exact: True if the replay matches the recording bit by bit up to the takeover.
         limit: The kinematic limit.
     """
 
@@ -55,17 +55,17 @@ class Grade:
     limit: Limit
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data for a record."""
+        """Return plain data for a record."""
         return asdict(self)
 
     def metrics(self) -> dict[str, float]:
-        """The fields of `EpisodeMetrics` that the grade fills: 1 for who stays clear."""
-        fields = {f"avoided_by_{name}": float(fine) for name, fine in self.avoids.items()}
+        """Return the fields of `EpisodeMetrics` that the grade fills: 1 where the model stays clear."""
+        fields = {f"avoided_by_{name}": float(is_clear) for name, is_clear in self.avoids.items()}
         return fields | {"avoided_by_limit": float(self.verdict != "unavoidable")}
 
 
 class _Onlooker:
-    """Follows replays, a scene each: is it the recorded drive, when was the other triggered, when in sight?
+    """Observer of replays, one drive per scene: fidelity, trigger and visibility of the other agent.
 
     Attributes:
         seen, triggered, same: [B, T] of each scene and step; rows are as long as the longest drive.
@@ -73,27 +73,30 @@ class _Onlooker:
 
     def __init__(self, drives: Sequence[Drive], agents: Sequence[int]) -> None:
         self.agents, self.step = np.asarray(agents), 0
-        self.poses = [np.stack([t.x, t.y, t.yaw], -1) for _, _, t in drives]
+        self.poses = [np.stack([trace.x, trace.y, trace.yaw], -1) for _, _, trace in drives]
         shape = len(drives), max(map(len, self.poses))
         self.seen, self.triggered, self.same = np.zeros(shape, bool), np.zeros(shape, bool), np.ones(shape, bool)
-        scripts = [k > 0 and bool(one.agents[k].phases) for (one, _, _), k in zip(drives, agents, strict=True)]
+        scripts = [
+            agent > 0 and bool(episode.agents[agent].phases)
+            for (episode, _, _), agent in zip(drives, agents, strict=True)
+        ]
         self.scripted = np.array(scripts)
 
     def __call__(self, world: World) -> None:
         self.step += 1
-        k = self.step
-        if k >= self.same.shape[1]:
+        step = self.step
+        if step >= self.same.shape[1]:
             return
         pose, rows = world.array("pose"), np.arange(world.batch)
-        for b, recorded in enumerate(self.poses):
-            if k < len(recorded):
-                here = pose[b, : recorded.shape[1]]
-                self.same[b, k] = self.same[b, k - 1] and bool((here == recorded[k]).all())
-        self.triggered[:, k] = self.scripted & (world.array("phase")[rows, self.agents] > 0)
-        looks = (self.agents > 0) & (world.ended() == 0)
-        if looks.any():
-            sight = in_sight(pose[:, 0, :2], world.truth(), REACH)
-            self.seen[:, k] = looks & sight[rows, self.agents]
+        for scene, recorded in enumerate(self.poses):
+            if step < len(recorded):
+                scene_pose = pose[scene, : recorded.shape[1]]
+                self.same[scene, step] = self.same[scene, step - 1] and bool((scene_pose == recorded[step]).all())
+        self.triggered[:, step] = self.scripted & (world.array("phase")[rows, self.agents] > 0)
+        is_observed = (self.agents > 0) & (world.ended() == 0)
+        if is_observed.any():
+            visible = in_sight(pose[:, 0, :2], world.truth(), REACH)
+            self.seen[:, step] = is_observed & visible[rows, self.agents]
 
 
 def danger_begins(trace: EpisodeTrace, agent: int, contact: int, triggered: Bool, seen: Bool) -> int:
@@ -116,26 +119,26 @@ def danger_begins(trace: EpisodeTrace, agent: int, contact: int, triggered: Bool
     if agent < 1:
         return earliest
     on_course = ttc(trace)[: contact + 1, agent - 1] <= HORIZON
-    begin = earliest + conflict_begins(on_course[earliest:])
-    started = np.flatnonzero(triggered[: contact + 1])
-    if len(started):
-        begin = min(begin, int(started[0]))
-    begin = max(begin, earliest)
-    sight = np.flatnonzero(seen[begin:contact])
-    return begin + int(sight[0]) if len(sight) else contact
+    danger_step = earliest + conflict_begins(on_course[earliest:])
+    trigger_steps = np.flatnonzero(triggered[: contact + 1])
+    if len(trigger_steps):
+        danger_step = min(danger_step, int(trigger_steps[0]))
+    danger_step = max(danger_step, earliest)
+    visible_steps = np.flatnonzero(seen[danger_step:contact])
+    return danger_step + int(visible_steps[0]) if len(visible_steps) else contact
 
 
 def conflict_begins(on_course: Bool) -> int:
-    """The step since which two have been on a course to touch, up to the last one [T], the contact."""
-    begin, gap = len(on_course) - 1, 0
-    for k in range(len(on_course) - 2, -1, -1):
-        if on_course[k]:
-            begin, gap = k, 0
+    """Return the step since which two agents are on a collision course, up to the last one [T], the contact."""
+    first_step, interruption = len(on_course) - 1, 0
+    for step in range(len(on_course) - 2, -1, -1):
+        if on_course[step]:
+            first_step, interruption = step, 0
         else:
-            gap += 1
-            if gap > FLICKER:
+            interruption += 1
+            if interruption > FLICKER:
                 break
-    return begin
+    return first_step
 
 
 def grade_collision(
@@ -147,7 +150,7 @@ def grade_collision(
     policies: Policies | None = None,
     sensors: Mapping[str, Sensor] | None = None,
 ) -> Grade:
-    """Grade the first collision of a drive in the world; see `grade_collisions`."""
+    """Grade the first collision of one drive; see `grade_collisions`."""
     return grade_collisions([(episode, graph, trace)], device=device, policies=policies, sensors=sensors)[0]
 
 
@@ -179,34 +182,42 @@ def grade_collisions(
     """
     if not drives:
         return []
-    about: dict[str, Any] = {"device": device, "policies": policies, "sensors": sensors}
+    run_options: dict[str, Any] = {"device": device, "policies": policies, "sensors": sensors}
     contacts = [first_contact(trace) for _, _, trace in drives]
-    ends = [step * trace.dt for (step, _), (_, _, trace) in zip(contacts, drives, strict=True)]
-    nobody = Takeover(Careful(), math.inf)
-    watch = _Onlooker(drives, [agent for _, agent in contacts])
-    play([Ending(*drive, [nobody], end) for drive, end in zip(drives, ends, strict=True)], watch=watch, **about)
-    begins = [
-        danger_begins(trace, agent, contact, watch.triggered[k, : len(trace.x)], watch.seen[k, : len(trace.x)])
-        for k, ((_, _, trace), (contact, agent)) in enumerate(zip(drives, contacts, strict=True))
+    contact_times = [step * trace.dt for (step, _), (_, _, trace) in zip(contacts, drives, strict=True)]
+    no_takeover = Takeover(Careful(), math.inf)
+    observer = _Onlooker(drives, [agent for _, agent in contacts])
+    play(
+        [Ending(*drive, [no_takeover], end) for drive, end in zip(drives, contact_times, strict=True)],
+        watch=observer,
+        **run_options,
+    )
+    danger_steps = [
+        danger_begins(
+            trace, agent, contact, observer.triggered[index, : len(trace.x)], observer.seen[index, : len(trace.x)]
+        )
+        for index, ((_, _, trace), (contact, agent)) in enumerate(zip(drives, contacts, strict=True))
     ]
-    starts = [begin * trace.dt for begin, (_, _, trace) in zip(begins, drives, strict=True)]
+    takeover_times = [begin * trace.dt for begin, (_, _, trace) in zip(danger_steps, drives, strict=True)]
     models = [Careful(name, keep_speed=True) for name in MODELS]
-    hits = play(
+    collided = play(
         [
             Ending(*drive, [Takeover(model, start) for model in models], end + AFTER)
-            for drive, start, end in zip(drives, starts, ends, strict=True)
+            for drive, start, end in zip(drives, takeover_times, contact_times, strict=True)
         ],
-        **about,
+        **run_options,
     )
-    limits = _limits(drives, starts, ends, about)
+    limits = _limits(drives, takeover_times, contact_times, run_options)
     grades = []
-    for k, (hit, limit) in enumerate(zip(hits, limits, strict=True)):
-        avoids = {name: not bool(touched) for name, touched in zip(MODELS, hit, strict=True)}
+    for index, (model_hits, limit) in enumerate(zip(collided, limits, strict=True)):
+        avoids = {name: not bool(is_hit) for name, is_hit in zip(MODELS, model_hits, strict=True)}
         verdict: Verdict = "unavoidable" if limit.manoeuvre is None else "limit"
         if any(avoids.values()):
             verdict = "avoidable"
-        exact = bool(watch.same[k, begins[k]])
-        grades.append(Grade(verdict, avoids, starts[k], ends[k], contacts[k][1], exact, limit))
+        exact = bool(observer.same[index, danger_steps[index]])
+        grades.append(
+            Grade(verdict, avoids, takeover_times[index], contact_times[index], contacts[index][1], exact, limit)
+        )
     return grades
 
 
@@ -214,19 +225,32 @@ def _limits(
     drives: Sequence[Drive], starts: Sequence[float], ends: Sequence[float], about: Mapping[str, Any]
 ) -> list[Limit]:
     """The kinematic limits, of as many drives side by side as fit into a world."""
-    tried = [manoeuvres(drive[0], start, end) for drive, start, end in zip(drives, starts, ends, strict=True)]
-    found: list[Limit] = []
-    while len(found) < len(drives):
-        first, size = len(found), np.cumsum([len(options) for options in tried[len(found) :]])
-        last = first + max(int((size <= SCENES).sum()), 1)
-        part = range(first, last)
-        options = [m for k in part for m in tried[k]]
-        hand = Evasions(options)
-        episodes = [drives[k][0] for k in part for _ in tried[k]]
-        side = OwnSide(episodes, {drives[k][0].town: drives[k][1] for k in part}, [m.start for m in options])
-        endings = [Ending(*drives[k], [Takeover(hand, m.start) for m in tried[k]], ends[k] + AFTER) for k in part]
-        hits = play(endings, watch=side, **about)
-        left = np.split(side.left, np.cumsum([len(hit) for hit in hits])[:-1])
-        for k, hit, gone in zip(part, hits, left, strict=True):
-            found.append(limit_of(tried[k], ~hit & ~gone, contact=ends[k]))
-    return found
+    options_by_drive = [
+        manoeuvres(drive[0], start, end) for drive, start, end in zip(drives, starts, ends, strict=True)
+    ]
+    limits: list[Limit] = []
+    while len(limits) < len(drives):
+        begin, cumulative_count = len(limits), np.cumsum([len(options) for options in options_by_drive[len(limits) :]])
+        stop = begin + max(int((cumulative_count <= SCENES).sum()), 1)
+        chunk = range(begin, stop)
+        options = [manoeuvre for index in chunk for manoeuvre in options_by_drive[index]]
+        evasions = Evasions(options)
+        episodes = [drives[index][0] for index in chunk for _ in options_by_drive[index]]
+        side_watch = OwnSide(
+            episodes,
+            {drives[index][0].town: drives[index][1] for index in chunk},
+            [manoeuvre.start for manoeuvre in options],
+        )
+        endings = [
+            Ending(
+                *drives[index],
+                [Takeover(evasions, manoeuvre.start) for manoeuvre in options_by_drive[index]],
+                ends[index] + AFTER,
+            )
+            for index in chunk
+        ]
+        hits = play(endings, watch=side_watch, **about)
+        left_road = np.split(side_watch.left, np.cumsum([len(collided) for collided in hits])[:-1])
+        for index, collided, left_side in zip(chunk, hits, left_road, strict=True):
+            limits.append(limit_of(options_by_drive[index], ~collided & ~left_side, contact=ends[index]))
+    return limits

@@ -1,9 +1,9 @@
-"""The four careful drivers of the regulation literature, as functions of an encounter: when they brake, and how hard.
+"""Careful driver models of the regulation literature: the braking that each demands in an encounter.
 
 Source: UN Regulation 157 (2021), Annex 4, Appendix 3 (careful and competent human driver) and paragraph 5.2.5.2;
 Shalev-Shwartz et al. 2017 (RSS) with the parameters, and Mattas et al. 2020 and 2022 (Fuzzy Safety Model) with the
-formulas, that the Joint Research Centre compares them with. Where these speak of a car that cuts in, SSAD reads: of
-anybody who comes into the path (see `Encounter`), and adds one rule: who will have left the path before the driver
+formulas, that the Joint Research Centre compares them with. SSAD applies the rules for cut-ins to
+any agent that enters the path (see `Encounter`), and adds one rule: an agent that leaves the path before the driver
 reaches it is no danger.
 """
 
@@ -17,22 +17,22 @@ from ssad.core.errors import unknown_name
 from ssad.core.types import F64, Bool
 from ssad.drivers.careful.encounter import Encounter
 
-HARD = 0.774 * 9.81  # m/s^2: what a careful human brakes with in an emergency (about 7.59)
-JERK = HARD / 0.6  # m/s^3: it takes 0.6 s to get there (about 12.65)
-SPARE = 0.1  # s between the other's leaving the path and the driver's arrival, and the other way round
+HARD = 0.774 * 9.81  # m/s^2: emergency braking of a careful human (about 7.59)
+JERK = HARD / 0.6  # m/s^3: full braking is reached after 0.6 s (about 12.65)
+SPARE = 0.1  # s between the departure of one agent from the conflict zone and the arrival of the other
 
 
 @dataclass(frozen=True)
 class CarefulModel:
-    """A model: what it demands, and how it follows its own demand.
+    """Careful driver model: its demand for braking, and the dynamics of its response.
 
     Attributes:
         name: Its short name.
-        delay: s from the moment that the danger is perceived to the first braking.
-        jerk: m/s^3 by which braking may grow; infinite: at once.
-        coast: m/s^2 that it slows by during the delay.
-        hold: m/s^2 with which it goes on braking for whom it brakes, until it no longer closes on him or he is out of
-            its way; 0: it does as it demands.
+        delay: s from the perception of the danger to the first braking.
+        jerk: Maximum growth of the braking, m/s^3; infinite: immediate.
+        coast: Deceleration during the delay, m/s^2.
+        hold: Minimum braking, m/s^2, once begun, until the gap no longer falls or the other leaves the path; 0: the
+            demand alone decides.
     """
 
     name: str
@@ -42,20 +42,19 @@ class CarefulModel:
     hold: float
 
     def demand(self, e: Encounter) -> F64:
-        """Braking that each other asks for, m/s^2; 0: there is no danger, or it is not perceived yet."""
+        """Return the braking that each other agent requires, m/s^2; 0: no danger, or not perceived yet."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class CarefulHuman(CarefulModel):
-    """UN R157, Annex 4, Appendix 3: the careful and competent human driver.
+    """Careful and competent human driver of UN R157, Annex 4, Appendix 3.
 
     Attributes:
-        wander: m across its lane that another may wander without a meaning.
-        evaluate: m that it moves on while the driver judges it (0.4 s at 1.8 m/s).
-        critical: TTC, s, below which the driver brakes.
-        wait_for_overlap: Perceives a cut-in only once it is in the way, as in JRC's grids; else from the regulation's
-            point on.
+        wander: Lateral wandering of other vehicles that is ignored, m.
+        evaluate: Lateral travel while the driver evaluates the risk, m (0.4 s at 1.8 m/s).
+        critical: TTC below which the driver brakes, s.
+        wait_for_overlap: Perceive a cut-in only once it is in the path, as in JRC's grids; else as in the regulation.
     """
 
     name: str = "cc"
@@ -69,21 +68,21 @@ class CarefulHuman(CarefulModel):
     wait_for_overlap: bool = False
 
     def demand(self, e: Encounter) -> F64:
-        """See `CarefulModel`."""
-        comes = (e.moved > self.wander + self.evaluate) & (e.approach > 0.0) & (not self.wait_for_overlap)
-        seen = (e.lateral <= 0.0) | comes
-        return np.where(seen & e.ahead() & stays(e) & (e.time_to_reach() < self.critical), HARD, 0.0)
+        """Brake hard below the critical TTC, once the other is perceived."""
+        is_cutting_in = (e.moved > self.wander + self.evaluate) & (e.approach > 0.0) & (not self.wait_for_overlap)
+        is_perceived = (e.lateral <= 0.0) | is_cutting_in
+        return np.where(is_perceived & e.ahead() & stays(e) & (e.time_to_reach() < self.critical), HARD, 0.0)
 
 
 @dataclass(frozen=True)
 class Reg157(CarefulModel):
-    """UN R157, paragraph 5.2.5.2: the cut-in that a lane keeping system must survive.
+    """Lane keeping system of UN R157, paragraph 5.2.5.2, which must survive certain cut-ins.
 
     Attributes:
-        brake: m/s^2, at once.
-        margin: m between the bodies at which the other counts as in the lane: 0.3 m inside of its marking.
-        spare: s added to the time that braking takes.
-        reach: m that it sees.
+        brake: Braking, m/s^2, applied immediately.
+        margin: Lateral distance at which the other counts as in the lane, m: 0.3 m inside of its marking.
+        spare: Margin added to the braking time, s.
+        reach: Sensor range, m.
     """
 
     name: str = "reg157"
@@ -97,11 +96,11 @@ class Reg157(CarefulModel):
     reach: float = 46.0
 
     def demand(self, e: Encounter) -> F64:
-        """See `CarefulModel`."""
-        inside = (e.lateral <= 0.0) | ((e.lateral <= self.margin) & (e.approach > 0.0))
-        needs = e.closing() / (2.0 * self.brake) + self.delay + self.spare
-        danger = inside & e.ahead() & stays(e) & (e.gap < self.reach) & (e.time_to_reach() < needs)
-        return np.where(danger, self.brake, 0.0)
+        """Brake once the TTC of a vehicle in the lane falls below the time that braking takes."""
+        in_lane = (e.lateral <= 0.0) | ((e.lateral <= self.margin) & (e.approach > 0.0))
+        required_time = e.closing() / (2.0 * self.brake) + self.delay + self.spare
+        is_danger = in_lane & e.ahead() & stays(e) & (e.gap < self.reach) & (e.time_to_reach() < required_time)
+        return np.where(is_danger, self.brake, 0.0)
 
 
 @dataclass(frozen=True)
@@ -130,31 +129,33 @@ class RSS(CarefulModel):
 
     def _runs(self, speed: F64, push: float, brake: float) -> F64:
         """How far a body goes that speeds up during the delay and then brakes, m."""
-        after = speed + push * self.delay
-        return (speed + 0.5 * push * self.delay) * self.delay + after * after / (2.0 * brake)
+        final_speed = speed + push * self.delay
+        return (speed + 0.5 * push * self.delay) * self.delay + final_speed * final_speed / (2.0 * brake)
 
     def demand(self, e: Encounter) -> F64:
-        """See `CarefulModel`."""
-        own = self._runs(e.speed, self.accelerate, self.brake)
-        leads = -e.lead * np.abs(e.lead) / (2.0 * self.brake)
-        comes = self._runs(np.abs(e.lead), self.accelerate, self.brake)
-        along = np.maximum(own + np.where(e.lead >= 0.0, leads, comes), 0.0)
-        rest = self._runs(np.zeros_like(e.speed), self.sideways, self.sideways)
-        across = self.wander + rest + self._runs(np.maximum(e.approach, 0.0), self.sideways, self.sideways)
-        beside = (e.lateral <= 0.0) | ((e.lateral < across) & (e.approach > 0.0))
-        danger = (e.gap < along) & beside & (e.gap > -e.length) & (e.speed > 0.0) & stays(e)
-        return np.where(danger, HARD, 0.0)
+        """Brake hard while both the longitudinal and the lateral distance are unsafe."""
+        ego_distance = self._runs(e.speed, self.accelerate, self.brake)
+        leader_distance = -e.lead * np.abs(e.lead) / (2.0 * self.brake)
+        oncoming_distance = self._runs(np.abs(e.lead), self.accelerate, self.brake)
+        safe_gap = np.maximum(ego_distance + np.where(e.lead >= 0.0, leader_distance, oncoming_distance), 0.0)
+        lateral_stop = self._runs(np.zeros_like(e.speed), self.sideways, self.sideways)
+        safe_lateral = (
+            self.wander + lateral_stop + self._runs(np.maximum(e.approach, 0.0), self.sideways, self.sideways)
+        )
+        is_beside = (e.lateral <= 0.0) | ((e.lateral < safe_lateral) & (e.approach > 0.0))
+        is_danger = (e.gap < safe_gap) & is_beside & (e.gap > -e.length) & (e.speed > 0.0) & stays(e)
+        return np.where(is_danger, HARD, 0.0)
 
 
 @dataclass(frozen=True)
 class FSM(CarefulModel):
-    """The Fuzzy Safety Model: brakes a little where a stop would get tight, fully where it would not succeed.
+    """Fuzzy Safety Model: brakes gently where a stop gets tight, hard where it would not succeed.
 
     Attributes:
-        least: m/s^2 of comfortable braking.
-        most: m/s^2 of hard braking.
-        leader: m/s^2 that whoever is ahead may brake with.
-        margin: m that it keeps behind a stop.
+        least: Comfortable braking, m/s^2.
+        most: Hard braking, m/s^2.
+        leader: Assumed braking of the leader, m/s^2.
+        margin: Standstill gap, m.
     """
 
     name: str = "fsm"
@@ -168,37 +169,39 @@ class FSM(CarefulModel):
     margin: float = 2.0
 
     def demand(self, e: Encounter) -> F64:
-        """See `CarefulModel`."""
+        """Brake according to the critical fuzzy score, else the proactive one."""
         proactive, critical = self.proactive(e), self.critical(e)
         level = np.where(critical > 0.0, self.least + (self.most - self.least) * critical, self.least * proactive)
-        misses = e.time_to_enter() > e.time_to_pass() + SPARE
-        comes = (e.lateral <= 0.0) | (e.approach > 0.0)
-        return np.where(comes & ~misses & (e.gap > -e.length) & stays(e), np.minimum(level, HARD), 0.0)
+        passes_before = e.time_to_enter() > e.time_to_pass() + SPARE
+        is_relevant = (e.lateral <= 0.0) | (e.approach > 0.0)
+        return np.where(is_relevant & ~passes_before & (e.gap > -e.length) & stays(e), np.minimum(level, HARD), 0.0)
 
     def proactive(self, e: Encounter) -> F64:
         """PFS, 0 to 1: could the driver stop behind a leader that brakes?"""
-        u, stop = e.speed, e.lead * np.abs(e.lead) / (2.0 * self.leader)
-        safe = u * self.delay + u * u / (2.0 * self.least) - stop + self.margin
-        unsafe = u * self.delay + u * u / (2.0 * self.most) - stop
+        speed, leader_stop = e.speed, e.lead * np.abs(e.lead) / (2.0 * self.leader)
+        safe = speed * self.delay + speed * speed / (2.0 * self.least) - leader_stop + self.margin
+        unsafe = speed * self.delay + speed * speed / (2.0 * self.most) - leader_stop
         return _between(e.gap - self.margin, safe, unsafe)
 
     def critical(self, e: Encounter) -> F64:
         """CFS, 0 to 1: could the driver slow down to a leader that keeps its speed?"""
-        u, lead, gap = e.speed, e.lead, e.gap
-        accel = np.maximum(e.accel, -self.least)
-        later = u + accel * self.delay
-        braking = np.where(accel < 0.0, accel, -self.least)
-        slower = (gap < (u - lead) ** 2 / (2.0 * np.abs(braking))).astype(np.float64)
-        run = (0.5 * (u + later) - lead) * self.delay
-        safe = run + (later - lead) ** 2 / (2.0 * self.least)
-        unsafe = run + (later - lead) ** 2 / (2.0 * self.most)
-        return np.where(u > lead, np.where(later < lead, slower, _between(gap, safe, unsafe)), 0.0)
+        speed, lead_speed, gap = e.speed, e.lead, e.gap
+        acceleration = np.maximum(e.accel, -self.least)
+        final_speed = speed + acceleration * self.delay
+        braking = np.where(acceleration < 0.0, acceleration, -self.least)
+        is_critical = (gap < (speed - lead_speed) ** 2 / (2.0 * np.abs(braking))).astype(np.float64)
+        delay_distance = (0.5 * (speed + final_speed) - lead_speed) * self.delay
+        safe = delay_distance + (final_speed - lead_speed) ** 2 / (2.0 * self.least)
+        unsafe = delay_distance + (final_speed - lead_speed) ** 2 / (2.0 * self.most)
+        return np.where(
+            speed > lead_speed, np.where(final_speed < lead_speed, is_critical, _between(gap, safe, unsafe)), 0.0
+        )
 
 
 def _between(gap: F64, safe: F64, unsafe: F64) -> F64:
-    """0 above `safe`, 1 below `unsafe`, linear in between."""
-    wide = np.where(safe > unsafe, safe - unsafe, 1.0)
-    return np.where(gap >= safe, 0.0, np.where(gap <= unsafe, 1.0, (safe - gap) / wide))
+    """Return 0 above `safe`, 1 below `unsafe`, linear in between."""
+    width = np.where(safe > unsafe, safe - unsafe, 1.0)
+    return np.where(gap >= safe, 0.0, np.where(gap <= unsafe, 1.0, (safe - gap) / width))
 
 
 def stays(e: Encounter) -> Bool:
@@ -210,7 +213,7 @@ MODELS: dict[str, CarefulModel] = {m.name: m for m in (CarefulHuman(), Reg157(),
 
 
 def careful_model(name: str) -> CarefulModel:
-    """The model of that short name; raises UnknownNameError with the closest."""
+    """Return the model of a short name. UnknownNameError lists the closest names."""
     try:
         return MODELS[name]
     except KeyError:
@@ -219,11 +222,11 @@ def careful_model(name: str) -> CarefulModel:
 
 @dataclass(frozen=True)
 class Reaction:
-    """What a model remembers.
+    """Memory of a model.
 
     Attributes:
-        since: s since each other has been perceived as a danger; negative: it is none.
-        brake: m/s^2 that the driver brakes with now because of it.
+        since: Time since each other agent became a danger, s; negative: no danger.
+        brake: Current braking because of it, m/s^2.
     """
 
     since: F64
@@ -231,7 +234,7 @@ class Reaction:
 
 
 def calm(shape: tuple[int, ...]) -> Reaction:
-    """Nothing perceived, no braking."""
+    """Return the memory without danger and braking."""
     return Reaction(np.full(shape, -1.0), np.zeros(shape))
 
 
@@ -247,19 +250,19 @@ def react(model: CarefulModel, e: Encounter, before: Reaction, dt: float) -> tup
     Returns:
         Mean braking over the step that each other asks for, m/s^2, and what the model remembers now.
     """
-    wants = model.demand(e)
-    began = (before.since + dt > model.delay) & (before.since >= 0.0)
+    demanded = model.demand(e)
+    is_braking = (before.since + dt > model.delay) & (before.since >= 0.0)
     if model.hold > 0.0:
-        there = (e.lateral <= 0.0) | (e.approach > 0.0)
-        wants = np.where(began & e.ahead() & there, np.maximum(wants, model.hold), wants)
-    since = np.where(wants > 0.0, np.maximum(before.since, 0.0), -1.0)
-    # braking may begin within the step
+        is_relevant = (e.lateral <= 0.0) | (e.approach > 0.0)
+        demanded = np.where(is_braking & e.ahead() & is_relevant, np.maximum(demanded, model.hold), demanded)
+    since = np.where(demanded > 0.0, np.maximum(before.since, 0.0), -1.0)
+    # the delay may end within the step
     share = np.clip((since + dt - model.delay) / dt, 0.0, 1.0)
     if np.isinf(model.jerk):
-        brake = np.where(share > 0.0, wants, 0.0)
-        mean = wants * share
+        brake = np.where(share > 0.0, demanded, 0.0)
+        mean_braking = demanded * share
     else:
-        brake = np.where(share > 0.0, np.minimum(wants, before.brake + model.jerk * dt * share), 0.0)
-        mean = 0.5 * (np.minimum(before.brake, wants) + brake)
-    mean = np.where((since >= 0.0) & (share < 1.0), np.maximum(mean, model.coast), mean)
-    return mean, Reaction(np.where(since >= 0.0, since + dt, -1.0), brake)
+        brake = np.where(share > 0.0, np.minimum(demanded, before.brake + model.jerk * dt * share), 0.0)
+        mean_braking = 0.5 * (np.minimum(before.brake, demanded) + brake)
+    mean_braking = np.where((since >= 0.0) & (share < 1.0), np.maximum(mean_braking, model.coast), mean_braking)
+    return mean_braking, Reaction(np.where(since >= 0.0, since + dt, -1.0), brake)

@@ -1,4 +1,4 @@
-"""Recorded drives again, up to a moment at which others take the wheel: many endings of many encounters at once."""
+"""Replays of recorded drives up to a moment at which other drivers take over: many endings side by side."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ssad.world.world import World
 
 
 class Hand(Protocol):
-    """What takes the wheel of some scenes: the part of `Driver` that is needed.
+    """Protocol of a driver that takes over: the required part of `Driver`.
 
     Attributes:
         sensors: As for `Driver`.
@@ -26,19 +26,19 @@ class Hand(Protocol):
     sensors: tuple[str, ...]
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """See `Driver`."""
+        """Prepare for new episodes, as `Driver.reset`."""
 
     def act(self, view: Observation) -> F32:
-        """See `Driver`."""
+        """Return the controls of the rows, as `Driver.act`."""
 
 
 @dataclass(frozen=True)
 class Takeover:
-    """Whom a scene is handed to, and when.
+    """Driver that takes over a scene, and the time of the takeover.
 
     Attributes:
-        hand: Who takes the wheel; one hand may take many scenes.
-        start: s from which on it drives.
+        driver: The driver; one driver may take many scenes.
+        start: Time of the takeover, s.
     """
 
     hand: Hand
@@ -46,24 +46,24 @@ class Takeover:
 
 
 def recorded_controls(trace: EpisodeTrace) -> F32:
-    """Controls of the ego [T, 4] that led to each row of a drive: throttle, brake, steer, reverse."""
+    """Return the controls of the ego [T, 4] that led to each row of a drive: throttle, brake, steer, reverse."""
     speed = trace.speed[:, 0]
-    back = np.zeros(len(speed), np.float32)
+    reverse = np.zeros(len(speed), np.float32)
     # the throttle of a vehicle in reverse makes it faster backwards
-    back[1:] = (trace.throttle[1:] > 0) & (trace.brake[1:] == 0) & (speed[1:] < speed[:-1])
-    return np.stack([trace.throttle, trace.brake, trace.steer, back], 1).astype(np.float32)
+    reverse[1:] = (trace.throttle[1:] > 0) & (trace.brake[1:] == 0) & (speed[1:] < speed[:-1])
+    return np.stack([trace.throttle, trace.brake, trace.steer, reverse], 1).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Ending:
-    """A drive that is played once for each takeover.
+    """Drive that is replayed once for each takeover.
 
     Attributes:
-        episode: What was driven.
-        graph: Its town.
-        trace: How.
-        takeovers: Who takes over, and when; a scene each.
-        until: s at which all is stopped.
+        episode: The driven episode.
+        graph: Lane graph of its town.
+        trace: Recording of the drive.
+        takeovers: The takeovers, one scene each.
+        until: End of the replay, s.
     """
 
     episode: Episode
@@ -74,7 +74,7 @@ class Ending:
 
     @property
     def steps(self) -> int:
-        """Steps until then."""
+        """Number of steps of the replay."""
         return round(self.until / self.trace.dt)
 
 
@@ -86,53 +86,60 @@ def play(
     sensors: Mapping[str, Sensor] | None = None,
     watch: Callable[[World], None] | None = None,
 ) -> list[Bool]:
-    """Play drives side by side, each once for each of its takeovers; none depends on the others.
+    """Replay drives side by side, once for each of their takeovers; the scenes are independent.
 
-    Everybody but the ego does what the episode says: scripts and traffic react to the new ego as they did to the old.
+    All other agents follow the episode: scripts and traffic react to the new ego as they did to the recorded one.
 
     Args:
-        endings: What is played; the world's scenes are their takeovers, in order. A hand may take scenes of several.
-        device: Where the world computes.
+        endings: The replays; the world's scenes are their takeovers, in order. A driver may serve several endings.
+        device: Device of the world.
         policies: As for `rollout`.
         sensors: As for `rollout`.
-        watch: Looks at the world after each step.
+        watch: Called with the world after each step.
 
     Returns:
-        Of each scene of each drive, whether the ego touched anybody.
+        For each drive, [scenes] True where the ego collided.
     """
-    again = []
-    for one in endings:
-        limits = replace(one.episode.limits, max_steps=one.steps, max_time=1e6, max_distance=1e9, contact="end")
-        again.append(replace(one.episode, limits=limits))
-    count = [len(one.takeovers) for one in endings]
-    scenes = np.repeat(np.arange(len(endings)), count)
-    graphs = {one.episode.town: one.graph for one in endings}
-    world = World(again, graphs, assign=scenes, device=device, ego=Controller.EXTERNAL)
+    replayed = []
+    for ending in endings:
+        limits = replace(ending.episode.limits, max_steps=ending.steps, max_time=1e6, max_distance=1e9, contact="end")
+        replayed.append(replace(ending.episode, limits=limits))
+    scene_counts = [len(ending.takeovers) for ending in endings]
+    scenes = np.repeat(np.arange(len(endings)), scene_counts)
+    graphs = {ending.episode.town: ending.graph for ending in endings}
+    world = World(replayed, graphs, assign=scenes, device=device, ego=Controller.EXTERNAL)
     loop = Loop(world, {}, policies=policies, sensors=sensors)
     loop.reset()
-    takeovers = [takeover for one in endings for takeover in one.takeovers]
-    hands = list(dict.fromkeys(t.hand for t in takeovers))
-    for hand in hands:
-        hand.reset([again[k] for k in scenes])
-    owner = np.array([hands.index(t.hand) for t in takeovers])
-    start, dt = np.array([t.start for t in takeovers]), np.array([one.trace.dt for one in endings])[scenes]
-    recorded = [recorded_controls(one.trace) for one in endings]
+    takeovers = [takeover for ending in endings for takeover in ending.takeovers]
+    drivers = list(dict.fromkeys(candidate.hand for candidate in takeovers))
+    for driver in drivers:
+        driver.reset([replayed[index] for index in scenes])
+    driver_index = np.array([drivers.index(candidate.hand) for candidate in takeovers])
+    start, dt = (
+        np.array([candidate.start for candidate in takeovers]),
+        np.array([ending.trace.dt for ending in endings])[scenes],
+    )
+    recorded = [recorded_controls(ending.trace) for ending in endings]
     controls = np.zeros((world.batch, world.agents, 4), np.float32)
-    for step in range(max(one.steps for one in endings)):
-        controls[:, 0] = np.stack([own[min(step + 1, len(own) - 1)] for own in recorded])[scenes]
-        taken = (step * dt > start - 1e-4) & (world.ended() == End.RUNNING)
-        for k, hand in enumerate(hands):
-            mine = np.flatnonzero(taken & (owner == k))
-            if len(mine):
-                agents = np.stack([mine, np.zeros_like(mine)], 1).astype(np.int32)
-                readings = {name: loop.sensors[name](world, agents) for name in hand.sensors}
+    for step in range(max(ending.steps for ending in endings)):
+        # Row 0 is the start state: the controls of step k are recorded in row k + 1.
+        controls[:, 0] = np.stack(
+            [ending_controls[min(step + 1, len(ending_controls) - 1)] for ending_controls in recorded]
+        )[scenes]
+        # The tolerance absorbs rounding of step * dt at the takeover time.
+        taken_over = (step * dt > start - 1e-4) & (world.ended() == End.RUNNING)
+        for index, driver in enumerate(drivers):
+            scene_rows = np.flatnonzero(taken_over & (driver_index == index))
+            if len(scene_rows):
+                agents = np.stack([scene_rows, np.zeros_like(scene_rows)], 1).astype(np.int32)
+                readings = {name: loop.sensors[name](world, agents) for name in driver.sensors}
                 view = observe(world.state(), agents, world.ended() != End.RUNNING, readings)
-                controls[mine, 0] = 0.0
-                given = hand.act(view)
-                controls[mine, 0, : given.shape[1]] = given
+                controls[scene_rows, 0] = 0.0
+                driver_controls = driver.act(view)
+                controls[scene_rows, 0, : driver_controls.shape[1]] = driver_controls
         loop.step(controls)
         if watch is not None:
             watch(world)
         if (world.ended() != End.RUNNING).all():
             break
-    return np.split(np.asarray(world.ended() == End.COLLISION), np.cumsum(count)[:-1])
+    return np.split(np.asarray(world.ended() == End.COLLISION), np.cumsum(scene_counts)[:-1])

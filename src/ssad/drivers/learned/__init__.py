@@ -1,1 +1,1 @@
-"""Driving systems that were trained by reinforcement learning: PPO, SAC and TD3."""
+"""Driving systems trained by reinforcement learning: PPO, SAC and TD3."""

@@ -1,1 +1,1 @@
-"""A driving system that knows of traffic only what its cameras show; each part can be replaced."""
+"""Driving system that knows traffic only through its cameras; each component can be replaced."""

@@ -54,7 +54,7 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is believed at a step, for who watches.
+    """Belief at a step, for observers.
 
     Attributes:
         scene: [N] the scenes.
@@ -68,18 +68,18 @@ class Known:
 
 
 class Perceiving:
-    """The Autopilot over what its eyes see.
+    """Autopilot on the belief of its eyes.
 
     Args:
-        eyes: What looks.
-        lifting: How detections become places.
-        tracking: How places become tracks.
-        rate: Looks a second; the world has 10 steps a second.
-        latency: s from a picture to its detections. Tracks are moved on to the present, so what is late is not
-            misplaced, but unknown for so long.
-        watch: Told of each look, and at each step of what is believed.
-        repair: Repairs one error of what is found, to see what it alone does.
-        signs: How it reads stop signs; None: it knows those of the map.
+        eyes: Source of detections.
+        lifting: Settings of the projection of detections to the world.
+        tracking: Settings of the tracker.
+        rate: Looks per second; the world has 10 steps per second.
+        latency: s from an image to its detections. Tracks are predicted to the present, so latency delays new objects
+            but does not misplace known ones.
+        watch: Called with each look, and with the belief at each step.
+        repair: Repairs one perception error, to isolate its effect.
+        signs: Settings of reading stop signs; None: those of the map are known.
 
     Raises:
         ConfigError: A value is out of its range.
@@ -113,19 +113,19 @@ class Perceiving:
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
-        """The cameras among its sensors, which the engine makes."""
+        """Cameras among its sensors, which the engine renders."""
         return {name: camera for name, camera in self.eyes.cameras.items() if name in self.sensors}
 
     @property
     def detector(self) -> Any:
-        """The detector of its eyes, which attacks ask for; None if they have none."""
+        """Detector of its eyes, for attacks; None if they have none."""
         return getattr(self.eyes, "detector", None)
 
     def to(self, device: str) -> None:
-        """Compute on another device, if its eyes can."""
-        move = getattr(self.eyes, "to", None)
-        if move is not None:
-            move(device)
+        """Move the computation to another device, if the eyes support it."""
+        move_eyes = getattr(self.eyes, "to", None)
+        if move_eyes is not None:
+            move_eyes(device)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Forget the past."""
@@ -137,31 +137,31 @@ class Perceiving:
         self.eyes.reset(episodes)
 
     def snapshot(self) -> Any:
-        """All that changes; with a snapshot of the simulator, `restore` goes on from there to the bit."""
+        """Return the complete state; `restore` continues from it bit by bit, together with a simulator snapshot."""
         signs = None if self._signs is None else self._signs.snapshot()
         return self._tracker.snapshot(), self._looks.copy(), list(self._waiting), self.eyes.snapshot(), signs
 
     def restore(self, snapshot: Any) -> None:
-        """Go on from an earlier moment of the same batch."""
-        tracks, looks, waiting, eyes, signs = snapshot
+        """Continue from an earlier snapshot of the same batch."""
+        tracks, look_counts, pending, eye_state, sign_state = snapshot
         self._tracker.restore(tracks)
-        self._looks, self._waiting = looks.copy(), list(waiting)
-        self.eyes.restore(eyes)
+        self._looks, self._waiting = look_counts.copy(), list(pending)
+        self.eyes.restore(eye_state)
         if self._signs is not None:
-            self._signs.restore(signs)
+            self._signs.restore(sign_state)
 
     def act(self, view: Observation) -> F32:
-        """Never called: the planner runs inside the world."""
+        """Raise RuntimeError: the planner runs inside the world."""
         raise RuntimeError("the Autopilot runs inside the world")
 
     def believe(self, view: Observation) -> Belief:
-        """What is around the egos, as far as it has been seen."""
+        """Return the tracked objects around the egos."""
         now = view.time.astype(np.float64)
-        looks = np.floor((now + LATE) * self.rate).astype(np.int64)
-        due = np.flatnonzero(~view.done & (looks > self._looks[view.scene]))
-        if len(due):
-            self._looks[view.scene[due]] = looks[due]
-            self._waiting += self._sightings(view, due, now)
+        look_counts = np.floor((now + LATE) * self.rate).astype(np.int64)
+        due_rows = np.flatnonzero(~view.done & (look_counts > self._looks[view.scene]))
+        if len(due_rows):
+            self._looks[view.scene[due_rows]] = look_counts[due_rows]
+            self._waiting += self._sightings(view, due_rows, now)
         self._take_in(dict(zip(view.scene.tolist(), now.tolist(), strict=True)))
         tracks = self._tracker.confirmed(view.scene, now)
         if self.watch is not None:
@@ -172,52 +172,78 @@ class Perceiving:
         return replace(belief, stop_sign=self._signs.known(view.scene, now, view.pose))
 
     def _sightings(self, view: Observation, rows: I64, now: F64) -> list[Sighting]:
-        """What is seen now in some rows."""
-        looked, scenes = self.eyes.look(view, rows), view.scene[rows].astype(np.int64)
-        egos = upright_poses(view.pose[rows].astype(np.float64))
-        parts, blind, signs = [no_objects()], np.ones(len(rows), bool), [[np.zeros((0, 2))] for _ in rows]
+        """Return the sightings of some rows at the present time."""
+        detections_by_camera, scenes = self.eyes.look(view, rows), view.scene[rows].astype(np.int64)
+        ego_poses = upright_poses(view.pose[rows].astype(np.float64))
+        parts, without_image, signs = [no_objects()], np.ones(len(rows), bool), [[np.zeros((0, 2))] for _ in rows]
         for name, camera in self.eyes.cameras.items():
-            seen = np.array([k for k, one in enumerate(looked[name]) if one is not None], np.int64)
-            found, eyes = [one for one in looked[name] if one is not None], egos[seen] @ camera.to_ego
-            parts.append(lift(found, camera, eyes, scenes[seen], self.eyes.classes, settings=self.lifting))
-            blind[seen] = False
+            image_rows = np.array(
+                [index for index, detections in enumerate(detections_by_camera[name]) if detections is not None],
+                np.int64,
+            )
+            valid_detections, camera_poses = (
+                [detections for detections in detections_by_camera[name] if detections is not None],
+                ego_poses[image_rows] @ camera.to_ego,
+            )
+            parts.append(
+                lift(
+                    valid_detections, camera, camera_poses, scenes[image_rows], self.eyes.classes, settings=self.lifting
+                )
+            )
+            without_image[image_rows] = False
             if self._signs is not None:
-                for k, one, at in zip(seen.tolist(), found, eyes, strict=True):
-                    signs[k].append(read_signs(one, camera, at, self.eyes.classes, score=self._signs.settings.score))
-        together = merged(Objects.joined(parts), self.lifting.merge)
+                for index, detections, camera_pose in zip(
+                    image_rows.tolist(), valid_detections, camera_poses, strict=True
+                ):
+                    signs[index].append(
+                        read_signs(detections, camera, camera_pose, self.eyes.classes, score=self._signs.settings.score)
+                    )
+        # Neighbouring cameras overlap, so an object can be detected twice.
+        merged_objects = merged(Objects.joined(parts), self.lifting.merge)
         sightings = []
-        for k, row in enumerate(rows.tolist()):
-            mine = slice(*np.searchsorted(together.scene, [scenes[k], scenes[k] + 1]))
-            all_ = None if blind[k] else together.take(mine)
+        for index, row in enumerate(rows.tolist()):
+            scene_slice = slice(*np.searchsorted(merged_objects.scene, [scenes[index], scenes[index] + 1]))
+            scene_objects = None if without_image[index] else merged_objects.take(scene_slice)
             if self.repair is not None:
-                all_ = self.repair(view, row, all_ or no_objects(), self.eyes.cameras, self.lifting)
-            shown = {} if self.watch is None else self._pictures(view, row)
-            read = None if self._signs is None else np.concatenate(signs[k])
-            sightings.append(Sighting(int(scenes[k]), float(now[row]), all_, shown, read, egos[k, :2, 3]))
+                scene_objects = self.repair(view, row, scene_objects or no_objects(), self.eyes.cameras, self.lifting)
+            images = {} if self.watch is None else self._pictures(view, row)
+            sign_positions = None if self._signs is None else np.concatenate(signs[index])
+            sightings.append(
+                Sighting(
+                    int(scenes[index]), float(now[row]), scene_objects, images, sign_positions, ego_poses[index, :2, 3]
+                )
+            )
             if self.watch is not None:
                 self.watch(sightings[-1])
         return sightings
 
     def _pictures(self, view: Observation, row: int) -> dict[str, U8]:
-        """What the cameras showed to a row."""
+        """Return the camera images of a row."""
         return {name: view.readings[name][row] for name in self.cameras}
 
     def _take_in(self, now: Mapping[int, float]) -> None:
-        """Hand the tracker what has arrived, look by look; a look without any picture tells nothing."""
-        ready = [s for s in self._waiting if s.scene in now and s.time + self.latency <= now[s.scene] + LATE]
-        taken = {id(s) for s in ready}
-        self._waiting = [s for s in self._waiting if id(s) not in taken]
+        """Pass arrived sightings to the tracker, look by look; a look without images carries no information."""
+        ready = [
+            arrival
+            for arrival in self._waiting
+            if arrival.scene in now and arrival.time + self.latency <= now[arrival.scene] + LATE
+        ]
+        ready_ids = {id(arrival) for arrival in ready}
+        self._waiting = [arrival for arrival in self._waiting if id(arrival) not in ready_ids]
         while ready:
-            first: dict[int, Sighting] = {}
+            # The tracker takes at most one look per scene and call, in order of time.
+            first_of_scene: dict[int, Sighting] = {}
             for sighting in ready:
-                first.setdefault(sighting.scene, sighting)
-            ready = [s for s in ready if first[s.scene] is not s]
-            batch = [s for s in first.values() if s.found is not None]
+                first_of_scene.setdefault(sighting.scene, sighting)
+            ready = [arrival for arrival in ready if first_of_scene[arrival.scene] is not arrival]
+            batch = [arrival for arrival in first_of_scene.values() if arrival.found is not None]
             if batch:
-                scenes = np.array([s.scene for s in batch])
-                times = np.array([s.time for s in batch])
-                found = Objects.joined([no_objects(), *(s.found for s in batch if s.found is not None)])
-                self._tracker.update(scenes, times, found)
-                for one in batch:
-                    if self._signs is not None and one.signs is not None and one.eye is not None:
-                        self._signs.update(one.scene, one.time, one.eye, one.signs)
+                scenes = np.array([arrival.scene for arrival in batch])
+                times = np.array([arrival.time for arrival in batch])
+                objects = Objects.joined(
+                    [no_objects(), *(arrival.found for arrival in batch if arrival.found is not None)]
+                )
+                self._tracker.update(scenes, times, objects)
+                for processed in batch:
+                    if self._signs is not None and processed.signs is not None and processed.eye is not None:
+                        self._signs.update(processed.scene, processed.time, processed.eye, processed.signs)

@@ -1,7 +1,7 @@
-"""What looks: a detector on the pictures of cameras, or a perfect one that is told the truth.
+"""Eyes of perceiving drivers: a detector on camera images, or a perfect detector that knows the truth.
 
-Both report `Detections` in the frame of a camera, so that all that follows is the same; where the two drive
-differently, the difference is the detector's.
+Both report `Detections` in the frame of a camera, so the rest of the pipeline is the same; any difference in driving
+is caused by the detector.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ssad.drivers.perceiving.objects import I64, SIZES
 from ssad.rendering.camera.rig import rig_camera
 
 FRONT = ("CAM_FRONT",)
-# what a perfect detector calls each kind
+# class that a perfect detector reports for each kind
 NAMES: Mapping[int, str] = {
     AgentKind.CAR: "car",
     AgentKind.TRUCK: "truck",
@@ -39,16 +39,16 @@ NAMES: Mapping[int, str] = {
     AgentKind.WALKER: "pedestrian",
     AgentKind.PROP: "barrier",
 }
-MEMORY = 100  # bytes that a detector needs on a GPU for each value of a picture, about
-_SLOTS = 64  # a scene has fewer agents: draws for all, so that none depends on how many there are
+MEMORY = 100  # approximate bytes of GPU memory that a detector needs per image value
+_SLOTS = 64  # more than the agents of any scene: with fixed draws per look none depends on the number of agents
 
 
 class Eyes(Protocol):
-    """What looks.
+    """Protocol of sources of detections.
 
     Attributes:
         sensors: Names of the sensors that it reads.
-        cameras: The cameras that it looks through, by the names of their sensors.
+        cameras: Its cameras, by the names of their sensors.
     """
 
     sensors: tuple[str, ...]
@@ -66,41 +66,41 @@ class Eyes(Protocol):
         """
 
     def snapshot(self) -> Any:
-        """All that changes from look to look."""
+        """Return the state that changes from look to look."""
 
     def restore(self, snapshot: Any) -> None:
-        """Go on from an earlier moment.
+        """Continue from an earlier snapshot.
 
         Args:
             snapshot: What `snapshot` returned.
         """
 
     def look(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
-        """Look through all cameras.
+        """Detect objects through all cameras.
 
         Args:
-            view: What the egos see.
-            rows: [n] which of its rows are wanted.
+            view: Observation of the egos.
+            rows: [n] indices of the rows to process.
 
         Returns:
-            For each camera what was found in each row, [n]; None where there was no picture.
+            For each camera the detections of each row, [n]; None where there was no image.
         """
 
 
 def front(width: int = 640, channels: Sequence[str] = FRONT) -> dict[str, Camera]:
-    """Cameras of the nuScenes rig with pictures so many pixels wide, by channel."""
+    """Return cameras of the nuScenes rig with images of a width in pixels, by channel."""
     return {channel: rig_camera(channel, width) for channel in channels}
 
 
 class CameraEyes:
-    """A detector on pictures. A picture that is 0 everywhere is none: the signal is lost, and that is noticed.
+    """Detector on camera images. An image that is 0 everywhere counts as a detected loss of signal.
 
     Args:
-        detector: The detector, or the name of one, which is made when it is first needed.
+        detector: The detector, or the name of one, which is made on first use.
         cameras: Cameras by name; None: the front camera of nuScenes, 640 pixels wide.
-        threshold: Least score of what it reports.
-        device: Where the detector computes; one that is not a name is there already.
-        options: What the builder of a named detector takes.
+        threshold: Minimum score of reported detections.
+        device: Device of a named detector; a detector object stays on its own.
+        options: Options of the builder of a named detector.
     """
 
     def __init__(
@@ -124,10 +124,10 @@ class CameraEyes:
         if self._made is None:
             if isinstance(self._given, str):
                 # by name: drivers do not import detectors
-                make: Callable[..., Detector] = resolve(
+                factory: Callable[..., Detector] = resolve(
                     "function", {"make_detector": "ssad.detectors:make_detector"}, "make_detector"
                 )
-                self._made = make(self._given, device=self.device, **self._options)
+                self._made = factory(self._given, device=self.device, **self._options)
             else:
                 self._made = self._given
         return self._made
@@ -138,40 +138,44 @@ class CameraEyes:
         return tuple(self.detector.classes)
 
     def to(self, device: str) -> None:
-        """Make a named detector on another device."""
+        """Remake a named detector on another device."""
         if device != self.device and isinstance(self._given, str):
             self.device, self._made = device, None
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """Nothing to forget."""
+        """Do nothing: the detector is stateless."""
 
     def snapshot(self) -> None:
-        """Nothing changes."""
+        """Return None: the detector is stateless."""
 
     def restore(self, snapshot: Any) -> None:
-        """Nothing changes."""
+        """Do nothing: the detector is stateless."""
 
     def look(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
-        """See `Eyes`; on a GPU the pictures of all cameras of one size are one batch, on a CPU those of a camera."""
-        found: dict[str, list[Detections | None]] = {}
+        """Detect objects; on a GPU all cameras of one size form one batch, on a CPU each camera its own."""
+        detections: dict[str, list[Detections | None]] = {}
         batches: dict[Any, list[tuple[str, I64, torch.Tensor]]] = {}
         for name in self.cameras:
-            pictures = self._pictures(view, rows, name)
-            found[name] = [None] * len(rows)
-            seen = np.flatnonzero(pictures.flatten(1).any(1).cpu().numpy())
-            if len(seen):
-                shown = pictures if len(seen) == len(rows) else pictures[_at(seen, pictures)]
-                batches.setdefault(pictures.shape[1:] if pictures.is_cuda else name, []).append((name, seen, shown))
+            images = self._pictures(view, rows, name)
+            detections[name] = [None] * len(rows)
+            valid_rows = np.flatnonzero(images.flatten(1).any(1).cpu().numpy())
+            if len(valid_rows):
+                valid_images = images if len(valid_rows) == len(rows) else images[_at(valid_rows, images)]
+                batches.setdefault(images.shape[1:] if images.is_cuda else name, []).append(
+                    (name, valid_rows, valid_images)
+                )
         for batch in batches.values():
-            lens = np.array([self.cameras[name].intrinsic for name, seen, _ in batch for _ in seen], np.float32)
-            together = batch[0][2] if len(batch) == 1 else torch.cat([one for *_, one in batch])
-            places = [(name, k) for name, seen, _ in batch for k in seen.tolist()]
-            for (name, k), one in zip(places, self.detect(together, lens), strict=True):
-                found[name][k] = one
-        return found
+            intrinsics = np.array(
+                [self.cameras[name].intrinsic for name, valid_rows, _ in batch for _ in valid_rows], np.float32
+            )
+            stacked = batch[0][2] if len(batch) == 1 else torch.cat([entry for *_, entry in batch])
+            targets = [(name, index) for name, valid_rows, _ in batch for index in valid_rows.tolist()]
+            for (name, index), entry in zip(targets, self.detect(stacked, intrinsics), strict=True):
+                detections[name][index] = entry
+        return detections
 
     def _pictures(self, view: Observation, rows: I64, name: str) -> torch.Tensor:
-        """Pictures uint8 [n, 3, H, W] of a camera on the detector's device, from arrays or tensors."""
+        """Return images uint8 [n, 3, H, W] of a camera on the detector's device, from arrays or tensors."""
         reading, camera = view.readings[name], self.cameras[name]
         if reading.shape[1:] != (3, camera.height, camera.width):
             raise ConfigError(
@@ -187,12 +191,14 @@ class CameraEyes:
 
     def detect(self, pictures: torch.Tensor, lens: Floats) -> list[Detections]:
         """What is in pictures uint8 [n, 3, H, W] with intrinsics [n, 3, 3]; all of it on the host."""
-        needed = torch.from_numpy(lens).to(self.device) if self.detector.task == "3d" else None
-        room, found = _room(pictures), []
-        for k in range(0, len(pictures), room):
-            part = None if needed is None else needed[k : k + room]
-            found += self.detector.predict(pictures[k : k + room].float() / 255.0, part, threshold=self.threshold)
-        return on_host(found) if pictures.is_cuda else found
+        intrinsics = torch.from_numpy(lens).to(self.device) if self.detector.task == "3d" else None
+        batch_size, detections = _room(pictures), []
+        for start in range(0, len(pictures), batch_size):
+            batch_intrinsics = None if intrinsics is None else intrinsics[start : start + batch_size]
+            detections += self.detector.predict(
+                pictures[start : start + batch_size].float() / 255.0, batch_intrinsics, threshold=self.threshold
+            )
+        return on_host(detections) if pictures.is_cuda else detections
 
 
 def _room(pictures: torch.Tensor) -> int:
@@ -200,8 +206,10 @@ def _room(pictures: torch.Tensor) -> int:
     if not pictures.is_cuda:
         return max(len(pictures), 1)
     device = pictures.device
-    left = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return max(left // 4 // (MEMORY * pictures[0].numel()), 16)
+    free_bytes = (
+        torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    )
+    return max(free_bytes // 4 // (MEMORY * pictures[0].numel()), 16)
 
 
 def _at(rows: I64, like: torch.Tensor) -> torch.Tensor:
@@ -210,34 +218,34 @@ def _at(rows: I64, like: torch.Tensor) -> torch.Tensor:
 
 def on_host(found: list[Detections]) -> list[Detections]:
     """Detections of images [at least one] on the host, brought there in one go and not image by image."""
-    counts = [len(one.score) for one in found]
+    counts = [len(entry.score) for entry in found]
 
-    def brought(values: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
+    def transfer(values: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
         return torch.split(torch.cat(list(values)).cpu(), counts)
 
-    flat = [brought([getattr(one, name) for one in found]) for name in ("score", "label", "box")]
-    solids = [one.solid for one in found if one.solid is not None]
+    flat_columns = [transfer([getattr(entry, name) for entry in found]) for name in ("score", "label", "box")]
+    solids = [entry.solid for entry in found if entry.solid is not None]
     if len(solids) < len(found):
-        return [Detections(*part) for part in zip(*flat, strict=True)]
+        return [Detections(*part) for part in zip(*flat_columns, strict=True)]
     names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
-    deep = zip(*(brought([getattr(one, name) for one in solids]) for name in names), strict=True)
-    parts = zip(*flat, deep, strict=True)
+    solid_columns = zip(*(transfer([getattr(entry, name) for entry in solids]) for name in names), strict=True)
+    parts = zip(*flat_columns, solid_columns, strict=True)
     return [Detections(score, label, box, Solids(*solid)) for score, label, box, solid in parts]
 
 
 class PerfectEyes:
-    """A detector that is told the truth: it finds all that can be seen, where it is.
+    """Perfect detector that knows the truth: it finds every visible object at its true position.
 
-    Found is what has its middle before a camera and a part of its outline in the picture, and is not hidden (see
-    `ssad.drivers.belief.in_sight`). With `missed`, `noise` and `phantoms`, it fails as detectors do.
+    An object is found if its centre is in front of a camera, a part of its outline is in the image, and it is not
+    hidden (see `ssad.drivers.belief.in_sight`). `missed`, `noise` and `phantoms` add the failures of real detectors.
 
     Args:
         cameras: Cameras by name; None: the front camera of nuScenes.
-        reach: m to which it sees.
+        reach: Range, m.
         missed: Share of the looks in which an object is missed.
-        burst: Looks in a row that an object stays missed on average, as in `DegradedBelief`.
+        burst: Mean number of consecutive looks that an object stays missed, as in `DegradedBelief`.
         noise: Standard deviation of the distance of an object as a share of it.
-        phantoms: Cars a look that are not there, on average; anywhere in the picture, 5 to 40 m away.
+        phantoms: Mean number of phantom cars per look; anywhere in the image, 5 to 40 m away.
 
     Raises:
         ConfigError: A value is out of its range.
@@ -269,65 +277,69 @@ class PerfectEyes:
         self._missing = np.zeros((0, _SLOTS), bool)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
-        """See `Eyes`; draws begin anew for these episodes."""
+        """Restart the random draws for these episodes."""
         self._draws = [generator("eyes", episode.key, episode.seed) for episode in episodes]
         self._missing = np.array([draws.random(_SLOTS) < self.missed for draws in self._draws]).reshape(-1, _SLOTS)
 
     def look(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
-        """See `Eyes`."""
+        """Return the visible objects as detections, with the configured errors."""
         truth: Belief = view.readings["truth"]
         truth = truth.rows(rows)
-        seen = in_sight(view.pose[rows, :2], truth, self.reach)
-        shift = np.ones(seen.shape)
-        for k, scene in enumerate(view.scene[rows].tolist()):
-            draws, count = self._draws[scene], seen.shape[1]
-            chance = draws.random(_SLOTS)
-            gone = self._missing[scene]
-            self._missing[scene] = gone = np.where(gone, chance >= self.again, chance < self.lost)
-            seen[k] &= ~gone[:count]
-            shift[k] += self.noise * draws.normal(size=_SLOTS)[:count]
-        found: dict[str, list[Detections | None]] = {}
+        visible = in_sight(view.pose[rows, :2], truth, self.reach)
+        distance_factors = np.ones(visible.shape)
+        for index, scene in enumerate(view.scene[rows].tolist()):
+            draws, count = self._draws[scene], visible.shape[1]
+            uniform = draws.random(_SLOTS)
+            missing = self._missing[scene]
+            self._missing[scene] = missing = np.where(missing, uniform >= self.again, uniform < self.lost)
+            visible[index] &= ~missing[:count]
+            distance_factors[index] += self.noise * draws.normal(size=_SLOTS)[:count]
+        detections: dict[str, list[Detections | None]] = {}
         for name, camera in self.cameras.items():
-            found[name] = []
-            for k, row in enumerate(rows.tolist()):
-                boxes = boxes_of(truth, k, seen[k])
+            detections[name] = []
+            for index, row in enumerate(rows.tolist()):
+                object_boxes = boxes_of(truth, index, visible[index])
                 pose = upright_pose(*view.pose[row].astype(np.float64).tolist()) @ camera.to_ego
-                one = projected(boxes, np.asarray(np.linalg.inv(pose), np.float64), camera, shift[k][seen[k]])
+                projected_objects = projected(
+                    object_boxes,
+                    np.asarray(np.linalg.inv(pose), np.float64),
+                    camera,
+                    distance_factors[index][visible[index]],
+                )
                 scene = int(view.scene[row])
-                found[name].append(_joined(one, self._invented(self._draws[scene], camera)))
-        return found
+                detections[name].append(_joined(projected_objects, self._invented(self._draws[scene], camera)))
+        return detections
 
     def snapshot(self) -> Any:
-        """See `Eyes`."""
+        """Return copies of the random generators and the missed objects."""
         return deepcopy(self._draws), self._missing.copy()
 
     def restore(self, snapshot: Any) -> None:
-        """See `Eyes`."""
+        """Restore the random generators and the missed objects."""
         self._draws, self._missing = deepcopy(snapshot[0]), snapshot[1].copy()
 
     def _invented(self, draws: np.random.Generator, camera: Camera) -> Detections:
-        """Cars that are not there."""
+        """Return phantom cars."""
         count = int(draws.poisson(self.phantoms)) if self.phantoms else 0
         column, depth = draws.uniform(0, camera.width, count), draws.uniform(5.0, 40.0, count)
         x = (column - camera.intrinsic[0, 2]) / camera.intrinsic[0, 0] * depth
         size = np.tile(SIZES[AgentKind.CAR], (count, 1))
+        # Phantoms stand on the ground: camera height minus half of their own.
         y = camera.to_ego[2, 3] - 0.5 * size[:, 2]
-        turn = draws.uniform(-np.pi, np.pi, count)
-        return _detections(
-            np.stack([x, y, depth], 1), size, turn, [AgentKind.CAR] * count, np.zeros((count, 2)), camera
-        )
+        yaw = draws.uniform(-np.pi, np.pi, count)
+        return _detections(np.stack([x, y, depth], 1), size, yaw, [AgentKind.CAR] * count, np.zeros((count, 2)), camera)
 
 
 def boxes_of(truth: Belief, scene: int, mask: Any) -> tuple[F64, F64, F64, list[int], F64]:
-    """Objects of a scene as upright boxes in the world, with the heights that are usual for their kinds.
+    """Return objects of a scene as upright boxes in the world, with the default heights of their kinds.
 
     Args:
         truth: The objects of all scenes.
-        scene: Which scene.
-        mask: [K] which of its objects.
+        scene: Index of the scene.
+        mask: [K] selects its objects.
 
     Returns:
-        Middle [N, 3], size [N, 3] (length, width, height), yaw [N], kind, velocity [N, 2].
+        Centre [N, 3], size [N, 3] (length, width, height), yaw [N], kind, velocity [N, 2].
     """
     pose, speed = truth.pose[scene][mask].astype(np.float64), truth.speed[scene][mask].astype(np.float64)
     kind = truth.kind[scene][mask].tolist()
@@ -353,42 +365,43 @@ def projected(
     local = centre @ to_camera[:3, :3].T + to_camera[:3, 3]
     if shift is not None:
         local = local * shift[:, None]
-    ahead = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]) @ to_camera[:3, :3].T
+    direction = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]) @ to_camera[:3, :3].T
     moving = np.column_stack([velocity, np.zeros(len(yaw))]) @ to_camera[:3, :3].T
-    return _detections(local, size, camera_yaw(ahead), kind, moving[:, [0, 2]], camera)
+    return _detections(local, size, camera_yaw(direction), kind, moving[:, [0, 2]], camera)
 
 
 def _detections(  # noqa: PLR0917  # columns
     centre: F64, size: F64, yaw: F64, kind: Sequence[int], velocity: F64, camera: Camera
 ) -> Detections:
-    """Boxes in a camera's frame (sizes: length, width, height) as detections; those out of the picture are left out."""
+    """Return boxes in a camera's frame (length, width, height) as detections; boxes out of the image are dropped."""
     corners = np.einsum("nij,nkj->nki", camera_axes(yaw), UNIT_CORNERS * size[:, None]) + centre[:, None]
-    front_ = np.maximum(corners[..., 2:], 0.1)
-    points = (corners / front_) @ camera.intrinsic.T
-    low, high = points[..., :2].min(1), points[..., :2].max(1)
-    limit = np.array([camera.width, camera.height], float)
-    box = np.concatenate([np.clip(low, 0.0, limit), np.clip(high, 0.0, limit)], 1)
+    # Corners behind the camera would be mirrored by the division.
+    depth = np.maximum(corners[..., 2:], 0.1)
+    points = (corners / depth) @ camera.intrinsic.T
+    minimum, maximum = points[..., :2].min(1), points[..., :2].max(1)
+    image_size = np.array([camera.width, camera.height], float)
+    box = np.concatenate([np.clip(minimum, 0.0, image_size), np.clip(maximum, 0.0, image_size)], 1)
     rows = np.flatnonzero((centre[:, 2] > 0.5) & (box[:, 2] - box[:, 0] >= 1.0) & (box[:, 3] - box[:, 1] >= 1.0))
-    label = [MMDET3D_CLASSES.index(NAMES[kind[k]]) for k in rows.tolist()]
-    turned = size[rows][:, [0, 2, 1]]
+    label = [MMDET3D_CLASSES.index(NAMES[kind[row]]) for row in rows.tolist()]
+    size_lhw = size[rows][:, [0, 2, 1]]
     attribute = torch.full((len(rows),), MMDET3D_ATTRIBUTES.index("none"))
-    columns = [torch.from_numpy(np.ascontiguousarray(v[rows])) for v in (centre, yaw, velocity, box)]
-    solid = Solids(columns[0], torch.from_numpy(turned), columns[1], columns[2], attribute)
+    columns = [torch.from_numpy(np.ascontiguousarray(column[rows])) for column in (centre, yaw, velocity, box)]
+    solid = Solids(columns[0], torch.from_numpy(size_lhw), columns[1], columns[2], attribute)
     return Detections(
         torch.ones(len(rows), dtype=torch.float64), torch.tensor(label, dtype=torch.int64), columns[3], solid
     )
 
 
 def _joined(one: Detections, other: Detections) -> Detections:
-    a, b = one.solid, other.solid
-    assert a is not None
-    assert b is not None
+    first_solid, second_solid = one.solid, other.solid
+    assert first_solid is not None
+    assert second_solid is not None
     solid = Solids(
-        torch.cat([a.centre, b.centre]),
-        torch.cat([a.size_lhw, b.size_lhw]),
-        torch.cat([a.yaw, b.yaw]),
-        torch.cat([a.velocity, b.velocity]),
-        torch.cat([a.attribute, b.attribute]),
+        torch.cat([first_solid.centre, second_solid.centre]),
+        torch.cat([first_solid.size_lhw, second_solid.size_lhw]),
+        torch.cat([first_solid.yaw, second_solid.yaw]),
+        torch.cat([first_solid.velocity, second_solid.velocity]),
+        torch.cat([first_solid.attribute, second_solid.attribute]),
     )
     score, label = torch.cat([one.score, other.score]), torch.cat([one.label, other.label])
     return Detections(score, label, torch.cat([one.box, other.box]), solid)

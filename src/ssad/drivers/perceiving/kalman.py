@@ -1,4 +1,4 @@
-"""The Kalman filter of a point that moves steadily on the ground, for many points at once.
+"""Kalman filter of points with nearly constant velocity on the ground, batched.
 
 The state is x, y, vx, vy; what is measured is x, y. Its speed changes by white noise of acceleration with a spectral
 density q (m^2/s^3): Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation (2001),
@@ -13,29 +13,31 @@ from ssad.core.types import F64
 
 
 def predict(mean: F64, covariance: F64, seconds: F64, density: float) -> tuple[F64, F64]:
-    """Where points will be.
+    """Predict points to a later time.
 
     Args:
         mean: [N, 4].
         covariance: [N, 4, 4].
-        seconds: [N] from now; 0 changes nothing.
+        seconds: [N] time step, s; 0 changes nothing.
         density: Spectral density of the acceleration, m^2/s^3.
 
     Returns:
         Mean [N, 4] and covariance [N, 4, 4].
     """
-    move = np.tile(np.eye(4), (len(mean), 1, 1))
-    move[:, 0, 2] = move[:, 1, 3] = seconds
+    transition = np.tile(np.eye(4), (len(mean), 1, 1))
+    transition[:, 0, 2] = transition[:, 1, 3] = seconds
     noise = np.zeros_like(covariance)
-    for place, speed in ((0, 2), (1, 3)):
-        noise[:, place, place] = seconds**3 / 3.0
-        noise[:, place, speed] = noise[:, speed, place] = seconds**2 / 2.0
-        noise[:, speed, speed] = seconds
-    return (move @ mean[..., None])[..., 0], move @ covariance @ move.transpose(0, 2, 1) + density * noise
+    for position_axis, velocity_axis in ((0, 2), (1, 3)):
+        noise[:, position_axis, position_axis] = seconds**3 / 3.0
+        noise[:, position_axis, velocity_axis] = noise[:, velocity_axis, position_axis] = seconds**2 / 2.0
+        noise[:, velocity_axis, velocity_axis] = seconds
+    return (transition @ mean[..., None])[..., 0], transition @ covariance @ transition.transpose(
+        0, 2, 1
+    ) + density * noise
 
 
 def update(mean: F64, covariance: F64, place: F64, spread: F64) -> tuple[F64, F64]:
-    """Take in a measurement of each point, in Joseph's form, which keeps the covariance positive.
+    """Update each point with a measurement, in Joseph form, which keeps the covariance positive.
 
     Args:
         mean: [N, 4].
@@ -46,16 +48,16 @@ def update(mean: F64, covariance: F64, place: F64, spread: F64) -> tuple[F64, F6
     Returns:
         Mean [N, 4] and covariance [N, 4, 4].
     """
-    expected = covariance[:, :2, :2] + spread
-    gain = np.linalg.solve(expected, covariance[:, :2, :]).transpose(0, 2, 1)
-    left = np.tile(np.eye(4), (len(mean), 1, 1))
-    left[:, :, :2] -= gain
-    better = left @ covariance @ left.transpose(0, 2, 1) + gain @ spread @ gain.transpose(0, 2, 1)
-    return mean + (gain @ (place - mean[:, :2])[..., None])[..., 0], better
+    innovation = covariance[:, :2, :2] + spread
+    gain = np.linalg.solve(innovation, covariance[:, :2, :]).transpose(0, 2, 1)
+    complement = np.tile(np.eye(4), (len(mean), 1, 1))
+    complement[:, :, :2] -= gain
+    posterior = complement @ covariance @ complement.transpose(0, 2, 1) + gain @ spread @ gain.transpose(0, 2, 1)
+    return mean + (gain @ (place - mean[:, :2])[..., None])[..., 0], posterior
 
 
 def distance(mean: F64, covariance: F64, place: F64, spread: F64) -> F64:
-    """Squared Mahalanobis distances of points and measurements, pair by pair.
+    """Return squared Mahalanobis distances of points and measurements, pair by pair.
 
     Args:
         mean: [N, 4].
@@ -67,6 +69,7 @@ def distance(mean: F64, covariance: F64, place: F64, spread: F64) -> F64:
         [N].
     """
     x, y = (place - mean[:, :2]).T
-    expected = covariance[:, :2, :2] + spread
-    a, b, c = expected[:, 0, 0], 0.5 * (expected[:, 0, 1] + expected[:, 1, 0]), expected[:, 1, 1]
+    innovation = covariance[:, :2, :2] + spread
+    # Closed-form inverse of the symmetric 2x2 matrix [[a, b], [b, c]].
+    a, b, c = innovation[:, 0, 0], 0.5 * (innovation[:, 0, 1] + innovation[:, 1, 0]), innovation[:, 1, 1]
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))

@@ -1,7 +1,7 @@
-"""From what a detector reports in a camera's picture to objects in the world.
+"""Projection of detections in a camera image to objects in the world.
 
-3D boxes are moved by the pose of the camera. 2D boxes are lifted by the ground plane: the middle of a box's lower edge
-is taken for the point where the object meets a level road.
+3D boxes are transformed by the camera pose. 2D boxes are lifted by the ground plane: the middle of the lower edge is
+taken as the contact point of the object with a level road.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from ssad.drivers.perceiving.objects import I64, KINDS, LARGE, SIZES, Objects, n
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lifting:
-    """Settings.
+    """Settings of the projection to the world.
 
     Attributes:
-        reach: m from the camera beyond which nothing is reported.
-        along: Standard deviation of an object's place along the line of sight: m, and m per m of distance.
-        across: The same across it.
-        overhang: m from a large vehicle's end to the wheels on which its lower edge seems to stand; of 2D boxes alone.
-        merge: Share of the longer of two large objects' lengths within which their middles belong to one object.
+        reach: Maximum distance of reported objects from the camera, m.
+        along: Standard deviation of an object's position along the line of sight: m, and m per m of distance.
+        across: The same across the line of sight.
+        overhang: m from the end of a large vehicle to the visible wheels of its lower edge; for 2D boxes only.
+        merge: Two large objects are one if their centres are closer than this share of the longer length.
     """
 
     reach: float = 60.0
@@ -63,38 +63,41 @@ def lift(
     """
     if not found:
         return no_objects()
-    score, label = _joined([one.score for one in found]), _joined([one.label for one in found]).astype(np.int64)
+    score, label = (
+        _joined([image_detections.score for image_detections in found]),
+        _joined([image_detections.label for image_detections in found]).astype(np.int64),
+    )
     _check(score, label, classes)
     kind = np.array([KINDS.get(name, 0) for name in classes], np.int64)[label]
     rows = np.flatnonzero(kind > 0)
     if not len(rows):
         return no_objects()
-    picture = np.repeat(np.arange(len(found)), [len(one.score) for one in found])[rows]
-    kind, pose = kind[rows], poses[picture]
-    solids = [one.solid for one in found if one.solid is not None]
+    image_index = np.repeat(np.arange(len(found)), [len(image_detections.score) for image_detections in found])[rows]
+    kind, pose = kind[rows], poses[image_index]
+    solids = [image_detections.solid for image_detections in found if image_detections.solid is not None]
     if len(solids) < len(found):
-        box = _joined([one.box for one in found]).astype(np.float64)[rows]
+        box = _joined([image_detections.box for image_detections in found]).astype(np.float64)[rows]
         _finite(box)
-        place, yaw, known = _on_ground(box, kind, camera, pose, settings.overhang)
+        position, yaw, on_road = _on_ground(box, kind, camera, pose, settings.overhang)
         size: F64 = SIZES[kind, :2]
         velocity: F64 = np.full((len(rows), 2), np.nan)
-        rows, kind, place, yaw, pose = rows[known], kind[known], place[known], yaw[known], pose[known]
-        size, velocity, picture = size[known], velocity[known], picture[known]
+        rows, kind, position, yaw, pose = rows[on_road], kind[on_road], position[on_road], yaw[on_road], pose[on_road]
+        size, velocity, image_index = size[on_road], velocity[on_road], image_index[on_road]
     else:
-        centre, lhw, turn, speed = (
-            _joined([getattr(one, name) for one in solids]).astype(np.float64)[rows]
+        centre, size_lhw, camera_yaw, speed = (
+            _joined([getattr(image_detections, name) for image_detections in solids]).astype(np.float64)[rows]
             for name in ("centre", "size_lhw", "yaw", "velocity")
         )
-        _finite(centre, lhw, turn)
-        place = (_turned(pose, centre) + pose[:, :3, 3])[:, :2]
-        ahead = _turned(pose, camera_axes(turn)[:, :, 0])
-        yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
-        size = np.maximum(lhw[:, [0, 2]], 0.2)
+        _finite(centre, size_lhw, camera_yaw)
+        position = (_turned(pose, centre) + pose[:, :3, 3])[:, :2]
+        direction = _turned(pose, camera_axes(camera_yaw)[:, :, 0])
+        yaw = np.arctan2(direction[:, 1], direction[:, 0])
+        size = np.maximum(size_lhw[:, [0, 2]], 0.2)
         velocity = _turned(pose, np.stack([speed[:, 0], np.zeros(len(rows)), speed[:, 1]], 1))[:, :2]
-    spread, away = _spread(place, pose, settings)
-    every = Objects(scenes[picture], place, spread, yaw, size, velocity, kind, score[rows].astype(np.float64))
-    order = np.lexsort((-every.score, picture))
-    return every.take(order[away[order] <= settings.reach])
+    spread, distance = _spread(position, pose, settings)
+    objects = Objects(scenes[image_index], position, spread, yaw, size, velocity, kind, score[rows].astype(np.float64))
+    ranking = np.lexsort((-objects.score, image_index))
+    return objects.take(ranking[distance[ranking] <= settings.reach])
 
 
 def merged(found: Objects, share: float) -> Objects:
@@ -108,31 +111,32 @@ def merged(found: Objects, share: float) -> Objects:
         The others, scene by scene, best first.
     """
     found = found.take(np.lexsort((-found.score, found.scene)))
-    keep = np.ones(len(found), bool)
-    rows = np.flatnonzero(np.isin(found.kind, LARGE))
-    if len(rows):
-        # a table of the large objects, a line a scene
-        _, line, count = np.unique(found.scene[rows], return_inverse=True, return_counts=True)
-        slot = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+    keep_mask = np.ones(len(found), bool)
+    large_rows = np.flatnonzero(np.isin(found.kind, LARGE))
+    if len(large_rows):
+        # padded table of the large objects, one row per scene
+        _, scene_row, count = np.unique(found.scene[large_rows], return_inverse=True, return_counts=True)
+        slot = np.arange(len(large_rows)) - np.repeat(np.cumsum(count) - count, count)
         shape = (len(count), int(count.max()))
-        place, length = np.zeros((*shape, 2)), np.zeros(shape)
-        place[line, slot], length[line, slot] = found.place[rows], found.size[rows, 0]
-        kept = np.zeros(shape, bool)
-        for k in range(shape[1]):
-            gap = np.linalg.norm(place[:, :k] - place[:, k, None], axis=-1)
-            close = gap < share * np.maximum(length[:, :k], length[:, k, None])
-            kept[:, k] = ~(close & kept[:, :k]).any(1)
-        keep[rows] = kept[line, slot]
-    return found.take(keep)
+        positions, lengths = np.zeros((*shape, 2)), np.zeros(shape)
+        positions[scene_row, slot], lengths[scene_row, slot] = found.place[large_rows], found.size[large_rows, 0]
+        retained = np.zeros(shape, bool)
+        # Greedy suppression: slots are sorted by score, so each is compared with better ones only.
+        for column in range(shape[1]):
+            distances = np.linalg.norm(positions[:, :column] - positions[:, column, None], axis=-1)
+            overlaps = distances < share * np.maximum(lengths[:, :column], lengths[:, column, None])
+            retained[:, column] = ~(overlaps & retained[:, :column]).any(1)
+        keep_mask[large_rows] = retained[scene_row, slot]
+    return found.take(keep_mask)
 
 
 def _joined(parts: Sequence[Tensor]) -> npt.NDArray[Any]:
-    """Rows of all tensors, on the host."""
+    """Concatenate the rows of tensors on the host."""
     return torch.cat([part.detach() for part in parts]).cpu().numpy()
 
 
 def _turned(pose: F64, vector: F64) -> F64:
-    """Vectors [N, 3] turned by poses [N, 4, 4], each by itself: to the bit the same in any company."""
+    """Rotate vectors [N, 3] by poses [N, 4, 4], row by row: bit-identical in any batch."""
     return np.asarray((pose[:, :3, :3] * vector[:, None, :]).sum(-1))
 
 
@@ -149,14 +153,16 @@ def _finite(*arrays: F64) -> None:
 
 def _spread(place: F64, pose: F64, settings: Lifting) -> tuple[F64, F64]:
     """Covariances [N, 2, 2] of places as seen from cameras, and distances [N]."""
-    line = place - pose[:, :2, 3]
-    away = np.linalg.norm(line, axis=1)
-    one = line / np.maximum(away, 1e-6)[:, None]
-    other = np.stack([-one[:, 1], one[:, 0]], 1)
-    along, across = ((own[0] + own[1] * away) ** 2 for own in (settings.along, settings.across))
-    return along[:, None, None] * one[:, :, None] * one[:, None, :] + across[:, None, None] * (
-        other[:, :, None] * other[:, None, :]
-    ), away
+    line_of_sight = place - pose[:, :2, 3]
+    distance = np.linalg.norm(line_of_sight, axis=1)
+    along_axis = line_of_sight / np.maximum(distance, 1e-6)[:, None]
+    across_axis = np.stack([-along_axis[:, 1], along_axis[:, 0]], 1)
+    along_variance, across_variance = (
+        (deviation[0] + deviation[1] * distance) ** 2 for deviation in (settings.along, settings.across)
+    )
+    return along_variance[:, None, None] * along_axis[:, :, None] * along_axis[:, None, :] + across_variance[
+        :, None, None
+    ] * (across_axis[:, :, None] * across_axis[:, None, :]), distance
 
 
 def _on_ground(box: F64, kind: I64, camera: Camera, pose: F64, overhang: float) -> tuple[F64, F64, Bool]:
@@ -165,17 +171,17 @@ def _on_ground(box: F64, kind: I64, camera: Camera, pose: F64, overhang: float) 
     A box about as wide as the object's end shows it from front or back, so its heading is along the line of sight and
     its middle half a length behind what is seen; a wider one shows its side.
     """
-    foot = np.stack([0.5 * (box[:, 0] + box[:, 2]), box[:, 3], np.ones(len(box))], 1)
-    ray = _turned(pose[:, :3, :3] @ np.linalg.inv(camera.intrinsic), foot)
-    down = -ray[:, 2]
-    known = down > 1e-3
-    where = pose[:, :3, 3] + ray * (pose[:, 2, 3] / np.where(known, down, 1.0))[:, None]
-    line = where[:, :2] - pose[:, :2, 3]
-    line = line / np.maximum(np.linalg.norm(line, axis=1), 1e-6)[:, None]
+    foot_point = np.stack([0.5 * (box[:, 0] + box[:, 2]), box[:, 3], np.ones(len(box))], 1)
+    ray = _turned(pose[:, :3, :3] @ np.linalg.inv(camera.intrinsic), foot_point)
+    descent = -ray[:, 2]
+    on_road = descent > 1e-3
+    contact = pose[:, :3, 3] + ray * (pose[:, 2, 3] / np.where(on_road, descent, 1.0))[:, None]
+    direction = contact[:, :2] - pose[:, :2, 3]
+    direction = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-6)[:, None]
     length, width, height = SIZES[kind].T
-    shape = (box[:, 2] - box[:, 0]) / np.maximum(box[:, 3] - box[:, 1], 1e-6)
-    aside = shape > np.sqrt(length * width) / height
-    course = np.arctan2(line[:, 1], line[:, 0])
-    behind = np.where(aside, 0.5 * width, 0.5 * length - np.where(np.isin(kind, LARGE), overhang, 0.0))
-    middle = where[:, :2] + behind[:, None] * line
-    return middle, course + np.where(aside, 0.5 * np.pi, 0.0), known
+    aspect = (box[:, 2] - box[:, 0]) / np.maximum(box[:, 3] - box[:, 1], 1e-6)
+    side_view = aspect > np.sqrt(length * width) / height
+    bearing = np.arctan2(direction[:, 1], direction[:, 0])
+    depth_offset = np.where(side_view, 0.5 * width, 0.5 * length - np.where(np.isin(kind, LARGE), overhang, 0.0))
+    centre = contact[:, :2] + depth_offset[:, None] * direction
+    return centre, bearing + np.where(side_view, 0.5 * np.pi, 0.0), on_road

@@ -1,4 +1,4 @@
-"""What a perceiver has found at a moment: objects of all scenes as columns, in the world."""
+"""Detected objects of all scenes at one time, as columns in the world frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ssad.core.types import F64, AgentKind
 
 I64 = npt.NDArray[np.int64]
-# names of nuScenes and of COCO; what is not named here does not matter to a driver
+# names of nuScenes and COCO; all other classes are irrelevant to a driver
 KINDS: Final[Mapping[str, AgentKind]] = MappingProxyType(
     {
         "car": AgentKind.CAR,
@@ -29,7 +29,7 @@ KINDS: Final[Mapping[str, AgentKind]] = MappingProxyType(
         "barrier": AgentKind.PROP,
     }
 )
-# usual length, width and height of each kind, m, where a detector tells none; rounded means of nuScenes' training split
+# default length, width and height of each kind, m; rounded means of nuScenes' training split
 SIZES: Final[F64] = np.array(
     [
         (1.0, 1.0, 1.0),
@@ -47,12 +47,12 @@ LARGE: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS)
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """M objects found in some scenes, in the world frame.
+    """Table of M detected objects of several scenes, in the world frame.
 
     Attributes:
-        scene: [M] which scene.
-        place: [M, 2] x, y of the middle, m.
-        spread: [M, 2, 2] covariance of the place, m^2.
+        scene: [M] index of the scene.
+        place: [M, 2] x, y of the centre, m.
+        spread: [M, 2, 2] covariance of the position, m^2.
         yaw: [M] heading, rad; NaN where unknown.
         size: [M, 2] length and width, m.
         velocity: [M, 2] m/s; NaN where unknown.
@@ -73,16 +73,20 @@ class Objects:
         return len(self.scene)
 
     def take(self, index: npt.NDArray[Any] | slice) -> Self:
-        """The rows that `index` (numbers, a mask or a slice) names."""
-        return type(self)(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        """Return the rows selected by indices, a mask or a slice."""
+        return type(self)(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """All rows of some tables, in order; there is at least one table."""
-        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+        """Concatenate tables in order; at least one is required."""
+        return cls(
+            **{column.name: np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)}
+        )
 
 
 def no_objects() -> Objects:
-    """A table without rows."""
-    none, whole = np.zeros(0), np.zeros(0, np.int64)
-    return Objects(whole, np.zeros((0, 2)), np.zeros((0, 2, 2)), none, np.zeros((0, 2)), np.zeros((0, 2)), whole, none)
+    """Return a table without rows."""
+    floats, integers = np.zeros(0), np.zeros(0, np.int64)
+    return Objects(
+        integers, np.zeros((0, 2)), np.zeros((0, 2, 2)), floats, np.zeros((0, 2)), np.zeros((0, 2)), integers, floats
+    )

@@ -1,4 +1,4 @@
-"""Perception with one error repaired: one object is seen as a perfect detector sees it, all others as they were."""
+"""Perception with one repaired error: one object is seen by a perfect detector, all others are unchanged."""
 
 from __future__ import annotations
 
@@ -51,17 +51,19 @@ class Repair:
             return found
         ego = upright_pose(*view.pose[row].astype(np.float64).tolist())
         parts = [no_objects()]
-        only = np.arange(truth.kind.shape[1]) == agent
+        agent_mask = np.arange(truth.kind.shape[1]) == agent
         for camera in cameras.values():
             pose = ego @ camera.to_ego
-            one = projected(boxes_of(truth, 0, only), np.asarray(np.linalg.inv(pose), np.float64), camera)
+            projected_agent = projected(
+                boxes_of(truth, 0, agent_mask), np.asarray(np.linalg.inv(pose), np.float64), camera
+            )
             scene = view.scene[[row]].astype(np.int64)
-            parts.append(lift([one], camera, pose[None], scene, PerfectEyes.classes, settings=lifting))
-        seen = Objects.joined(parts).take(np.arange(min(1, sum(len(part) for part in parts))))
-        if not len(seen):
+            parts.append(lift([projected_agent], camera, pose[None], scene, PerfectEyes.classes, settings=lifting))
+        perfect = Objects.joined(parts).take(np.arange(min(1, sum(len(part) for part in parts))))
+        if not len(perfect):
             return found
-        places = truth.pose[0, :, :2].astype(np.float64)
-        gap = np.linalg.norm(found.place[:, None] - places[None], axis=-1)
-        gap[:, truth.kind[0] == 0] = np.inf
-        own = (gap[:, agent] < AROUND) & (gap[:, agent] <= gap.min(1, initial=np.inf))
-        return Objects.joined([found.take(~own), seen])
+        true_positions = truth.pose[0, :, :2].astype(np.float64)
+        distances = np.linalg.norm(found.place[:, None] - true_positions[None], axis=-1)
+        distances[:, truth.kind[0] == 0] = np.inf
+        replaced = (distances[:, agent] < AROUND) & (distances[:, agent] <= distances.min(1, initial=np.inf))
+        return Objects.joined([found.take(~replaced), perfect])

@@ -1,8 +1,7 @@
-"""Stop signs that a perceiving driver reads: without them, it stops before no line of a stop sign.
+"""Stop signs read by a perceiving driver: without a reading it stops at no stop line.
 
-Where lines lie is told by the map; whether one must stop there, by a sign that has been read. Prior work attacks single
-pictures of signs; whether a drive is changed depends on how long a sign is remembered (Shen et al., SoK: semantic AI
-security, 2022).
+The map provides the stop lines; a sign that has been read makes one mandatory. Prior work attacks single images of
+signs; the effect on a drive depends on how long a sign is remembered (Shen et al., SoK: semantic AI security, 2022).
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from ssad.core.types import F32, F64, I32, U8
 
 NAMES: Final = ("stop_sign", "stop sign")  # of our detectors and of COCO
 FACE: Final = 0.762  # m, height of the face of a sign R1-1 (30 inches) on a street
-SAME: Final = 0.35  # share of its distance, within which a sign that is read again is the same
+SAME: Final = 0.35  # share of its distance within which another reading belongs to the same sign
 AHEAD, ASIDE, BEHIND = 70.0, 14.0, 2.0  # m around the ego, along and across its heading, within which a sign counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SignReading:
-    """Settings.
+    """Settings of reading stop signs.
 
     Attributes:
-        confirm: Looks in which a sign must have been read until it is believed.
-        memory: s that it is remembered after it was last read; inf: until it has been passed.
-        score: Least score of a sign that is read.
+        confirm: Number of looks with a reading that confirm a sign.
+        memory: s that a sign is remembered after its last reading; inf: until it has been passed.
+        score: Minimum score of a reading.
     """
 
     confirm: int = 2
@@ -47,15 +46,15 @@ class SignReading:
 
 
 def sign_labels(classes: Sequence[str]) -> list[int]:
-    """Labels of stop signs.
+    """Return the labels of stop signs.
 
     Args:
         classes: Names of a detector's labels.
 
     Raises:
-        ConfigError: It knows no stop signs.
+        ConfigError: The detector has no class for stop signs.
     """
-    labels = [k for k, name in enumerate(classes) if name in NAMES]
+    labels = [label for label, name in enumerate(classes) if name in NAMES]
     if not labels:
         raise ConfigError("signs are read by a detector with the class stop_sign, such as yolov5n")
     return labels
@@ -77,13 +76,13 @@ def read_signs(found: Detections, camera: Camera, pose: F64, classes: Sequence[s
     Raises:
         ConfigError: The detector knows no stop signs.
     """
-    chosen = np.isin(found.label.cpu().numpy(), sign_labels(classes)) & (found.score.detach().cpu().numpy() >= score)
-    box = found.box.detach().cpu().double().numpy()[chosen]
+    selected = np.isin(found.label.cpu().numpy(), sign_labels(classes)) & (found.score.detach().cpu().numpy() >= score)
+    box = found.box.detach().cpu().double().numpy()[selected]
     depth = camera.intrinsic[1, 1] * FACE / np.maximum(box[:, 3] - box[:, 1], 1.0)
-    middle = np.stack([0.5 * (box[:, 0] + box[:, 2]), 0.5 * (box[:, 1] + box[:, 3]), np.ones(len(box))], 1)
-    local = middle @ np.linalg.inv(camera.intrinsic).T * depth[:, None]
-    place: F64 = (local @ pose[:3, :3].T + pose[:3, 3])[:, :2]
-    return place
+    image_centre = np.stack([0.5 * (box[:, 0] + box[:, 2]), 0.5 * (box[:, 1] + box[:, 3]), np.ones(len(box))], 1)
+    local = image_centre @ np.linalg.inv(camera.intrinsic).T * depth[:, None]
+    position: F64 = (local @ pose[:3, :3].T + pose[:3, 3])[:, :2]
+    return position
 
 
 @dataclass(slots=True)
@@ -95,7 +94,7 @@ class _Sign:
 
 @dataclass(slots=True)
 class SignMemory:
-    """The signs that have been read in B scenes.
+    """Memory of the stop signs that have been read in B scenes.
 
     Attributes:
         settings: Settings.
@@ -109,58 +108,61 @@ class SignMemory:
         self._known = [[] for _ in range(batch)]
 
     def update(self, scene: int, time: float, eye: F64, places: F64) -> None:
-        """Take in a look.
+        """Update the memory with the signs of one look.
 
         Args:
-            scene: Which scene.
-            time: s when the picture was taken.
-            eye: [2] x, y from where.
-            places: [M, 2] of the signs read.
+            scene: Index of the scene.
+            time: s when the image was taken.
+            eye: [2] x, y of the viewpoint.
+            places: [M, 2] positions of the signs.
         """
-        seen: set[int] = set()
+        updated: set[int] = set()
         for place in places:
             reach = SAME * float(np.linalg.norm(place - eye)) + 1.0
-            near = [(float(np.linalg.norm(sign.place - place)), k) for k, sign in enumerate(self._known[scene])]
-            away, k = min(near, default=(np.inf, -1))
-            if away > reach:
+            distances = [
+                (float(np.linalg.norm(sign.place - place)), sign_index)
+                for sign_index, sign in enumerate(self._known[scene])
+            ]
+            min_distance, sign_index = min(distances, default=(np.inf, -1))
+            if min_distance > reach:
                 self._known[scene].append(_Sign(place, 1, time))
-                seen.add(len(self._known[scene]) - 1)
+                updated.add(len(self._known[scene]) - 1)
                 continue
-            sign = self._known[scene][k]
-            # what is nearer is measured better: the last place counts
-            self._known[scene][k] = _Sign(place, sign.hits + (k not in seen), time)
-            seen.add(k)
+            sign = self._known[scene][sign_index]
+            # nearer readings are more accurate, so the latest position replaces the earlier one
+            self._known[scene][sign_index] = _Sign(place, sign.hits + (sign_index not in updated), time)
+            updated.add(sign_index)
 
     def known(self, scenes: I32, time: F64, pose: F32) -> U8:
-        """Whether egos know of a stop sign before them.
+        """Return whether egos know of a stop sign ahead.
 
         Args:
-            scenes: [N] which scenes.
+            scenes: [N] indices of the scenes.
             time: [N] s.
             pose: [N, 3] x, y, yaw of the egos.
 
         Returns:
             [N] 1 or 0.
         """
-        found = np.zeros(len(scenes), np.uint8)
+        is_ahead = np.zeros(len(scenes), np.uint8)
         signs = [(row, sign) for row, scene in enumerate(scenes.tolist()) for sign in self._known[scene]]
         if not signs:
-            return found
-        row = np.array([one for one, _ in signs])
+            return is_ahead
+        row = np.array([row_index for row_index, _ in signs])
         place = np.array([sign.place for _, sign in signs])
-        hits, last = (np.array(column) for column in zip(*((s.hits, s.last) for _, s in signs), strict=True))
+        hits, last = (np.array(column) for column in zip(*((sine.hits, sine.last) for _, sine in signs), strict=True))
         yaw = pose[row, 2].astype(np.float64)
-        apart, c, s = place - pose[row, :2], np.cos(yaw), np.sin(yaw)
-        along, aside = c * apart[:, 0] + s * apart[:, 1], c * apart[:, 1] - s * apart[:, 0]
-        counts = (hits >= self.settings.confirm) & (time[row] - last <= self.settings.memory)
-        near = (along > -BEHIND) & (along < AHEAD) & (np.abs(aside) < ASIDE)
-        found[row[counts & near]] = 1
-        return found
+        offset, cosine, sine = place - pose[row, :2], np.cos(yaw), np.sin(yaw)
+        along, aside = cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0]
+        confirmed = (hits >= self.settings.confirm) & (time[row] - last <= self.settings.memory)
+        nearby = (along > -BEHIND) & (along < AHEAD) & (np.abs(aside) < ASIDE)
+        is_ahead[row[confirmed & nearby]] = 1
+        return is_ahead
 
     def snapshot(self) -> Any:
-        """All that changes."""
+        """Return a copy of the memory."""
         return [[_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in self._known]
 
     def restore(self, snapshot: Any) -> None:
-        """Go on from an earlier moment."""
+        """Continue from an earlier snapshot."""
         self._known = [[_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in snapshot]

@@ -1,4 +1,4 @@
-"""Perceiving systems by name; what they are made of can be chosen in Python, or in suites of kind `gap`."""
+"""Perceiving systems by name; their components can be chosen in Python, or in suites of kind `gap`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ssad.drivers.perceiving.tracker import Tracking, tracking_of
 
 
 class OneCamera(Perceiving):
-    """One front camera and a detector with the weights that ship.
+    """System with one front camera and a detector with shipped weights.
 
     Attributes:
         weights: Name of the detector; results depend on them.
@@ -19,30 +19,34 @@ class OneCamera(Perceiving):
     weights: ClassVar[str]
 
     def __init__(self, *, width: int = 640, tracking: Tracking | None = None, **settings: Any) -> None:
-        own = tracking or tracking_of(self.weights)
-        super().__init__(CameraEyes(self.weights, front(width), threshold=own.low), tracking=own, **settings)
+        tracker_settings = tracking or tracking_of(self.weights)
+        super().__init__(
+            CameraEyes(self.weights, front(width), threshold=tracker_settings.low),
+            tracking=tracker_settings,
+            **settings,
+        )
 
 
 class Fcos3d(OneCamera):
-    """One front camera, FCOS3D light."""
+    """System with one front camera and FCOS3D light."""
 
     weights = "fcos3d-light"
 
 
 class PgdDet(OneCamera):
-    """One front camera, PGD-Det light."""
+    """System with one front camera and PGD-Det light."""
 
     weights = "pgd-det-light"
 
 
 class Yolov5n(OneCamera):
-    """One front camera, YOLOv5n, whose boxes are lifted by the ground plane."""
+    """System with one front camera and YOLOv5n, whose boxes are lifted by the ground plane."""
 
     weights = "yolov5n"
 
 
 class Perfect(Perceiving):
-    """One front camera, and a detector that is told the truth: the ceiling of all others with this camera."""
+    """System with one front camera and a perfect detector: the upper bound of all systems with this camera."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(PerfectEyes(), **settings)

@@ -27,7 +27,7 @@ from ssad.core.types import F64, I32, AgentKind
 from ssad.drivers.perceiving.kalman import distance, predict, update
 from ssad.drivers.perceiving.objects import I64, Objects
 
-MEMORY = 0.8  # what earlier sizes, kinds and headings weigh, at each hit
+MEMORY = 0.8  # weight of the earlier sizes, kinds and headings at each hit
 SCORES = {
     "fcos3d-light": (0.25, 0.1),
     "fcos3d-light-robust": (0.25, 0.1),
@@ -42,15 +42,15 @@ class Tracking:
     """Settings of the tracker.
 
     Attributes:
-        confirm: Hits from which a track is believed (H).
+        confirm: Hits that confirm a track (H).
         reserve: Looks without a hit that a confirmed track survives (R).
-        patience: The same for a track that is not confirmed yet.
-        high: Score from which an object is matched first, and may begin a track.
-        low: Score below which objects do not count.
-        gate: Squared Mahalanobis distance from which nothing matches; 9.21 loses 1 % of the true pairs.
-        stranger: What is added to it where the kinds differ.
+        patience: The same for an unconfirmed track.
+        high: Minimum score to be matched first and to start a track.
+        low: Minimum score of an object.
+        gate: Maximum squared Mahalanobis distance of a match; 9.21 loses 1 % of the true pairs.
+        stranger: Penalty added to the distance if the kinds differ.
         density: Spectral density of the objects' acceleration, m^2/s^3.
-        speed: Standard deviation of the speed of an object seen for the first time, m/s.
+        speed: Standard deviation of the speed of a new track, m/s.
     """
 
     confirm: int = 2
@@ -74,19 +74,20 @@ class Tracking:
 
 
 def tracking_of(detector: str, *, high: float | None = None, low: float | None = None, **settings: Any) -> Tracking:
-    """Settings for a detector: unless others are said, from the scores that it gives.
+    """Return tracker settings for a detector, by default adapted to the scores that it reports.
 
     Args:
         detector: Its name, with or without options and label.
-        high: As of `Tracking`. One of `high` and `low` alone takes the other along where they would cross.
+        high: As of `Tracking`. If only one of `high` and `low` is given, the other one is adapted where they would
+            cross.
         low: As of `Tracking`.
         settings: The other fields of `Tracking`.
 
     Raises:
         ConfigError: high is below low, or a setting is out of its range.
     """
-    plain = Tracking()
-    usual_high, usual_low = SCORES.get(Reference.of(detector).name, (plain.high, plain.low))
+    defaults = Tracking()
+    usual_high, usual_low = SCORES.get(Reference.of(detector).name, (defaults.high, defaults.low))
     if low is None:
         low = usual_low if high is None else min(usual_low, high)
     return Tracking(high=max(usual_high, low) if high is None else high, low=low, **settings)
@@ -94,16 +95,16 @@ def tracking_of(detector: str, *, high: float | None = None, low: float | None =
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """N tracks of all scenes; never changed in place.
+    """Table of N tracks of all scenes; never modified in place.
 
     Attributes:
-        scene: [N] which scene.
-        ident: [N] number of the track in its scene, in the order in which they began.
-        time: [N] s that the state belongs to.
+        scene: [N] index of the scene.
+        ident: [N] number of the track in its scene, in order of creation.
+        time: [N] time of the state, s.
         mean: [N, 4] x, y, vx, vy.
         covariance: [N, 4, 4].
-        axis: [N, 2] weighted sum of the cosines and sines of twice the headings seen: which way it lies.
-        heading: [N, 2] weighted sum of the cosines and sines of the headings seen: which way it looks.
+        axis: [N, 2] weighted sum of the cosines and sines of twice the observed headings: the axis.
+        heading: [N, 2] weighted sum of the cosines and sines of the observed headings: the direction.
         size: [N, 2] length and width, m.
         votes: [N, kinds] weighted scores by kind.
         score: [N] of the last hit.
@@ -128,50 +129,62 @@ class Tracks:
         return len(self.scene)
 
     def take(self, index: npt.NDArray[Any] | slice) -> Self:
-        """The rows that `index` (numbers, a mask or a slice) names."""
-        return type(self)(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        """Return the rows selected by indices, a mask or a slice."""
+        return type(self)(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
 
     def at(self, time: F64, density: float) -> Self:
-        """The same tracks at other times [N]."""
+        """Predict the tracks to other times [N]."""
         mean, covariance = predict(self.mean, self.covariance, time - self.time, density)
         return replace(self, time=time.copy(), mean=mean, covariance=covariance)
 
     @property
     def kind(self) -> I64:
-        """[N] the kind that has most votes."""
+        """Kind with the most votes [N]."""
         return np.asarray(self.votes.argmax(1), np.int64)
 
     @property
     def yaw(self) -> F64:
-        """[N] heading: of its motion where that is sure, of its body as seen otherwise, rad."""
-        moves = np.hypot(self.mean[:, 2], self.mean[:, 3])
-        error = np.sqrt(np.maximum(0.5 * (self.covariance[:, 2, 2] + self.covariance[:, 3, 3]), 1e-12))
+        """Heading [N], rad: that of the motion where it is sure, else that of the observed body."""
+        speed = np.hypot(self.mean[:, 2], self.mean[:, 3])
+        speed_error = np.sqrt(np.maximum(0.5 * (self.covariance[:, 2, 2] + self.covariance[:, 3, 3]), 1e-12))
         course = np.arctan2(self.mean[:, 3], self.mean[:, 2])
-        seen = (self.axis != 0.0).any(1)
-        weight = np.minimum((moves / error / SURE) ** 2, 10.0)
-        twice = self.axis + weight[:, None] * np.stack([np.cos(2 * course), np.sin(2 * course)], 1)
-        yaw = 0.5 * np.arctan2(twice[:, 1], twice[:, 0])
-        sure = moves > SURE * error
-        ahead = np.where(sure[:, None], self.mean[:, 2:], self.heading)
-        backwards = np.cos(yaw) * ahead[:, 0] + np.sin(yaw) * ahead[:, 1] < 0.0
-        return np.where(seen, yaw + np.pi * backwards, course)
+        observed = (self.axis != 0.0).any(1)
+        # Doubled angles make opposite headings equal; front and rear are decided below.
+        weight = np.minimum((speed / speed_error / SURE) ** 2, 10.0)
+        double_angle = self.axis + weight[:, None] * np.stack([np.cos(2 * course), np.sin(2 * course)], 1)
+        yaw = 0.5 * np.arctan2(double_angle[:, 1], double_angle[:, 0])
+        is_sure = speed > SURE * speed_error
+        direction = np.where(is_sure[:, None], self.mean[:, 2:], self.heading)
+        backwards = np.cos(yaw) * direction[:, 0] + np.sin(yaw) * direction[:, 1] < 0.0
+        return np.where(observed, yaw + np.pi * backwards, course)
 
 
 def no_tracks() -> Tracks:
-    """A table without rows."""
-    none, whole = np.zeros(0), np.zeros(0, np.int64)
-    wide, votes = np.zeros((0, 2)), np.zeros((0, len(AgentKind)))
+    """Return a table without rows."""
+    floats, integers = np.zeros(0), np.zeros(0, np.int64)
+    pairs, votes = np.zeros((0, 2)), np.zeros((0, len(AgentKind)))
     return Tracks(
-        whole, whole, none, np.zeros((0, 4)), np.zeros((0, 4, 4)), wide, wide, wide, votes, none, whole, whole
+        integers,
+        integers,
+        floats,
+        np.zeros((0, 4)),
+        np.zeros((0, 4, 4)),
+        pairs,
+        pairs,
+        pairs,
+        votes,
+        floats,
+        integers,
+        integers,
     )
 
 
 class Tracker:
-    """Follows objects in B scenes.
+    """Multi-object tracker of B scenes.
 
     Args:
-        settings: Its settings.
-        scenes: B.
+        settings: Settings of the tracker.
+        scenes: Number of scenes B.
     """
 
     def __init__(self, settings: Tracking | None = None, scenes: int = 1) -> None:
@@ -180,11 +193,11 @@ class Tracker:
         self._born = np.zeros(scenes, np.int64)
 
     def snapshot(self) -> tuple[Tracks, I64]:
-        """All that changes; `restore` goes on from there, to the bit."""
+        """Return the complete state; `restore` continues from it, bit by bit."""
         return self.tracks, self._born.copy()
 
     def restore(self, snapshot: tuple[Tracks, I64]) -> None:
-        """Go on from an earlier moment."""
+        """Continue from an earlier snapshot."""
         self.tracks, self._born = snapshot[0], snapshot[1].copy()
 
     def update(self, scenes: I64, times: F64, found: Objects) -> None:
@@ -195,83 +208,102 @@ class Tracker:
             times: [n] s of the looks, none before the last one of its scene.
             found: The objects; those of other scenes do not count.
         """
-        own, when = self.settings, np.full(len(self._born), np.nan)
-        when[scenes] = times
-        looked = np.isfinite(when[self.tracks.scene])
-        tracks = self.tracks.at(np.where(looked, when[self.tracks.scene], self.tracks.time), own.density)
-        found = found.take(np.isfinite(when[found.scene]) & (found.score >= own.low))
+        settings, look_times = self.settings, np.full(len(self._born), np.nan)
+        look_times[scenes] = times
+        was_looked_at = np.isfinite(look_times[self.tracks.scene])
+        tracks = self.tracks.at(
+            np.where(was_looked_at, look_times[self.tracks.scene], self.tracks.time), settings.density
+        )
+        found = found.take(np.isfinite(look_times[found.scene]) & (found.score >= settings.low))
         rows, hits = self._matched(tracks, found, np.sort(scenes))
-        tracks = replace(tracks, missed=np.where(looked, tracks.missed + 1, tracks.missed))
+        tracks = replace(tracks, missed=np.where(was_looked_at, tracks.missed + 1, tracks.missed))
         tracks = self._with_hits(tracks, rows, found.take(hits))
-        left = np.setdiff1d(np.flatnonzero(found.score >= own.high), hits)
-        limit = np.where(tracks.hits >= own.confirm, own.reserve, own.patience)
-        tracks = tracks.take(tracks.missed <= limit)
-        self.tracks = _joined(tracks, self._begun(found.take(left), when))
+        unmatched = np.setdiff1d(np.flatnonzero(found.score >= settings.high), hits)
+        max_missed = np.where(tracks.hits >= settings.confirm, settings.reserve, settings.patience)
+        tracks = tracks.take(tracks.missed <= max_missed)
+        self.tracks = _joined(tracks, self._begun(found.take(unmatched), look_times))
 
     def _matched(self, tracks: Tracks, found: Objects, scenes: I64) -> tuple[I64, I64]:
         """Rows of tracks and of objects that belong together, scene by scene."""
-        own = self.settings
-        rows, begin, count = _by_scene(tracks.scene, scenes)
-        hits, first, many = _by_scene(found.scene, scenes)
-        # all pairs of all scenes in one go, the pairs of a scene one after the other, track by track
-        size = count * many
-        line = np.repeat(np.arange(len(scenes)), size)
-        number = np.arange(len(line)) - np.repeat(np.cumsum(size) - size, size)
-        a, b = rows[begin[line] + number // many[line]], hits[first[line] + number % many[line]]
-        far = distance(tracks.mean[a], tracks.covariance[a], found.place[b], found.spread[b])
-        far = np.minimum(far + own.stranger * (tracks.kind[a] != found.kind[b]), own.gate)
-        confirmed, high = tracks.hits >= own.confirm, found.score >= own.high
-        stages = ((confirmed, high), (confirmed & (tracks.missed == 0), ~high), (~confirmed, high))
-        one: list[I64] = [np.zeros(0, np.int64)]
-        other: list[I64] = [np.zeros(0, np.int64)]
-        free, open_ = np.ones(len(tracks), bool), np.ones(len(found), bool)
-        at = 0
-        for k in np.flatnonzero(size).tolist():
-            r, h = rows[begin[k] : begin[k] + count[k]], hits[first[k] : first[k] + many[k]]
-            cost = far[at : at + size[k]].reshape(len(r), len(h))
-            at += int(size[k])
-            for wanted, offered in stages:
-                i, j = np.flatnonzero((wanted & free)[r]), np.flatnonzero((offered & open_)[h])
+        settings = self.settings
+        rows, track_begin, track_count = _by_scene(tracks.scene, scenes)
+        hits, object_begin, object_count = _by_scene(found.scene, scenes)
+        # distances of all pairs of all scenes in one batch, ordered by scene, then by track
+        pair_count = track_count * object_count
+        pair_scene = np.repeat(np.arange(len(scenes)), pair_count)
+        pair_number = np.arange(len(pair_scene)) - np.repeat(np.cumsum(pair_count) - pair_count, pair_count)
+        track_index, object_index = (
+            rows[track_begin[pair_scene] + pair_number // object_count[pair_scene]],
+            hits[object_begin[pair_scene] + pair_number % object_count[pair_scene]],
+        )
+        distances = distance(
+            tracks.mean[track_index],
+            tracks.covariance[track_index],
+            found.place[object_index],
+            found.spread[object_index],
+        )
+        # Clipping at the gate keeps impossible pairs from distorting the optimal assignment.
+        distances = np.minimum(
+            distances + settings.stranger * (tracks.kind[track_index] != found.kind[object_index]), settings.gate
+        )
+        confirmed, is_high = tracks.hits >= settings.confirm, found.score >= settings.high
+        stages = ((confirmed, is_high), (confirmed & (tracks.missed == 0), ~is_high), (~confirmed, is_high))
+        track_matches: list[I64] = [np.zeros(0, np.int64)]
+        object_matches: list[I64] = [np.zeros(0, np.int64)]
+        free_tracks, free_objects = np.ones(len(tracks), bool), np.ones(len(found), bool)
+        offset = 0
+        for scene_index in np.flatnonzero(pair_count).tolist():
+            scene_tracks, scene_objects = (
+                rows[track_begin[scene_index] : track_begin[scene_index] + track_count[scene_index]],
+                hits[object_begin[scene_index] : object_begin[scene_index] + object_count[scene_index]],
+            )
+            cost = distances[offset : offset + pair_count[scene_index]].reshape(len(scene_tracks), len(scene_objects))
+            offset += int(pair_count[scene_index])
+            for track_mask, object_mask in stages:
+                i, j = (
+                    np.flatnonzero((track_mask & free_tracks)[scene_tracks]),
+                    np.flatnonzero((object_mask & free_objects)[scene_objects]),
+                )
                 if len(i) and len(j):
-                    part = cost[i[:, None], j]
-                    m, n = linear_sum_assignment(part)
-                    good = part[m, n] < own.gate
-                    one.append(r[i[m[good]]])
-                    other.append(h[j[n[good]]])
-                    free[one[-1]], open_[other[-1]] = False, False
-        return np.concatenate(one), np.concatenate(other)
+                    stage_cost = cost[i[:, None], j]
+                    matched_rows, matched_columns = linear_sum_assignment(stage_cost)
+                    within_gate = stage_cost[matched_rows, matched_columns] < settings.gate
+                    track_matches.append(scene_tracks[i[matched_rows[within_gate]]])
+                    object_matches.append(scene_objects[j[matched_columns[within_gate]]])
+                    free_tracks[track_matches[-1]], free_objects[object_matches[-1]] = False, False
+        return np.concatenate(track_matches), np.concatenate(object_matches)
 
     def _with_hits(self, tracks: Tracks, rows: I64, hits: Objects) -> Tracks:
-        """Tracks after their hits."""
-        out = {f.name: getattr(tracks, f.name).copy() for f in fields(tracks)}
-        moved = update(tracks.mean[rows], tracks.covariance[rows], hits.place, hits.spread)
-        out["mean"][rows], out["covariance"][rows] = moved
+        """Update tracks with their hits."""
+        columns = {column.name: getattr(tracks, column.name).copy() for column in fields(tracks)}
+        filtered = update(tracks.mean[rows], tracks.covariance[rows], hits.place, hits.spread)
+        columns["mean"][rows], columns["covariance"][rows] = filtered
         axis, heading, votes = _looks(hits)
         for name, value in (("axis", axis), ("heading", heading), ("votes", votes)):
-            out[name][rows] = MEMORY * out[name][rows] + value
-        out["size"][rows] = MEMORY * out["size"][rows] + (1.0 - MEMORY) * hits.size
-        out["score"][rows], out["missed"][rows] = hits.score, 0
-        out["hits"][rows] += 1
-        return Tracks(**out)
+            columns[name][rows] = MEMORY * columns[name][rows] + value
+        columns["size"][rows] = MEMORY * columns["size"][rows] + (1.0 - MEMORY) * hits.size
+        columns["score"][rows], columns["missed"][rows] = hits.score, 0
+        columns["hits"][rows] += 1
+        return Tracks(**columns)
 
     def _begun(self, found: Objects, when: F64) -> Tracks:
         """New tracks, numbered on in each scene."""
-        n = len(found)
-        order = np.zeros(n, np.int64)
+        count = len(found)
+        numbers = np.zeros(count, np.int64)
         for scene in np.unique(found.scene):
-            own = found.scene == scene
-            order[own] = self._born[scene] + np.arange(own.sum())
-            self._born[scene] += own.sum()
-        known = np.asarray(np.isfinite(found.velocity).all(1))
-        mean = np.concatenate([found.place, np.where(known[:, None], found.velocity, 0.0)], 1)
-        covariance = np.zeros((n, 4, 4))
+            in_scene = found.scene == scene
+            numbers[in_scene] = self._born[scene] + np.arange(in_scene.sum())
+            self._born[scene] += in_scene.sum()
+        has_velocity = np.asarray(np.isfinite(found.velocity).all(1))
+        mean = np.concatenate([found.place, np.where(has_velocity[:, None], found.velocity, 0.0)], 1)
+        covariance = np.zeros((count, 4, 4))
         covariance[:, :2, :2] = found.spread
         covariance[:, 2, 2] = covariance[:, 3, 3] = self.settings.speed**2
         axis, heading, votes = _looks(found)
-        once, none = np.ones(n, np.int64), np.zeros(n, np.int64)
+        first_hits, no_misses = np.ones(count, np.int64), np.zeros(count, np.int64)
         return Tracks(
             found.scene,
-            order,
+            numbers,
             when[found.scene],
             mean,
             covariance,
@@ -280,49 +312,51 @@ class Tracker:
             found.size,
             votes,
             found.score,
-            once,
-            none,
+            first_hits,
+            no_misses,
         )
 
     def confirmed(self, scenes: I32 | I64, times: F64) -> Tracks:
-        """The confirmed tracks of some scenes, each at its scene's time.
+        """Return the confirmed tracks of some scenes, each predicted to its scene's time.
 
         Args:
-            scenes: [n] each once.
+            scenes: [n] distinct scenes.
             times: [n] s.
         """
-        when = np.full(len(self._born), np.nan)
-        when[scenes] = times
-        chosen = self.tracks.take((self.tracks.hits >= self.settings.confirm) & np.isfinite(when[self.tracks.scene]))
-        return chosen.at(when[chosen.scene], self.settings.density)
+        scene_times = np.full(len(self._born), np.nan)
+        scene_times[scenes] = times
+        selected = self.tracks.take(
+            (self.tracks.hits >= self.settings.confirm) & np.isfinite(scene_times[self.tracks.scene])
+        )
+        return selected.at(scene_times[selected.scene], self.settings.density)
 
 
 def believed(tracks: Tracks, scenes: I32 | I64) -> Belief:
-    """Tracks as what the planner plans over: pose, speed, size and kind.
+    """Convert tracks to the belief of the planner: pose, speed, size and kind.
 
     Args:
-        tracks: Tracks of these scenes and of no others.
+        tracks: Tracks of exactly these scenes.
         scenes: [N] scene of each row of the belief.
     """
     row = np.full(int(np.max(scenes, initial=-1)) + 1, -1)
     row[scenes] = np.arange(len(scenes))
-    at = row[tracks.scene]
-    order = np.argsort(at, kind="stable")
-    tracks, at = tracks.take(order), at[order]
-    count = np.bincount(at, minlength=len(scenes))
+    belief_row = row[tracks.scene]
+    order = np.argsort(belief_row, kind="stable")
+    tracks, belief_row = tracks.take(order), belief_row[order]
+    count = np.bincount(belief_row, minlength=len(scenes))
     slot = np.arange(len(tracks)) - np.repeat(np.cumsum(count) - count, count)
     shape = (len(scenes), max(int(count.max(initial=0)), 1))
     pose, size = np.zeros((*shape, 3), np.float32), np.ones((*shape, 2), np.float32)
     speed, kind = np.zeros(shape, np.float32), np.full(shape, int(AgentKind.NONE), np.int32)
     yaw = tracks.yaw
-    pose[at, slot, :2], pose[at, slot, 2] = tracks.mean[:, :2], yaw
-    speed[at, slot] = tracks.mean[:, 2] * np.cos(yaw) + tracks.mean[:, 3] * np.sin(yaw)
-    size[at, slot], kind[at, slot] = tracks.size, tracks.kind
+    pose[belief_row, slot, :2], pose[belief_row, slot, 2] = tracks.mean[:, :2], yaw
+    speed[belief_row, slot] = tracks.mean[:, 2] * np.cos(yaw) + tracks.mean[:, 3] * np.sin(yaw)
+    size[belief_row, slot], kind[belief_row, slot] = tracks.size, tracks.kind
     return Belief(pose, speed, size, kind)
 
 
 def _by_scene(scene: I64, scenes: I64) -> tuple[I64, I64, I64]:
-    """Rows ordered by scene, and for each of some scenes where its rows begin in that order and how many they are."""
+    """Return rows ordered by scene, and the first position and number of rows of each given scene."""
     order = np.argsort(scene, kind="stable")
     begin, end = (np.searchsorted(scene[order], scenes, side=side) for side in ("left", "right"))
     return order, begin, end - begin
@@ -330,12 +364,17 @@ def _by_scene(scene: I64, scenes: I64) -> tuple[I64, I64, I64]:
 
 def _looks(found: Objects) -> tuple[F64, F64, F64]:
     """What a look says of heading (twice, once) and kind, weighed by the score; no heading: nothing."""
-    yaw, known = np.nan_to_num(found.yaw), np.isfinite(found.yaw)
-    weight = (found.score * known)[:, None]
+    yaw, has_yaw = np.nan_to_num(found.yaw), np.isfinite(found.yaw)
+    weight = (found.score * has_yaw)[:, None]
     axis = weight * np.stack([np.cos(2 * yaw), np.sin(2 * yaw)], 1)
     heading = weight * np.stack([np.cos(yaw), np.sin(yaw)], 1)
     return axis, heading, found.score[:, None] * np.eye(len(AgentKind))[found.kind]
 
 
 def _joined(one: Tracks, other: Tracks) -> Tracks:
-    return Tracks(**{f.name: np.concatenate([getattr(one, f.name), getattr(other, f.name)]) for f in fields(one)})
+    return Tracks(
+        **{
+            column.name: np.concatenate([getattr(one, column.name), getattr(other, column.name)])
+            for column in fields(one)
+        }
+    )

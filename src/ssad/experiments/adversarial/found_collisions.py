@@ -1,4 +1,4 @@
-"""The collisions that a search has found: saved as scenarios, graded, and driven with other systems."""
+"""Collisions found by a search: saved as scenarios, graded, and driven with other systems."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AVOIDERS = {
 
 
 def collides(base: Base) -> bool:
-    """Whether a drive ends in a collision."""
+    """Return True if a drive ends in a collision."""
     return bool(base.trace.end == "collision")
 
 
@@ -47,11 +47,11 @@ def saved_collisions(
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 
-    found = distinct([outcome for outcome in row if outcome.valid])[:keep]
-    made = [scenario_of(outcome, base, name=f"{stem}-{n}") for n, outcome in enumerate(found)]
-    if made:
-        save_scenarios(path, made)
-    return found, made
+    collisions = distinct([outcome for outcome in row if outcome.valid])[:keep]
+    scenarios = [scenario_of(outcome, base, name=f"{stem}-{index}") for index, outcome in enumerate(collisions)]
+    if scenarios:
+        save_scenarios(path, scenarios)
+    return collisions, scenarios
 
 
 def grades(rows: Sequence[Mapping[str, float]], collisions: Sequence[Base]) -> dict[str, float]:
@@ -63,15 +63,15 @@ def grades(rows: Sequence[Mapping[str, float]], collisions: Sequence[Base]) -> d
     """
     if not rows:
         return {}
-    careful = [any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit") for row in rows]
-    moving = [fine for fine, base in zip(careful, collisions, strict=True) if _moves(base)]
+    is_avoidable = [any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit") for row in rows]
+    avoidable_moving = [avoidable for avoidable, base in zip(is_avoidable, collisions, strict=True) if _moves(base)]
     shares = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    shares["attributable"] = float(np.mean(careful))
-    return shares | ({"attributable_moving": float(np.mean(moving))} if moving else {})
+    shares["attributable"] = float(np.mean(is_avoidable))
+    return shares | ({"attributable_moving": float(np.mean(avoidable_moving))} if avoidable_moving else {})
 
 
 def _moves(base: Base) -> bool:
-    """Whether the ego moves when it is hit."""
+    """Return True if the ego moves when it is hit."""
     return abs(float(base.trace.speed[int(np.flatnonzero(base.trace.contact)[0]), 0])) > MOVING
 
 
@@ -100,21 +100,22 @@ def transfer(
     from ssad.scenarios.dynamic.generate import Trials
 
     rows: list[dict[str, dict[str, float]]] = [{} for _ in bases]
-    groups = [
-        [(one, base.graph, seed) for one in (base.scenario, *found)]
-        for base, found, seed in zip(bases, made, seeds, strict=True)
+    episode_groups = [
+        [(episode_spec, base.graph, seed) for episode_spec in (base.scenario, *scenarios)]
+        for base, scenarios, seed in zip(bases, made, seeds, strict=True)
     ]
     for name in systems:
         trials = Trials(partial(make_system, name), make_system, device=device)
-        driven = iter(trials.bases([one for group in groups for one in group]))
-        for row, group in zip(rows, groups, strict=True):
-            hits = [float(collides(next(driven))) for _ in group]
-            row[name] = {"base": hits[0], "found": float(np.mean(hits[1:]))}
+        # All episodes of a system run as one batch; the iterator hands them back group by group.
+        driven_bases = iter(trials.bases([episode_spec for episodes in episode_groups for episode_spec in episodes]))
+        for system_rates, episodes in zip(rows, episode_groups, strict=True):
+            collision_flags = [float(collides(next(driven_bases))) for _ in episodes]
+            system_rates[name] = {"base": collision_flags[0], "found": float(np.mean(collision_flags[1:]))}
     return rows
 
 
 def refusal(factory: Any, episode: Episode) -> str:
-    """Why a generator has nothing to change in an episode; "": it has."""
+    """Return the reason why a generator cannot change an episode; "" if it can."""
     check = getattr(factory, "check", None)
     try:
         if check is not None:

@@ -1,6 +1,6 @@
-"""What a search for collisions has found: how much of it is distinct, and how much it moves like ordinary traffic.
+"""Results of a search for collisions: distinct collisions, and their similarity to ordinary traffic.
 
-The reference of ordinary traffic is that of SSAD's natural scenarios.
+The reference for ordinary traffic is that of SSAD's natural scenarios.
 """
 
 from __future__ import annotations
@@ -30,76 +30,77 @@ SHOWN: Final = ("speed", "acceleration", "yaw_rate", "nearest")
 
 def summary(row: Sequence[Outcome]) -> dict[str, Any]:
     """The metrics of one search; means over collisions are None where there is none."""
-    valid = [o for o in row if o.valid]
-    ran = [o for o in row if o.trace is not None]
-    first = next((n for n, o in enumerate(row, 1) if o.valid), None)
+    valid = [outcome for outcome in row if outcome.valid]
+    completed = [outcome for outcome in row if outcome.trace is not None]
+    first_rollout = next((rollout for rollout, outcome in enumerate(row, 1) if outcome.valid), None)
 
     def mean(values: Sequence[float | bool | None]) -> float | None:
-        known = [float(v) for v in values if v is not None]
-        return float(np.mean(known)) if known else None
+        numbers = [float(number) for number in values if number is not None]
+        return float(np.mean(numbers)) if numbers else None
 
     return {
         "CR": bool(valid),
-        "CR_any": any(o.collision for o in row),
-        "rollouts": first,
-        "share": mean([o.valid for o in row]),
+        "CR_any": any(outcome.collision for outcome in row),
+        "rollouts": first_rollout,
+        "share": mean([outcome.valid for outcome in row]),
         "distinct": len(distinct(valid)),
-        "off_road": mean([o.off_road for o in ran]),
-        "hit_others": mean([o.hit_others for o in ran]),
-        "moving": mean([o.ego_speed is not None and o.ego_speed > MOVING for o in valid]),
-        "impact_speed": mean([o.impact_speed for o in valid]),
-        "acceleration": mean([o.acceleration for o in valid]),
-        "jerk": mean([o.jerk for o in valid]),
-        "within_limits": mean([o.within_limits for o in valid]),
+        "off_road": mean([outcome.off_road for outcome in completed]),
+        "hit_others": mean([outcome.hit_others for outcome in completed]),
+        "moving": mean([outcome.ego_speed is not None and outcome.ego_speed > MOVING for outcome in valid]),
+        "impact_speed": mean([outcome.impact_speed for outcome in valid]),
+        "acceleration": mean([outcome.acceleration for outcome in valid]),
+        "jerk": mean([outcome.jerk for outcome in valid]),
+        "within_limits": mean([outcome.within_limits for outcome in valid]),
     }
 
 
 def distinct(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Those of some collisions that are no copies: the motion of who is hit, as the ego sees it, differs.
+    """Return the distinct ones among some collisions, by the motion of the struck agent as the ego sees it.
 
-    It is compared over the 3 s before contact; less than 1 m on average is the same collision.
+    Motions are compared over the 3 s before contact; a mean difference below 1 m is the same collision.
     """
-    kept: list[tuple[Outcome, np.ndarray[Any, Any]]] = []
+    distinct_approaches: list[tuple[Outcome, np.ndarray[Any, Any]]] = []
     for outcome in outcomes:
         motion = _approach(outcome)
-        if all(float(np.hypot(*(motion - other).T).mean()) >= APART for _, other in kept):
-            kept.append((outcome, motion))
-    return [outcome for outcome, _ in kept]
+        if all(float(np.hypot(*(motion - other_motion).T).mean()) >= APART for _, other_motion in distinct_approaches):
+            distinct_approaches.append((outcome, motion))
+    return [outcome for outcome, _ in distinct_approaches]
 
 
 def _approach(outcome: Outcome) -> np.ndarray[Any, Any]:
-    """Where the agent that was hit was in the ego's frame [30, 2], m, in the steps before contact."""
+    """Return the positions of the struck agent in the ego's frame [30, 2], m, in the steps before contact."""
     trace = outcome.trace
     assert trace is not None
     assert outcome.time is not None
-    row = round(outcome.time / trace.dt)
-    agent = int(trace.contact_agent[row])
-    rows = np.clip(np.arange(row - round(BEFORE / trace.dt) + 1, row + 1), 0, None)
-    x, y = (getattr(trace, name)[rows] for name in ("x", "y"))
-    cos, sin = np.cos(trace.yaw[rows, 0]), np.sin(trace.yaw[rows, 0])
+    contact_step = round(outcome.time / trace.dt)
+    agent = int(trace.contact_agent[contact_step])
+    # A contact in the first 3 s repeats the first step, so that all motions have one length.
+    steps = np.clip(np.arange(contact_step - round(BEFORE / trace.dt) + 1, contact_step + 1), 0, None)
+    x, y = (getattr(trace, name)[steps] for name in ("x", "y"))
+    cos, sin = np.cos(trace.yaw[steps, 0]), np.sin(trace.yaw[steps, 0])
     dx, dy = x[:, agent] - x[:, 0], y[:, agent] - y[:, 0]
     return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], 1)
 
 
 def motions(trace: EpisodeTrace, graph: LaneGraph, agents: Sequence[int]) -> list[dict[str, F64]]:
-    """The features of the vehicles among some agents that move."""
-    found = []
+    """Return the features of the moving vehicles among some agents."""
+    features = []
     query = LaneQuery(graph)
     for agent in agents:
-        span = np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent]))
-        if span < MOVED or not AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE:
+        travel = np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent]))
+        if travel < MOVED or not AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE:
             continue
         path = np.stack([trace.x[:, agent], trace.y[:, agent]], 1).astype(np.float64)
-        found.append(motion_features(trace, agent, edge_distances(query, path)))
-    return found
+        features.append(motion_features(trace, agent, edge_distances(query, path)))
+    return features
 
 
 def likeness(row: Sequence[Outcome], graph: LaneGraph, usual: Mapping[str, F64]) -> dict[str, float]:
     """Realism score and distances of the adversaries that have collided with the ego; NaN if none has."""
-    collided = [o for o in row if o.valid and o.trace is not None]
-    told = pooled([m for o in collided for m in motions(o.trace, graph, o.adversaries)])  # type: ignore[arg-type]
-    apart = wasserstein(told, usual)
-    return {"realism": realism(told, usual), **{f"w_{name}": apart[name] for name in SHOWN}}
+    collided = [outcome for outcome in row if outcome.valid and outcome.trace is not None]
+    features = pooled([motion for outcome in collided for motion in motions(outcome.trace, graph, outcome.adversaries)])  # type: ignore[arg-type]
+    feature_distances = wasserstein(features, usual)
+    return {"realism": realism(features, usual), **{f"w_{name}": feature_distances[name] for name in SHOWN}}
 
 
 def reference(folder: Path, device: str) -> dict[str, F64]:
@@ -119,8 +120,8 @@ def _natural(device: str) -> dict[str, F64]:
 
     scenarios = load_scenarios("natural")
     trials = Trials(lambda: make_system("autopilot"), make_system, device=device)
-    chosen = scenarios[:: max(1, len(scenarios) // EPISODES)][:EPISODES]
-    found = []
-    for base in trials.bases([(scenario, load_town(scenario.town), 0) for scenario in chosen]):
-        found += motions(base.trace, base.graph, range(1, len(base.trace.names)))
-    return pooled(found)
+    selected = scenarios[:: max(1, len(scenarios) // EPISODES)][:EPISODES]
+    features = []
+    for base in trials.bases([(scenario, load_town(scenario.town), 0) for scenario in selected]):
+        features += motions(base.trace, base.graph, range(1, len(base.trace.names)))
+    return pooled(features)

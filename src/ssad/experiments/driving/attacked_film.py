@@ -1,4 +1,4 @@
-"""A recorded drive filmed again with an attack in it: the ego's camera, clean beside attacked, and what is detected."""
+"""Film of a recorded drive with an attack: the ego's camera, clean beside attacked, with the detected boxes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ def first_ahead(trace: EpisodeTrace, kind: AgentKind = AgentKind.CAR) -> int | N
     """The agent of a kind that is longest before the ego, within `NEAR` m and in its camera's view; None if none is."""
     dx, dy = trace.x - trace.x[:, :1], trace.y - trace.y[:, :1]
     cos, sin = np.cos(trace.yaw[:, :1]), np.sin(trace.yaw[:, :1])
-    ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
-    seen = trace.active & (ahead > 2.0 * np.abs(aside)) & (ahead < NEAR) & (trace.kind == kind)
-    steps = seen[:, 1:].sum(0)
-    return int(steps.argmax()) + 1 if steps.size and steps.max() > 0 else None
+    forward, lateral = dx * cos + dy * sin, dy * cos - dx * sin
+    # A cone of 27 degrees to either side stands for the view of the camera.
+    visible = trace.active & (forward > 2.0 * np.abs(lateral)) & (forward < NEAR) & (trace.kind == kind)
+    visible_steps = visible[:, 1:].sum(0)
+    return int(visible_steps.argmax()) + 1 if visible_steps.size and visible_steps.max() > 0 else None
 
 
 def attacked_frames(
@@ -57,18 +58,18 @@ def attacked_frames(
     Raises:
         ConfigError: The attack does not fit on its agent.
     """
-    front = Camera.typical(width, width * 9 // 16)
-    lens = torch.tensor(front.intrinsic, dtype=torch.float32)
-    sides = [
-        (title, Onboard(weather=weather, attack=one).camera(front))
-        for title, one in (("clean", None), (f"agent {attack.agent} attacked", attack))
+    camera_model = Camera.typical(width, width * 9 // 16)
+    intrinsic = torch.tensor(camera_model.intrinsic, dtype=torch.float32)
+    variants = [
+        (title, Onboard(weather=weather, attack=variant_edit).camera(camera_model))
+        for title, variant_edit in (("clean", None), (f"agent {attack.agent} attacked", attack))
     ]
     for step in range(0, len(trace.x), every):
         tiles = []
-        for title, camera in sides:
-            (picture,) = camera.of_trace(trace, graph, steps=[step])
-            image = np.ascontiguousarray(np.moveaxis(picture, 0, -1))
+        for title, onboard_camera in variants:
+            (rendered,) = onboard_camera.of_trace(trace, graph, steps=[step])
+            image = np.ascontiguousarray(np.moveaxis(rendered, 0, -1))
             if detector is not None:
-                image = marked(detector, torch.from_numpy(picture.copy())[None].float() / 255, lens)
+                image = marked(detector, torch.from_numpy(rendered.copy())[None].float() / 255, intrinsic)
             tiles.append(captioned(image, f"{title}, {step * trace.dt:.1f} s", width))
         yield np.hstack(tiles)

@@ -1,4 +1,4 @@
-"""Pictures of the camera and of distribution shifts that a run of drives shows in its report."""
+"""Camera images and distribution shifts in the report of a run of drives."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ def write_pictures(names: Sequence[str], folder: Path) -> None:
     Raises:
         StoreError: A file cannot be written.
     """
-    target, captions = folder / "pictures", {}
+    picture_folder, captions = folder / "pictures", {}
     if "shifts" in names:
         captions["shifts.jpg"] = "The 11 natural distribution shifts at severity 3, on a street of Larkhill."
         captions["shifts-severities.jpg"] = "Each shift at severities 1 to 5."
-        if not all((target / name).is_file() for name in captions):
+        if not all((picture_folder / name).is_file() for name in captions):
             with tempfile.TemporaryDirectory() as temporary:
                 street = Recording(Path(temporary) / "street", ("Larkhill",), scenes=1, seconds=0.5, width=960)
-                write_sheets(record_nuscenes(street, workers=0), safeio.make_folder(target) / "shifts.jpg")
+                write_sheets(record_nuscenes(street, workers=0), safeio.make_folder(picture_folder) / "shifts.jpg")
     if "camera" in names:
-        captions |= write_gallery(safeio.make_folder(target))
-        chosen = pick_trace(folder)
-        if chosen is not None:
-            captions["camera.jpg"] = f"An episode of this run ({chosen.stem}) from the ego's camera and from above."
-            if not (target / "camera.jpg").is_file():
-                trace = load_trace(chosen)
+        captions |= write_gallery(safeio.make_folder(picture_folder))
+        trace_path = pick_trace(folder)
+        if trace_path is not None:
+            captions["camera.jpg"] = f"An episode of this run ({trace_path.stem}) from the ego's camera and from above."
+            if not (picture_folder / "camera.jpg").is_file():
+                trace = load_trace(trace_path)
                 graph = load_graph(folder / "towns" / town_file(trace.town))
-                save_picture(target / "camera.jpg", onboard_sheet(trace, graph))
+                save_picture(picture_folder / "camera.jpg", onboard_sheet(trace, graph))
     if captions:
-        safeio.write_atomic(target / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")
+        safeio.write_atomic(picture_folder / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")

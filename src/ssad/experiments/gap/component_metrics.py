@@ -1,4 +1,4 @@
-"""How well a driving system perceived in the very drive that it drove, and what went wrong before it collided."""
+"""Perception of a driving system in the very drive that it drove, and the causes of its collisions."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ CAUSES: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, eq=False)
 class Perceived:
-    """What a driver saw and believed in one drive.
+    """Perception of a driver in one drive.
 
     Attributes:
-        looks: For each look its time, s, and what was found; None where there was no picture.
+        looks: For each look its time, s, and the detections; None without an image.
         known: For each step its time, s, and the confirmed tracks.
-        cameras: Through which it looked.
-        signs: For each look its time, s, and where the stop signs stand that were read [M, 2].
+        cameras: Its cameras.
+        signs: For each look its time, s, and the positions of the stop signs that were read [M, 2].
     """
 
     looks: Sequence[tuple[float, Objects | None]]
@@ -58,12 +58,13 @@ class Perceived:
 
 
 class Watcher:
-    """Keeps what a driver sees and believes, by scene, and a few pictures of each drive.
+    """Recorder of the detections and tracks of a driver, by scene, and of a few images of each drive.
 
     Args:
-        cameras: Of the driver.
-        scenes: How many.
-        every: s from one picture that is kept to the next, at least; the last one is always kept. None: none are kept.
+        cameras: Cameras of the driver.
+        scenes: Number of scenes.
+        every: Minimum time from one stored image to the next, s; the last one is always stored. None: none are
+            stored.
     """
 
     def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float | None = 0.5) -> None:
@@ -80,13 +81,16 @@ class Watcher:
             if told.signs is not None:
                 self.signs[told.scene].append((told.time, told.signs))
             if self.every is not None:
-                for picture in list(told.pictures.values())[:1]:
-                    self._keep(self._shots[told.scene], told.time, picture, self.every)
+                for image in list(told.pictures.values())[:1]:
+                    self._keep(self._shots[told.scene], told.time, image, self.every)
             return
+        # Tracks of all scenes come together; sorted by scene, each scene is a slice.
         tracks = told.tracks.take(np.argsort(told.tracks.scene, kind="stable"))
-        ends = (np.searchsorted(tracks.scene, told.scene, side=side).tolist() for side in ("left", "right"))
-        for scene, time, begin, end in zip(told.scene.tolist(), told.time.tolist(), *ends, strict=True):
-            self.known[scene].append((time, tracks.take(slice(begin, end))))
+        track_limits = (np.searchsorted(tracks.scene, told.scene, side=side).tolist() for side in ("left", "right"))
+        for scene, time, first_track, last_track in zip(
+            told.scene.tolist(), told.time.tolist(), *track_limits, strict=True
+        ):
+            self.known[scene].append((time, tracks.take(slice(first_track, last_track))))
 
     @staticmethod
     def _keep(shots: list[tuple[float, Any]], time: float, picture: Any, every: float) -> None:
@@ -99,11 +103,11 @@ class Watcher:
         shots.append((time, picture))
 
     def shots(self, scene: int) -> list[tuple[float, U8]]:
-        """Pictures [H, W, 3] that the driver of a scene got, with their times, s."""
-        return [(time, _upright(picture)) for time, picture in self._shots[scene]]
+        """Return the images [H, W, 3] of the driver of a scene, with their times, s."""
+        return [(time, _upright(image)) for time, image in self._shots[scene]]
 
     def perceived(self, scene: int) -> Perceived:
-        """What was perceived in a scene."""
+        """Return the perception in a scene."""
         return Perceived(self.looks[scene], self.known[scene], self.cameras, self.signs[scene])
 
 
@@ -116,23 +120,28 @@ def _upright(picture: Any) -> U8:
 
 def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Camera]) -> Bool:
     """Which agents [N, A] the ego's cameras can see at N steps: not hidden, near enough, their middle in a picture."""
-    at = np.asarray(steps, np.int64)
-    kind = np.where(trace.active[at], trace.kind, int(AgentKind.NONE)).astype(np.int32)
+    step_indices = np.asarray(steps, np.int64)
+    kind = np.where(trace.active[step_indices], trace.kind, int(AgentKind.NONE)).astype(np.int32)
     kind[:, 0] = AgentKind.NONE
-    pose = np.stack([trace.x[at], trace.y[at], trace.yaw[at]], -1)
+    pose = np.stack([trace.x[step_indices], trace.y[step_indices], trace.yaw[step_indices]], -1)
     size = np.stack([trace.length, trace.width], -1)
-    truth = Belief(pose.astype(np.float32), trace.speed[at], np.broadcast_to(size, (len(at), *size.shape)), kind)
-    seen = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
+    truth = Belief(
+        pose.astype(np.float32),
+        trace.speed[step_indices],
+        np.broadcast_to(size, (len(step_indices), *size.shape)),
+        kind,
+    )
+    unoccluded = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
     egos = upright_poses(pose[:, 0].astype(np.float64))
     ones = np.ones(kind.shape)
-    places = np.stack([pose[..., 0], pose[..., 1], 0.8 * ones, ones], -1)
-    inside = np.zeros(kind.shape, bool)
+    homogeneous = np.stack([pose[..., 0], pose[..., 1], 0.8 * ones, ones], -1)
+    in_image = np.zeros(kind.shape, bool)
     for camera in cameras.values():
         to_camera = np.linalg.inv(egos @ camera.to_ego)
-        across, ahead = (np.einsum("nak,nk->na", places, to_camera[:, row]) for row in (0, 2))
-        column = across / np.maximum(ahead, 1e-6) * camera.intrinsic[0, 0] + camera.intrinsic[0, 2]
-        inside |= (ahead > 0.5) & (column >= 0) & (column < camera.width)
-    return np.asarray(seen & inside)
+        lateral, depth = (np.einsum("nak,nk->na", homogeneous, to_camera[:, axis]) for axis in (0, 2))
+        pixel_column = lateral / np.maximum(depth, 1e-6) * camera.intrinsic[0, 0] + camera.intrinsic[0, 2]
+        in_image |= (depth > 0.5) & (pixel_column >= 0) & (pixel_column < camera.width)
+    return np.asarray(unoccluded & in_image)
 
 
 def _steps(trace: EpisodeTrace, told: Sequence[tuple[float, Any]]) -> list[int]:
@@ -142,15 +151,15 @@ def _steps(trace: EpisodeTrace, told: Sequence[tuple[float, Any]]) -> list[int]:
 
 def object_that_matters(trace: EpisodeTrace) -> int | None:
     """The agent that the ego touches first, or else the one that it comes nearest to; None: there is nobody else."""
-    touched = trace.contact_agent[trace.contact_agent > 0]
-    if len(touched):
-        return int(touched[0])
+    struck_agents = trace.contact_agent[trace.contact_agent > 0]
+    if len(struck_agents):
+        return int(struck_agents[0])
     if len(trace.kind) < 2:
         return None
-    gap = np.hypot(trace.x[:, 1:] - trace.x[:, :1], trace.y[:, 1:] - trace.y[:, :1])
-    gap = np.where(trace.active[:, 1:], gap - 0.5 * trace.length[1:], np.inf)
-    best = int(gap.min(0).argmin())
-    return best + 1 if np.isfinite(gap[:, best]).any() else None
+    distances = np.hypot(trace.x[:, 1:] - trace.x[:, :1], trace.y[:, 1:] - trace.y[:, :1])
+    distances = np.where(trace.active[:, 1:], distances - 0.5 * trace.length[1:], np.inf)
+    nearest_agent = int(distances.min(0).argmin())
+    return nearest_agent + 1 if np.isfinite(distances[:, nearest_agent]).any() else None
 
 
 def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> dict[str, float | None]:
@@ -169,59 +178,71 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
         that are not there. believed: share of the steps with the object that matters in view in which it is believed
         where it is. switches: changes of its track. HOTA, MOTA and IDF1: see `track_metrics`.
     """
-    target = object_that_matters(trace)
-    found_of: list[tuple[float, bool, float]] = []  # distance, found, error of the distance
-    hits, there, phantoms, looks = 0, 0, 0, 0
-    tables: list[tuple[F64, Bool, Objects | None]] = []
-    missed: list[Bool] = []
-    shares: list[F64] = []
+    critical = object_that_matters(trace)
+    critical_looks: list[tuple[float, bool, float]] = []  # distance, found, error of the distance
+    hit_count, visible_count, phantom_count, look_count = 0, 0, 0, 0
+    look_tables: list[tuple[F64, Bool, Objects | None]] = []
+    missed_agents: list[Bool] = []
+    distance_errors: list[F64] = []
     steps = _steps(trace, seen.looks)
-    for (_, found), step, view in zip(seen.looks, steps, in_view(trace, steps, seen.cameras), strict=True):
-        place = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
-        tables.append((place, view, found))
-        looks += 1
-        got = np.zeros((0, 2)) if found is None else found.place
-        gap = np.linalg.norm(place[:, None] - got[None], axis=-1) if len(got) else np.full((len(place), 1), np.inf)
-        nearest = gap.min(1)
-        missed.append(view & (nearest >= NEAR))
-        if rough := np.flatnonzero(view & (nearest < ROUGH)).tolist():
-            far = np.linalg.norm(place[rough] - place[0], axis=1)
-            told = np.linalg.norm(got[gap[rough].argmin(1)] - place[0], axis=1)
-            shares.append(told / far - 1.0)
-        there, hits = there + int(view.sum()), hits + int((nearest[view] < NEAR).sum())
-        if found is not None and len(got):
-            others = trace.active[step].copy()
-            others[0] = False
-            lone = gap[others].min(0, initial=np.inf) > ROUGH
-            phantoms += int((lone & (found.score >= sure)).sum())
-        if target is not None and view[target]:
-            away = float(np.linalg.norm(place[target] - place[0]))
-            error = np.nan
-            if nearest[target] < ROUGH:
-                error = abs(float(np.linalg.norm(got[gap[target].argmin()] - place[0])) - away)
-            found_of.append((away, bool(nearest[target] < NEAR), error))
-    rows = np.array(found_of, float).reshape(-1, 3)
+    for (_, detections), step, visible in zip(seen.looks, steps, in_view(trace, steps, seen.cameras), strict=True):
+        agent_positions = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
+        look_tables.append((agent_positions, visible, detections))
+        look_count += 1
+        detected_positions = np.zeros((0, 2)) if detections is None else detections.place
+        distances = (
+            np.linalg.norm(agent_positions[:, None] - detected_positions[None], axis=-1)
+            if len(detected_positions)
+            else np.full((len(agent_positions), 1), np.inf)
+        )
+        nearest = distances.min(1)
+        missed_agents.append(visible & (nearest >= NEAR))
+        if roughly_found := np.flatnonzero(visible & (nearest < ROUGH)).tolist():
+            true_distances = np.linalg.norm(agent_positions[roughly_found] - agent_positions[0], axis=1)
+            detected_distances = np.linalg.norm(
+                detected_positions[distances[roughly_found].argmin(1)] - agent_positions[0], axis=1
+            )
+            distance_errors.append(detected_distances / true_distances - 1.0)
+        visible_count, hit_count = visible_count + int(visible.sum()), hit_count + int((nearest[visible] < NEAR).sum())
+        if detections is not None and len(detected_positions):
+            is_other = trace.active[step].copy()
+            is_other[0] = False
+            # All other agents count here, hidden ones too: a detection of one of them is no phantom.
+            is_phantom = distances[is_other].min(0, initial=np.inf) > ROUGH
+            phantom_count += int((is_phantom & (detections.score >= sure)).sum())
+        if critical is not None and visible[critical]:
+            critical_distance = float(np.linalg.norm(agent_positions[critical] - agent_positions[0]))
+            distance_error = np.nan
+            if nearest[critical] < ROUGH:
+                distance_error = abs(
+                    float(np.linalg.norm(detected_positions[distances[critical].argmin()] - agent_positions[0]))
+                    - critical_distance
+                )
+            critical_looks.append((critical_distance, bool(nearest[critical] < NEAR), distance_error))
+    rows = np.array(critical_looks, float).reshape(-1, 3)
     metrics: dict[str, float | None] = {
-        "AP": average_precision(tables),
-        "recall": hits / there if there else None,
-        "missed_burst": _burst(missed),
-        "distance_share": float(np.sqrt(np.mean(np.concatenate(shares) ** 2))) if shares else None,
+        "AP": average_precision(look_tables),
+        "recall": hit_count / visible_count if visible_count else None,
+        "missed_burst": _burst(missed_agents),
+        "distance_share": float(np.sqrt(np.mean(np.concatenate(distance_errors) ** 2))) if distance_errors else None,
         "target_recall": _mean(rows[:, 1]),
         "distance_error": _mean(rows[np.isfinite(rows[:, 2]), 2]),
-        "phantoms": phantoms / looks if looks else None,
+        "phantoms": phantom_count / look_count if look_count else None,
     }
-    for low, high in BANDS:
-        metrics[f"target_recall_{low:.0f}_{high:.0f}"] = _mean(rows[(rows[:, 0] >= low) & (rows[:, 0] < high), 1])
-    return metrics | _belief_metrics(trace, seen, target) | track_metrics(trace, seen)
+    for band_start, band_end in BANDS:
+        metrics[f"target_recall_{band_start:.0f}_{band_end:.0f}"] = _mean(
+            rows[(rows[:, 0] >= band_start) & (rows[:, 0] < band_end), 1]
+        )
+    return metrics | _belief_metrics(trace, seen, critical) | track_metrics(trace, seen)
 
 
 def _burst(missed: Sequence[Bool]) -> float | None:
     """Looks in a row that an object is missed, on average over all times that one is; `missed` [A] for each look."""
-    table = np.array(missed, bool)
-    if not table.any():
+    missed_table = np.array(missed, bool)
+    if not missed_table.any():
         return None
-    begun = table & ~np.concatenate([np.zeros_like(table[:1]), table[:-1]])
-    return float(table.sum() / begun.sum())
+    run_starts = missed_table & ~np.concatenate([np.zeros_like(missed_table[:1]), missed_table[:-1]])
+    return float(missed_table.sum() / run_starts.sum())
 
 
 def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | None]:
@@ -230,14 +251,18 @@ def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | Non
     A track on somebody who is out of view, whom the driver may well remember, counts neither for nor against.
     """
     frames, steps = [], _steps(trace, seen.known)
-    for (_, tracks), step, view in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
-        place = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
-        likeness = similarity_of(place, tracks.mean[:, :2], 2.0 * NEAR)
-        others = trace.active[step] & ~view
-        others[0] = False
-        best = likeness[view].max(0, initial=0.0)
-        kept = (best >= likeness[others].max(0, initial=0.0)) | (likeness[others].max(0, initial=0.0) < ENOUGH)
-        frames.append(TrackedFrame(np.flatnonzero(view), tracks.ident[kept], likeness[view][:, kept]))
+    for (_, tracks), step, visible in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
+        agent_positions = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
+        similarity = similarity_of(agent_positions, tracks.mean[:, :2], 2.0 * NEAR)
+        is_hidden = trace.active[step] & ~visible
+        is_hidden[0] = False
+        visible_similarity = similarity[visible].max(0, initial=0.0)
+        counted_tracks = (visible_similarity >= similarity[is_hidden].max(0, initial=0.0)) | (
+            similarity[is_hidden].max(0, initial=0.0) < ENOUGH
+        )
+        frames.append(
+            TrackedFrame(np.flatnonzero(visible), tracks.ident[counted_tracks], similarity[visible][:, counted_tracks])
+        )
     scores = track_scores(frames)
     if scores is None:
         return dict.fromkeys(("HOTA", "MOTA", "IDF1"))
@@ -256,48 +281,62 @@ def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, 
         sign_recall: share of the looks with such a sign 5 to 40 m ahead in which it was read; sign_recall_5_20 and so
         on: the same within a band of `SIGN_BANDS`. sign_read_at: m from the sign at which one was first read.
     """
-    looks: list[tuple[float, bool]] = []  # m to the sign ahead, whether it was read
-    for time, places in seen.signs:
+    sign_looks: list[tuple[float, bool]] = []  # m to the sign ahead, whether it was read
+    for time, readings in seen.signs:
         step = min(round(time / trace.dt), len(trace.x) - 1)
-        ego = np.array([trace.x[step, 0], trace.y[step, 0]], np.float64)
+        ego_position = np.array([trace.x[step, 0], trace.y[step, 0]], np.float64)
         yaw = float(trace.yaw[step, 0])
-        away = signs - ego
-        ahead = away @ (np.cos(yaw), np.sin(yaw))
-        aside = np.abs(away @ (-np.sin(yaw), np.cos(yaw)))
-        near = np.flatnonzero((ahead > SIGN_BANDS[0][0]) & (ahead < SIGN_BANDS[-1][1]) & (aside < 0.5 * ahead))
-        if len(near):
-            sign = near[ahead[near].argmin()]
-            apart = float(np.linalg.norm(away[sign]))
-            gap = np.linalg.norm(places - signs[sign], axis=1).min(initial=np.inf)
-            looks.append((apart, bool(gap < SAME * apart + 1.0)))
-    rows = np.array(looks, float).reshape(-1, 2)
-    found: dict[str, float | None] = {"sign_recall": _mean(rows[:, 1])}
-    for low, high in SIGN_BANDS:
-        found[f"sign_recall_{low:.0f}_{high:.0f}"] = _mean(rows[(rows[:, 0] >= low) & (rows[:, 0] < high), 1])
-    return found | {"sign_read_at": max((apart for apart, read in looks if read), default=None)}
+        offsets = signs - ego_position
+        forward = offsets @ (np.cos(yaw), np.sin(yaw))
+        lateral = np.abs(offsets @ (-np.sin(yaw), np.cos(yaw)))
+        visible_signs = np.flatnonzero(
+            (forward > SIGN_BANDS[0][0]) & (forward < SIGN_BANDS[-1][1]) & (lateral < 0.5 * forward)
+        )
+        if len(visible_signs):
+            nearest_sign = visible_signs[forward[visible_signs].argmin()]
+            sign_distance = float(np.linalg.norm(offsets[nearest_sign]))
+            reading_error = np.linalg.norm(readings - signs[nearest_sign], axis=1).min(initial=np.inf)
+            sign_looks.append((sign_distance, bool(reading_error < SAME * sign_distance + 1.0)))
+    rows = np.array(sign_looks, float).reshape(-1, 2)
+    metrics: dict[str, float | None] = {"sign_recall": _mean(rows[:, 1])}
+    for band_start, band_end in SIGN_BANDS:
+        metrics[f"sign_recall_{band_start:.0f}_{band_end:.0f}"] = _mean(
+            rows[(rows[:, 0] >= band_start) & (rows[:, 0] < band_end), 1]
+        )
+    return metrics | {
+        "sign_read_at": max((sign_distance for sign_distance, is_read in sign_looks if is_read), default=None)
+    }
 
 
 def average_precision(looks: Sequence[tuple[F64, Bool, Objects | None]]) -> float | None:
-    """AP over looks, all kinds as one, the mean over nuScenes' four distances; None: nothing was in view.
+    """Return AP over looks, all kinds as one, the mean over nuScenes' four distances; None if nothing was in view.
 
-    What is not in view and yet found counts neither for nor against.
+    Detections of hidden agents count neither for nor against.
 
     Args:
-        looks: Places of all agents [A, 2], which are in view [A], and what was found.
+        looks: Positions of all agents [A, 2], which of them are in view [A], and the detections.
     """
-    real, told = [], []
-    for number, (place, view, found) in enumerate(looks):
-        real.append((np.full(int(view.sum()), number), place[view], np.full(int(view.sum()), -1.0)))
-        if found is not None and len(found):
-            gap = np.linalg.norm(found.place[:, None] - place[None, 1:], axis=-1)
-            unseen = gap[:, ~view[1:]].min(1, initial=np.inf) < np.minimum(
-                gap[:, view[1:]].min(1, initial=np.inf), NEAR
+    truth_parts, detection_parts = [], []
+    for look_index, (agent_positions, visible, detections) in enumerate(looks):
+        truth_parts.append(
+            (np.full(int(visible.sum()), look_index), agent_positions[visible], np.full(int(visible.sum()), -1.0))
+        )
+        if detections is not None and len(detections):
+            distances = np.linalg.norm(detections.place[:, None] - agent_positions[None, 1:], axis=-1)
+            on_hidden_agent = distances[:, ~visible[1:]].min(1, initial=np.inf) < np.minimum(
+                distances[:, visible[1:]].min(1, initial=np.inf), NEAR
             )
-            told.append((np.full(len(found), number)[~unseen], found.place[~unseen], found.score[~unseen]))
-    truth, predicted = _table(real), _table(told)
-    if not len(truth):
+            detection_parts.append(
+                (
+                    np.full(len(detections), look_index)[~on_hidden_agent],
+                    detections.place[~on_hidden_agent],
+                    detections.score[~on_hidden_agent],
+                )
+            )
+    truth_table, detection_table = _table(truth_parts), _table(detection_parts)
+    if not len(truth_table):
         return None
-    scores = match(truth, predicted, samples=len(looks)).scores()
+    scores = match(truth_table, detection_table, samples=len(looks)).scores()
     return float(scores.mean_dist_aps["car"])
 
 
@@ -308,83 +347,93 @@ def cause_of_collision(trace: EpisodeTrace, seen: Perceived) -> dict[str, Any] |
         cause: the commonest of `CAUSES` from 3 s to 0.5 s before the contact; of equal ones the worse. unknown_s: for
         how long before the contact it was not believed where it was, at most 3 s. shares: of the steps, by cause.
     """
-    struck = np.flatnonzero(trace.contact_agent > 0)
-    if not len(struck):
+    contact_steps = np.flatnonzero(trace.contact_agent > 0)
+    if not len(contact_steps):
         return None
-    end = int(struck[0])
-    agent = int(trace.contact_agent[end])
-    states = [_state(trace, step, agent, seen) for step in range(max(end - round(BEFORE / trace.dt), 0), end)]
-    if not states:
+    contact_step = int(contact_steps[0])
+    agent = int(trace.contact_agent[contact_step])
+    perception_states = [
+        _state(trace, step, agent, seen)
+        for step in range(max(contact_step - round(BEFORE / trace.dt), 0), contact_step)
+    ]
+    if not perception_states:
         return None
-    unknown = 0
-    while unknown < len(states) and states[-1 - unknown] != "known":
-        unknown += 1
-    early = states[: max(len(states) - round(0.5 / trace.dt), 1)]
-    shares = {name: early.count(name) / len(early) for name in CAUSES}
+    unknown_steps = 0
+    while unknown_steps < len(perception_states) and perception_states[-1 - unknown_steps] != "known":
+        unknown_steps += 1
+    early_states = perception_states[: max(len(perception_states) - round(0.5 / trace.dt), 1)]
+    shares = {name: early_states.count(name) / len(early_states) for name in CAUSES}
     cause = max(CAUSES, key=lambda name: shares[name])
-    return {"cause": cause, "unknown_s": round(unknown * trace.dt, 3), "shares": shares, "agent": trace.names[agent]}
+    return {
+        "cause": cause,
+        "unknown_s": round(unknown_steps * trace.dt, 3),
+        "shares": shares,
+        "agent": trace.names[agent],
+    }
 
 
 def impact_speed(trace: EpisodeTrace) -> float | None:
-    """Speed of the ego against who it touches first, just before, m/s; None: there was no collision with an agent."""
-    struck = np.flatnonzero(trace.contact_agent > 0)
-    if not len(struck):
+    """Return the relative speed of the ego and the agent that it touches first, just before, m/s; None if none."""
+    contact_steps = np.flatnonzero(trace.contact_agent > 0)
+    if not len(contact_steps):
         return None
-    step = max(int(struck[0]) - 1, 0)
-    agent = int(trace.contact_agent[struck[0]])
+    step = max(int(contact_steps[0]) - 1, 0)
+    agent = int(trace.contact_agent[contact_steps[0]])
     velocity = trace.speed[step] * np.stack([np.cos(trace.yaw[step]), np.sin(trace.yaw[step])])
     return float(np.hypot(*(velocity[:, 0] - velocity[:, agent])))
 
 
 def hard_braking(trace: EpisodeTrace, limit: float = 4.0) -> int:
-    """How often the ego began to brake harder than a limit, m/s^2."""
-    hard = trace.accel < -limit
-    return int((hard & ~np.concatenate([[False], hard[:-1]])).sum())
+    """Count how often the ego begins to brake harder than a limit, m/s^2."""
+    brakes_hard = trace.accel < -limit
+    return int((brakes_hard & ~np.concatenate([[False], brakes_hard[:-1]])).sum())
 
 
 def phantom_stop(trace: EpisodeTrace, seen: Perceived) -> float:
     """Seconds that the ego stood (below 0.5 m/s) with something on the road ahead, within 20 m, that is not there."""
-    total = 0.0
+    standing_time = 0.0
     for time, tracks in seen.known:
         step = min(round(time / trace.dt), len(trace.x) - 1)
         if trace.speed[step, 0] > 0.5 or not len(tracks):
             continue
         yaw = float(trace.yaw[step, 0])
-        apart = tracks.mean[:, :2] - (trace.x[step, 0], trace.y[step, 0])
-        ahead, aside = apart @ (np.cos(yaw), np.sin(yaw)), apart @ (-np.sin(yaw), np.cos(yaw))
-        others = np.flatnonzero(trace.active[step])[1:]
-        place = np.stack([trace.x[step, others], trace.y[step, others]], -1)
-        gap = np.linalg.norm(tracks.mean[:, None, :2] - place[None], axis=-1).min(1, initial=np.inf)
-        total += trace.dt * bool(((ahead > 0) & (ahead < 20.0) & (np.abs(aside) < 2.5) & (gap > ROUGH)).any())
-    return total
+        track_offsets = tracks.mean[:, :2] - (trace.x[step, 0], trace.y[step, 0])
+        forward, lateral = track_offsets @ (np.cos(yaw), np.sin(yaw)), track_offsets @ (-np.sin(yaw), np.cos(yaw))
+        other_agents = np.flatnonzero(trace.active[step])[1:]
+        agent_positions = np.stack([trace.x[step, other_agents], trace.y[step, other_agents]], -1)
+        distances = np.linalg.norm(tracks.mean[:, None, :2] - agent_positions[None], axis=-1).min(1, initial=np.inf)
+        standing_time += trace.dt * bool(
+            ((forward > 0) & (forward < 20.0) & (np.abs(lateral) < 2.5) & (distances > ROUGH)).any()
+        )
+    return standing_time
 
 
 def _belief_metrics(trace: EpisodeTrace, seen: Perceived, target: int | None) -> dict[str, float | None]:
-    believed, idents, steps = [], [], _steps(trace, seen.known)
-    for (_, tracks), step, view in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
-        if target is None or not view[target]:
+    is_believed, track_ids, steps = [], [], _steps(trace, seen.known)
+    for (_, tracks), step, visible in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
+        if target is None or not visible[target]:
             continue
-        gap = _gaps(tracks, trace, step, target)
-        believed.append(float(gap.min(initial=np.inf) < NEAR))
-        if believed[-1]:
-            idents.append(int(tracks.ident[gap.argmin()]))
-    switches = float(np.count_nonzero(np.diff(idents))) if idents else None
-    return {"believed": _mean(np.array(believed)), "switches": switches}
+        distances = _gaps(tracks, trace, step, target)
+        is_believed.append(float(distances.min(initial=np.inf) < NEAR))
+        if is_believed[-1]:
+            track_ids.append(int(tracks.ident[distances.argmin()]))
+    switches = float(np.count_nonzero(np.diff(track_ids))) if track_ids else None
+    return {"believed": _mean(np.array(is_believed)), "switches": switches}
 
 
 def _state(trace: EpisodeTrace, step: int, agent: int, seen: Perceived) -> str:
     """Which of `CAUSES` an agent is at a step."""
     time = step * trace.dt
-    for then, tracks in seen.known:
-        if abs(then - time) < 0.5 * trace.dt and _gaps(tracks, trace, step, agent).min(initial=np.inf) < NEAR:
+    for record_time, tracks in seen.known:
+        if abs(record_time - time) < 0.5 * trace.dt and _gaps(tracks, trace, step, agent).min(initial=np.inf) < NEAR:
             return "known"
     if not in_view(trace, [step], seen.cameras)[0, agent]:
         return "hidden"
-    last = [found for then, found in seen.looks if then <= time + 0.5 * trace.dt][-1:]
-    if not last or last[0] is None or not len(last[0]):
+    last_look = [detections for record_time, detections in seen.looks if record_time <= time + 0.5 * trace.dt][-1:]
+    if not last_look or last_look[0] is None or not len(last_look[0]):
         return "missed"
-    place = np.array([trace.x[step, agent], trace.y[step, agent]])
-    nearest = float(np.linalg.norm(last[0].place - place, axis=1).min())
+    agent_position = np.array([trace.x[step, agent], trace.y[step, agent]])
+    nearest = float(np.linalg.norm(last_look[0].place - agent_position, axis=1).min())
     return "late" if nearest < NEAR else "misplaced" if nearest < ROUGH else "missed"
 
 
@@ -397,13 +446,13 @@ def _mean(values: F64) -> float | None:
 
 
 def _table(parts: Sequence[tuple[I64, F64, F64]]) -> BoxTable:
-    """Boxes of one class, of which only the place counts."""
+    """Return boxes of one class, of which only the position counts."""
     if not parts:
         return BoxTable.empty()
-    sample, place, score = (np.concatenate(column) for column in zip(*parts, strict=True))
+    sample, positions, score = (np.concatenate(column) for column in zip(*parts, strict=True))
     table = BoxTable.empty(len(sample))
     table.sample[:], table.score[:] = sample, score
-    table.centre[:, :2] = place
+    table.centre[:, :2] = positions
     table.size_lwh[:] = 1.0
     table.rotation[:, 0] = 1.0
     return table

@@ -1,4 +1,4 @@
-"""Drives as their drivers saw them: the picture that they got, and from above what is there, found and believed."""
+"""Drives from the view of their drivers: the camera image, and from above the true, detected and believed objects."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ def drive_sheet(trace: EpisodeTrace, seen: Perceived, shots: Sequence[tuple[floa
         shots: Pictures that the driver got, with their times, s.
         graph: The town.
     """
-    struck, end = np.flatnonzero(trace.contact_agent > 0), (len(trace.x) - 1) * trace.dt
-    wanted = (
-        [max(struck[0] * trace.dt - s, 0.0) for s in (2.0, 1.0, 0.0)]
-        if len(struck)
-        else [end * k / 4 for k in (1, 2, 3)]
+    contact_steps, end_time = np.flatnonzero(trace.contact_agent > 0), (len(trace.x) - 1) * trace.dt
+    row_times = (
+        [max(contact_steps[0] * trace.dt - seconds, 0.0) for seconds in (2.0, 1.0, 0.0)]
+        if len(contact_steps)
+        else [end_time * quarter / 4 for quarter in (1, 2, 3)]
     )
-    return np.vstack([_row(Seen("", trace, seen, shots), time, graph) for time in wanted])
+    return np.vstack([_row(Seen("", trace, seen, shots), time, graph) for time in row_times])
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A drive and what was seen in it.
+    """Drive with the perception of its driver.
 
     Attributes:
-        title: What the film calls it.
+        title: Title in the film.
         trace: The drive.
-        perceived: What was perceived in it.
-        shots: Pictures that the driver got, with their times, s.
+        perceived: Perception of the driver in it.
+        shots: Images of the driver, with their times, s.
     """
 
     title: str
@@ -64,7 +64,7 @@ class Seen:
 
     @property
     def end(self) -> float:
-        """When it ended, s."""
+        """End of the drive, s."""
         return (len(self.trace.x) - 1) * self.trace.dt
 
 
@@ -79,24 +79,26 @@ def drive_film(drives: Sequence[Seen], graph: LaneGraph, *, every: float = 0.2) 
     Yields:
         RGB frames [H, W, 3] of one size.
     """
-    last = max(drive.end for drive in drives)
-    for k in range(int(last / every + 1.5)):
-        yield np.hstack([_row(drive, min(k * every, drive.end), graph, exact=True) for drive in drives])
+    end_time = max(drive.end for drive in drives)
+    for frame_index in range(int(end_time / every + 1.5)):
+        yield np.hstack([_row(drive, min(frame_index * every, drive.end), graph, exact=True) for drive in drives])
 
 
 def _row(drive: Seen, time: float, graph: LaneGraph, *, exact: bool = False) -> U8:
-    """A moment of a drive; unless `exact`, all of it is shown at the time of the picture nearest to it."""
-    trace, seen = drive.trace, drive.perceived
-    when, picture = min(drive.shots, key=lambda shot: abs(shot[0] - time))
-    when = time if exact else when
-    step = min(round(when / trace.dt), len(trace.x) - 1)
-    wide = picture.shape[1] * TALL // picture.shape[0]
-    shown = cv2.resize(np.ascontiguousarray(picture), (wide, TALL), interpolation=cv2.INTER_AREA)
-    text = f"{drive.title}{', ' if drive.title else ''}{when:.1f} s, {trace.speed[step, 0]:.1f} m/s"
-    left = captioned(np.asarray(_marked(shown, trace, step, when, seen), np.uint8), text, wide)
-    right = captioned(_above(trace, step, when, seen, graph), LEGEND, WIDTH)
-    tall = max(len(left), len(right))
-    return np.hstack([_padded(left, tall), _padded(right, tall)])
+    """Draw a moment of a drive; unless `exact`, all of it is shown at the time of the nearest image."""
+    trace, perceived = drive.trace, drive.perceived
+    shown_time, image = min(drive.shots, key=lambda timed_image: abs(timed_image[0] - time))
+    shown_time = time if exact else shown_time
+    step = min(round(shown_time / trace.dt), len(trace.x) - 1)
+    image_width = image.shape[1] * TALL // image.shape[0]
+    resized = cv2.resize(np.ascontiguousarray(image), (image_width, TALL), interpolation=cv2.INTER_AREA)
+    text = f"{drive.title}{', ' if drive.title else ''}{shown_time:.1f} s, {trace.speed[step, 0]:.1f} m/s"
+    camera_panel = captioned(
+        np.asarray(_marked(resized, trace, step, shown_time, perceived), np.uint8), text, image_width
+    )
+    top_panel = captioned(_above(trace, step, shown_time, perceived, graph), LEGEND, WIDTH)
+    row_height = max(len(camera_panel), len(top_panel))
+    return np.hstack([_padded(camera_panel, row_height), _padded(top_panel, row_height)])
 
 
 def _padded(picture: U8, height: int) -> U8:
@@ -105,7 +107,7 @@ def _padded(picture: U8, height: int) -> U8:
 
 def _at(seen: Sequence[tuple[float, Any]], time: float) -> Any:
     """What was noted nearest to a time; None: nothing."""
-    return min(seen, key=lambda one: abs(one[0] - time))[1] if seen else None
+    return min(seen, key=lambda record: abs(record[0] - time))[1] if seen else None
 
 
 def _marked(picture: U8, trace: EpisodeTrace, step: int, time: float, seen: Perceived) -> U8:
@@ -113,22 +115,22 @@ def _marked(picture: U8, trace: EpisodeTrace, step: int, time: float, seen: Perc
     camera = next(iter(seen.cameras.values()))
     factor = picture.shape[1] / camera.width
     ego = (float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
-    found, tracks = _at(seen.looks, time), _at(seen.known, time)
+    detections, tracks = _at(seen.looks, time), _at(seen.known, time)
     for places, colour in (
-        ([] if found is None else found.place, FOUND),
+        ([] if detections is None else detections.place, FOUND),
         ([] if tracks is None else tracks.mean[:, :2], KNOWN),
     ):
-        for place in places:
-            local = to_local(np.array(ego), np.asarray(place))
-            ends = []
+        for position in places:
+            ego_point = to_local(np.array(ego), np.asarray(position))
+            stake_ends = []
             for height in (0.0, 1.6):
-                inside = np.linalg.inv(camera.to_ego) @ np.array([local[0], local[1], height, 1.0])
-                if inside[2] > 0.5:
-                    pixel = camera.intrinsic @ inside[:3] / inside[2] * factor
-                    ends.append((round(float(pixel[0])), round(float(pixel[1]))))
-            if len(ends) == 2:
-                cv2.line(picture, ends[0], ends[1], colour, 2, cv2.LINE_AA)
-                cv2.circle(picture, ends[0], 3, colour, -1, cv2.LINE_AA)
+                camera_point = np.linalg.inv(camera.to_ego) @ np.array([ego_point[0], ego_point[1], height, 1.0])
+                if camera_point[2] > 0.5:
+                    pixel = camera.intrinsic @ camera_point[:3] / camera_point[2] * factor
+                    stake_ends.append((round(float(pixel[0])), round(float(pixel[1]))))
+            if len(stake_ends) == 2:
+                cv2.line(picture, stake_ends[0], stake_ends[1], colour, 2, cv2.LINE_AA)
+                cv2.circle(picture, stake_ends[0], 3, colour, -1, cv2.LINE_AA)
     return picture
 
 
@@ -138,25 +140,25 @@ def _above(trace: EpisodeTrace, step: int, time: float, seen: Perceived, graph: 
     ego = np.array([trace.x[step, 0], trace.y[step, 0], trace.yaw[step, 0]], np.float64)
 
     def pixels(points: Any) -> Any:
-        local = to_local(ego, np.asarray(points, np.float64).reshape(-1, 2))
-        x = WIDTH / 2 - SCALE * local[:, 1]
-        y = TALL - SCALE * (local[:, 0] + BEHIND)
-        return np.rint(np.stack([x, y], 1)).astype(np.int32)
+        ego_points = to_local(ego, np.asarray(points, np.float64).reshape(-1, 2))
+        columns = WIDTH / 2 - SCALE * ego_points[:, 1]
+        rows = TALL - SCALE * (ego_points[:, 0] + BEHIND)
+        return np.rint(np.stack([columns, rows], 1)).astype(np.int32)
 
-    near = np.hypot(graph.xy[:, 0] - ego[0], graph.xy[:, 1] - ego[1]) < 90.0
+    is_near = np.hypot(graph.xy[:, 0] - ego[0], graph.xy[:, 1] - ego[1]) < 90.0
     for lane in range(graph.lanes):
-        part = slice(graph.offset[lane], graph.offset[lane + 1])
-        if near[part].any():
-            cv2.polylines(canvas, [pixels(graph.xy[part])], False, LANE, 2, cv2.LINE_AA)
-    view = in_view(trace, [step], seen.cameras)[0]
+        vertices = slice(graph.offset[lane], graph.offset[lane + 1])
+        if is_near[vertices].any():
+            cv2.polylines(canvas, [pixels(graph.xy[vertices])], False, LANE, 2, cv2.LINE_AA)
+    visible = in_view(trace, [step], seen.cameras)[0]
     for agent in np.flatnonzero(trace.active[step]):
-        colour = EGO if agent == 0 else THERE if view[agent] else UNSEEN
+        colour = EGO if agent == 0 else THERE if visible[agent] else UNSEEN
         pose = np.array([trace.x[step, agent], trace.y[step, agent], trace.yaw[step, agent]], np.float64)
         size = np.array([trace.length[agent], trace.width[agent]], np.float64)
         cv2.fillPoly(canvas, [pixels(_corners(pose, size))], colour, cv2.LINE_AA)
-    found, tracks = _at(seen.looks, time), _at(seen.known, time)
-    if found is not None:
-        for x, y in pixels(found.place).tolist():
+    detections, tracks = _at(seen.looks, time), _at(seen.known, time)
+    if detections is not None:
+        for x, y in pixels(detections.place).tolist():
             cv2.drawMarker(canvas, (x, y), FOUND, cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
     if tracks is not None:
         for mean, yaw, size in zip(tracks.mean, tracks.yaw, tracks.size, strict=True):
@@ -168,5 +170,5 @@ def _above(trace: EpisodeTrace, step: int, time: float, seen: Perceived, graph: 
 
 def _corners(pose: F64, size: F64) -> F64:
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    local = 0.5 * size * np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
-    return np.asarray(local @ np.array([[cos, sin], [-sin, cos]]) + pose[:2])
+    local_corners = 0.5 * size * np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+    return np.asarray(local_corners @ np.array([[cos, sin], [-sin, cos]]) + pose[:2])

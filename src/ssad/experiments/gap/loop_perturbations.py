@@ -1,4 +1,4 @@
-"""What suites of kind `gap` can do to a camera and to what it sees: faults, shifts, attacks, textures, lights."""
+"""Perturbations of cameras and scenes in suites of kind `gap`: faults, shifts, attacks, textures, lights."""
 
 from __future__ import annotations
 
@@ -70,12 +70,12 @@ def perturbation_names() -> Mapping[str, str]:
 
 
 def family_of(name: str) -> str:
-    """Family of a perturbation.
+    """Return the family of a perturbation.
 
     Raises:
-        UnknownNameError: There is no such perturbation.
+        UnknownNameError: Unknown perturbation.
         ConfigError: An attack cannot take so few steps.
-        FormatError: There is no exported light in its folder.
+        FormatError: The folder holds no exported light.
     """
     if name.startswith(FOUND):
         shining(name)
@@ -100,36 +100,40 @@ def method_of(name: str) -> tuple[str, dict[str, int]]:
 
 
 def has_severities(name: str) -> bool:
-    """Whether a perturbation has severities 1 to 5, or one alone."""
+    """Return True if a perturbation has severities 1 to 5."""
     return family_of(name) != TEXTURE and name not in (NIGHT, f"{SHINE}shadow") and not name.startswith(FOUND)
 
 
 def is_worn(name: str) -> bool:
-    """Whether a perturbation is on a car or on signs, so that drives without one are left out."""
+    """Return True if a perturbation is on a car or on signs, so that drives without one are left out."""
     return family_of(name) in (TEXTURE, LIGHT) and name != NIGHT
 
 
 def wearer(name: str, episode: Episode, graph: LaneGraph) -> int | None:
-    """Who wears a texture or is lit: the first agent besides the ego that is a car; None: nobody in this episode can.
+    """Return the agent that has a texture or is lit: the first car besides the ego; None without one.
 
     Args:
-        name: Of the perturbation.
+        name: Name of the perturbation.
         episode: The episode.
-        graph: Its town.
+        graph: Lane graph of its town.
 
     Returns:
-        Number of the agent; 0 where stop signs wear it.
+        Number of the agent; 0 if stop signs have the texture.
     """
     if _made_for(name) == SIGN:
         route = episode.agents[0].route
         return 0 if route is not None and len(signs_of_route(graph, route.xy)) else None
-    cars = (k for k, one in enumerate(episode.agents) if k and MODELS[one.model].kind == AgentKind.CAR)
+    cars = (
+        agent_index
+        for agent_index, agent in enumerate(episode.agents)
+        if agent_index and MODELS[agent.model].kind == AgentKind.CAR
+    )
     return next(cars, None)
 
 
 @lru_cache(maxsize=256)
 def _made_for(name: str) -> str:
-    """Whom a perturbation is made for: car or stop_sign."""
+    """Return the class that a perturbation is made for: car or stop_sign."""
     name = name.removeprefix(WEAR)
     if name not in shipped_textures():
         return SIGN if name == GREY_SIGN else "car"
@@ -137,22 +141,22 @@ def _made_for(name: str) -> str:
 
 
 def signs_of_route(graph: LaneGraph, route: F32) -> F64:
-    """Where the stop signs stand that a way [N, 2] comes by, x, y [M, 2]."""
-    stop = graph.sign_xy[graph.sign_kind == SignKind.STOP].astype(np.float64).reshape(-1, 2)
-    away = np.linalg.norm(stop[:, None] - route[None], axis=-1).min(1)
-    beside: F64 = stop[away < BESIDE]
-    return beside
+    """Return the positions of the stop signs along a route [N, 2], x, y [M, 2]."""
+    sign_positions = graph.sign_xy[graph.sign_kind == SignKind.STOP].astype(np.float64).reshape(-1, 2)
+    route_distances = np.linalg.norm(sign_positions[:, None] - route[None], axis=-1).min(1)
+    nearby_signs: F64 = sign_positions[route_distances < BESIDE]
+    return nearby_signs
 
 
 def worn(name: str, agent: int, *, severity: int = 1, seed: int = 0) -> PhysicalAttack:
-    """What makes an agent wear the texture of a perturbation, or lights it, for `Onboard`.
+    """Return the edit that puts the texture or light of a perturbation on an agent, for `Onboard`.
 
     Args:
-        name: Of the perturbation: a light; a shipped texture; grey, grey-sign: a car, or the plate of a sign, painted
-            grey all over, the control.
-        agent: Who wears it; of no account where signs do.
-        severity: Of a light.
-        seed: Of a light.
+        name: Name of the perturbation: a light; a shipped texture; grey, grey-sign: a car, or the plate of a sign,
+            painted grey all over, the control.
+        agent: Number of the agent; ignored for signs.
+        severity: Severity of a light.
+        seed: Seed of a light.
     """
     if family_of(name) == LIGHT:
         light = shining(name, severity, seed)
@@ -164,24 +168,26 @@ def worn(name: str, agent: int, *, severity: int = 1, seed: int = 0) -> Physical
         surface = make_carrier("camouflage", {}).on(parse_target(target).mesh())
         return Print(torch.full((3, *surface.size), 0.5), "camouflage", {}, target).live(agent)
     texture, card = load_texture(name)
-    whole = Print(texture, card.carrier, card.options, card.target)
+    full_texture = Print(texture, card.carrier, card.options, card.target)
 
     def edit(mesh: Mesh) -> SceneEdit:
-        """As large as it was trained, or smaller where the car has no room for it."""
-        for share in SHARES:
-            sized = {key: share * value if key in ("width", "height") else value for key, value in card.options.items()}
+        """Apply the texture at its trained size, or smaller if the car has no room for it."""
+        for scale in SHARES:
+            scaled_options = {
+                key: scale * value if key in ("width", "height") else value for key, value in card.options.items()
+            }
             try:
-                return replace(whole, options=sized).edit(mesh)
+                return replace(full_texture, options=scaled_options).edit(mesh)
             except ConfigError:
-                if share == SHARES[-1]:
+                if scale == SHARES[-1]:
                     raise
         raise AssertionError
 
-    return replace(whole.live(agent), edit=edit)
+    return replace(full_texture.live(agent), edit=edit)
 
 
 def texture_version(name: str) -> str:
-    """Hash of the texture or of the exported light of a perturbation; "" of those that the code decides."""
+    """Return the hash of the texture or exported light of a perturbation; "" for those that the code decides."""
     if family_of(name) == LIGHT:
         return light_version(name)
     name = name.removeprefix(WEAR)
@@ -196,18 +202,18 @@ def _hash_of(texture: str) -> str:
 def perturbed(
     onboard: Onboard, cameras: Mapping[str, Camera], name: str, severity: int, *, detector: Any = None, seed: int = 0
 ) -> tuple[dict[str, Sensor], dict[str, Perturbation]]:
-    """Cameras under a perturbation, as `ssad.world.rollout.rollout` takes them.
+    """Return cameras under a perturbation, as `ssad.world.rollout.rollout` takes them.
 
     Args:
-        onboard: What makes cameras.
-        cameras: By the names of their sensors.
-        name: Of the perturbation.
+        onboard: Source of the cameras.
+        cameras: Cameras by the names of their sensors.
+        name: Name of the perturbation.
         severity: 1 to 5.
-        detector: What attacks are made against, and whose intrinsics they need.
-        seed: Of the weather.
+        detector: Detector that attacks are made against, and that decides whether they need intrinsics.
+        seed: Seed of the weather.
 
     Returns:
-        Sensors, and perturbations of their pictures, by name.
+        Sensors, and perturbations of their images, by name.
     """
     family = family_of(name)
     sensors: dict[str, Sensor] = dict(onboard.together(cameras))
@@ -221,8 +227,10 @@ def perturbed(
             method, options = method_of(name)
             attack = make_attack(method, **options)
             budget = Budget(px(RADII[severity - 1]))
-            at_once = AT_ONCE if onboard.device == "cpu" else AT_ONCE_GPU
+            batch_size = AT_ONCE if onboard.device == "cpu" else AT_ONCE_GPU
             if isinstance(attack, UniversalFit):
-                attack = universal(attack, detector, camera, budget, device=onboard.device, batch=at_once)
-            changes[channel] = LiveAttack(attack, budget, detector=detector, intrinsic=camera.intrinsic, batch=at_once)
+                attack = universal(attack, detector, camera, budget, device=onboard.device, batch=batch_size)
+            changes[channel] = LiveAttack(
+                attack, budget, detector=detector, intrinsic=camera.intrinsic, batch=batch_size
+            )
     return sensors, changes

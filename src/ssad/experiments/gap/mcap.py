@@ -38,7 +38,7 @@ Message = tuple[int, str, Any]  # ns, topic, message
 
 
 def need_mcap() -> None:
-    """ConfigError: the packages of the extra `view` are missing."""
+    """Raise ConfigError if the packages of the extra `view` are missing."""
     try:
         importlib.import_module("mcap_protobuf.writer")
         importlib.import_module("foxglove_schemas_protobuf.SceneUpdate_pb2")
@@ -73,15 +73,18 @@ def write_mcap(
     need_mcap()
     from mcap_protobuf.writer import Writer
 
-    told = [*_scene(trace, graph), *_from_above(trace, above), *(() if seen is None else _perceived(seen))]
+    messages = [*_scene(trace, graph), *_from_above(trace, above), *(() if seen is None else _perceived(seen))]
     with safeio.atomic_path(path) as temporary, temporary.open("wb") as file, Writer(file) as writer:
-        for number, (time, topic, message) in enumerate(sorted(told, key=lambda one: one[0])):
-            writer.write_message(topic, message, log_time=time, publish_time=time, sequence=number)
+        # Viewers expect log times in order; the sort is stable, so topics of one time keep theirs.
+        for sequence_number, (time, topic, message) in enumerate(
+            sorted(messages, key=lambda timed_message: timed_message[0])
+        ):
+            writer.write_message(topic, message, log_time=time, publish_time=time, sequence=sequence_number)
     return path
 
 
 def _new(name: str, time: int | None = None, **fields: Any) -> Any:
-    """A message of Foxglove's schemas."""
+    """Build a message of Foxglove's schemas."""
     message = getattr(importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)(**fields)
     if time is not None:
         message.timestamp.FromNanoseconds(time)
@@ -93,9 +96,9 @@ def _ns(seconds: float) -> int:
 
 
 def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
-    """Where everybody is at each step, the way that is planned, and once the map."""
+    """Yield the map once, and the poses of all agents and the plan at each step."""
     yield 0, "/map", _update("map", 0, lines=list(_lanes(graph)))
-    names = [f"{k} {name}" for k, name in enumerate(trace.names)]
+    names = [f"{agent_index} {name}" for agent_index, name in enumerate(trace.names)]
     for step in range(len(trace.x)):
         time = _ns(step * trace.dt)
         pose = np.stack([trace.x[step], trace.y[step], trace.yaw[step]], -1).astype(np.float64)
@@ -104,46 +107,52 @@ def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
         size = np.stack([trace.length[rows], trace.width[rows]], -1)
         kind = trace.kind[rows].astype(np.int64)
         cubes = _cubes("truth", pose[rows], size.astype(np.float64), kind)
-        yield time, "/truth", _update("truth", time, cubes=cubes, words={names[k]: "" for k in rows.tolist()})
+        yield (
+            time,
+            "/truth",
+            _update("truth", time, cubes=cubes, words={names[agent_index]: "" for agent_index in rows.tolist()}),
+        )
         route = trace.route.astype(np.float64)
-        first = int(np.hypot(*(route - pose[0, :2]).T).argmin())
-        gone = np.cumsum(np.concatenate([[0.0], np.hypot(*np.diff(route[first:], axis=0).T)]))
-        line = _line("plan", route[first:][gone <= AHEAD])
-        told = {name: f"{getattr(trace, name)[step]:.3f}" for name in ("throttle", "brake", "steer")}
-        yield time, "/plan", _update("plan", time, lines=[line], words=told)
+        # The plan begins where the ego is now, not where the route begins.
+        nearest_point = int(np.hypot(*(route - pose[0, :2]).T).argmin())
+        route_distance = np.cumsum(np.concatenate([[0.0], np.hypot(*np.diff(route[nearest_point:], axis=0).T)]))
+        line = _line("plan", route[nearest_point:][route_distance <= AHEAD])
+        controls = {name: f"{getattr(trace, name)[step]:.3f}" for name in ("throttle", "brake", "steer")}
+        yield time, "/plan", _update("plan", time, lines=[line], words=controls)
 
 
 def _perceived(seen: Seen) -> Iterator[Message]:
     """What the driver saw, found and believed."""
     name, camera = next(iter(seen.perceived.cameras.items()))
-    turn, place = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()
-    for when, picture in seen.shots:
-        time = _ns(when)
-        data = encode_jpeg(np.ascontiguousarray(picture), QUALITY, "420")
-        yield time, "/tf", _transform(time, EGO, name, place, turn)
-        yield time, "/camera", _new("CompressedImage", time, frame_id=name, data=data, format="jpeg")
+    camera_rotation, camera_position = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()
+    for seconds, image in seen.shots:
+        time = _ns(seconds)
+        jpeg = encode_jpeg(np.ascontiguousarray(image), QUALITY, "420")
+        yield time, "/tf", _transform(time, EGO, name, camera_position, camera_rotation)
+        yield time, "/camera", _new("CompressedImage", time, frame_id=name, data=jpeg, format="jpeg")
         yield time, "/camera/calibration", _calibration(time, name, camera)
-    for when, found in seen.perceived.looks:
-        if found is not None:
-            pose = np.column_stack([found.place, np.nan_to_num(found.yaw)])
-            cubes = _cubes("detections", pose, found.size, found.kind)
-            words = {f"score {k}": f"{score:.3f}" for k, score in enumerate(found.score.tolist())}
-            yield _ns(when), "/detections", _update("detections", _ns(when), cubes=cubes, words=words)
-    for when, tracks in seen.perceived.known:
+    for seconds, detections in seen.perceived.looks:
+        if detections is not None:
+            pose = np.column_stack([detections.place, np.nan_to_num(detections.yaw)])
+            cubes = _cubes("detections", pose, detections.size, detections.kind)
+            metadata = {f"score {row}": f"{score:.3f}" for row, score in enumerate(detections.score.tolist())}
+            yield _ns(seconds), "/detections", _update("detections", _ns(seconds), cubes=cubes, words=metadata)
+    for seconds, tracks in seen.perceived.known:
         cubes = _cubes("tracks", np.column_stack([tracks.mean[:, :2], tracks.yaw]), tracks.size, tracks.kind)
-        words = {f"track {k}": str(ident) for k, ident in enumerate(tracks.ident.tolist())}
-        yield _ns(when), "/tracks", _update("tracks", _ns(when), cubes=cubes, words=words)
+        metadata = {f"track {row}": str(track_id) for row, track_id in enumerate(tracks.ident.tolist())}
+        yield _ns(seconds), "/tracks", _update("tracks", _ns(seconds), cubes=cubes, words=metadata)
 
 
 def _from_above(trace: EpisodeTrace, pictures: Iterable[U8]) -> Iterator[Message]:
-    for step, picture in enumerate(pictures):
-        time, data = _ns(step * trace.dt), encode_jpeg(np.ascontiguousarray(picture), QUALITY, "420")
-        yield time, "/above", _new("CompressedImage", time, frame_id=ABOVE, data=data, format="jpeg")
+    for step, top_view in enumerate(pictures):
+        time, jpeg = _ns(step * trace.dt), encode_jpeg(np.ascontiguousarray(top_view), QUALITY, "420")
+        yield time, "/above", _new("CompressedImage", time, frame_id=ABOVE, data=jpeg, format="jpeg")
 
 
 def _update(name: str, time: int, *, words: dict[str, str] | None = None, **parts: Any) -> Any:
     """A scene in place of the one before under this name."""
     metadata = [_new("KeyValuePair", key=key, value=value) for key, value in (words or {}).items()]
+    # Viewers replace an entity by the next one with the same id.
     entity = _new("SceneEntity", time, frame_id=WORLD, id=name, metadata=metadata, **parts)
     return _new("SceneUpdate", entities=[entity])
 
@@ -154,23 +163,28 @@ def _colour(name: str) -> Any:
 
 
 def _cubes(name: str, pose: F64, size: F64, kind: Any) -> list[Any]:
-    """Upright boxes at x, y, yaw [N, 3], of lengths and widths [N, 2], as high as their kinds [N] usually are."""
-    found = []
-    turns = yaw_to_quaternion(pose[:, 2]).reshape(-1, 4)
-    for (x, y, _), (length, width), turn, one in zip(pose.tolist(), size.tolist(), turns, kind, strict=True):
-        height = float(SIZES[min(int(one), len(AgentKind) - 1), 2])
-        place = _new("Pose", position=_vector([x, y, 0.5 * height]), orientation=_quaternion(turn))
-        found.append(_new("CubePrimitive", pose=place, size=_vector([length, width, height]), color=_colour(name)))
-    return found
+    """Build upright boxes at x, y, yaw [N, 3], of lengths and widths [N, 2].
+
+    The heights are those usual for their kinds [N].
+    """
+    cubes = []
+    rotations = yaw_to_quaternion(pose[:, 2]).reshape(-1, 4)
+    for (x, y, _), (length, width), rotation, agent_kind in zip(
+        pose.tolist(), size.tolist(), rotations, kind, strict=True
+    ):
+        height = float(SIZES[min(int(agent_kind), len(AgentKind) - 1), 2])
+        cube_pose = _new("Pose", position=_vector([x, y, 0.5 * height]), orientation=_quaternion(rotation))
+        cubes.append(_new("CubePrimitive", pose=cube_pose, size=_vector([length, width, height]), color=_colour(name)))
+    return cubes
 
 
 def _line(name: str, points: F64, height: float = 0.05) -> Any:
-    places = [_new("Point3", x=x, y=y, z=height) for x, y in points.tolist()]
-    return _new("LinePrimitive", thickness=0.15, points=places, color=_colour(name), pose=_origin())
+    vertices = [_new("Point3", x=x, y=y, z=height) for x, y in points.tolist()]
+    return _new("LinePrimitive", thickness=0.15, points=vertices, color=_colour(name), pose=_origin())
 
 
 def _lanes(graph: LaneGraph) -> Iterator[Any]:
-    """The centre lines of what vehicles drive on."""
+    """Yield the centre lines of the driving lanes."""
     for lane in np.flatnonzero(graph.kind == LaneType.DRIVING).tolist():
         yield _line("map", graph.xy[graph.offset[lane] : graph.offset[lane + 1]].astype(np.float64), 0.0)
 
@@ -200,15 +214,15 @@ def _transform(time: int, parent: str, child: str, place: Sequence[float], turn:
 
 
 def _calibration(time: int, name: str, camera: Camera) -> Any:
-    lens = camera.intrinsic
-    projection = np.column_stack([lens, np.zeros(3)])
+    intrinsic = camera.intrinsic
+    projection = np.column_stack([intrinsic, np.zeros(3)])
     return _new(
         "CameraCalibration",
         time,
         frame_id=name,
         width=camera.width,
         height=camera.height,
-        K=lens.ravel().tolist(),
+        K=intrinsic.ravel().tolist(),
         P=projection.ravel().tolist(),
         R=np.eye(3).ravel().tolist(),
     )

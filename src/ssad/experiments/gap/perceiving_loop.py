@@ -1,4 +1,4 @@
-"""Perceiving systems in the closed loop, as plain data: made, and driven with perturbed cameras under observation."""
+"""Perceiving systems in the closed loop: built from plain data, driven with perturbed cameras, and observed."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
 
 
 class PerceivingSystem(Schema):
-    """A perceiving system of a suite.
+    """Perceiving system of a suite.
 
     Attributes:
-        name: what tables call it.
-        detector: `ssad list detectors`; truth: a perfect detector, which is told the truth.
+        name: name in tables.
+        detector: `ssad list detectors`; truth: a perfect detector, which is given the truth.
         weights: a file of weights; none: the shipped ones.
-        cameras: of the nuScenes rig.
-        width: of their pictures, pixels.
+        cameras: cameras of the nuScenes rig.
+        width: width of their images, pixels.
         input_width: width to which a 3D detector resizes them; none: its own.
-        rate: looks a second.
-        latency: s from a picture to its detections.
-        confirm: hits from which an object is believed (H).
-        reserve: looks without a hit that it stays believed for (R).
+        rate: images a second.
+        latency: time from an image to its detections, s.
+        confirm: hits after which an object is believed (H).
+        reserve: images without a hit after which it is dropped (R).
         high, low: scores of the tracker's two stages; none: those that suit the detector.
-        reads_signs: whether it knows of stop signs only what its detector reads; else those of the map.
-        sign_memory: s that a sign is remembered after it was last read; none: until it has been passed.
-        missed, burst, noise, phantoms: how a perfect detector fails (`ssad.drivers.perceiving.eyes.PerfectEyes`).
+        reads_signs: true: stop signs are read by the detector; false: they are known from the map.
+        sign_memory: time that a sign is remembered after its last reading, s; none: until it has been passed.
+        missed, burst, noise, phantoms: errors of a perfect detector (`ssad.drivers.perceiving.eyes.PerfectEyes`).
     """
 
     name: str = Field(min_length=1)
@@ -77,16 +77,20 @@ class PerceivingSystem(Schema):
 
     @property
     def perfect(self) -> bool:
-        """Whether it is told the truth."""
+        """True if the detector is given the truth."""
         return self.detector == "truth"
 
     @property
     def tracking(self) -> Tracking:
-        """Settings of the tracker, with the scores that suit the detector unless others are said."""
+        """Settings of the tracker, with the scores that suit the detector unless the suite sets them."""
         return tracking_of(self.detector, high=self.high, low=self.low, confirm=self.confirm, reserve=self.reserve)
 
     def check(self) -> None:
-        """ConfigError: scores cross, settings of stop signs do not fit, or its detector knows no stop signs."""
+        """Validate the settings.
+
+        Raises:
+            ConfigError: Scores cross, settings of stop signs do not fit, or the detector knows no stop signs.
+        """
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ConfigError(f"system {self.name}: low {self.low:g} is above high {self.high:g}")
         if self.sign_memory is not None and not self.reads_signs:
@@ -104,7 +108,13 @@ class PerceivingSystem(Schema):
         repair: Repair | None = None,
         device: str = "cpu",
     ) -> Perceiving:
-        """The driver, its detector on a device; `watch` is told what it sees, `repair` mends one error of it."""
+        """Build the driver.
+
+        Args:
+            watch: Called with everything that the driver perceives.
+            repair: Corrects one kind of error of its perception.
+            device: Device of the detector.
+        """
         cameras, tracking = front(self.width, self.cameras), self.tracking
         eyes: CameraEyes | PerfectEyes
         if self.perfect:
@@ -112,10 +122,18 @@ class PerceivingSystem(Schema):
         else:
             detector = _detector(self.detector, self.weights, self.input_width, device)
             eyes = CameraEyes(detector, cameras, threshold=tracking.low, device=device)
-        memory = float("inf") if self.sign_memory is None else self.sign_memory
-        signs = SignReading(confirm=self.confirm, memory=memory, score=tracking.high) if self.reads_signs else None
+        memory_seconds = float("inf") if self.sign_memory is None else self.sign_memory
+        sign_reading = (
+            SignReading(confirm=self.confirm, memory=memory_seconds, score=tracking.high) if self.reads_signs else None
+        )
         return Perceiving(
-            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair, signs=signs
+            eyes,
+            rate=self.rate,
+            latency=self.latency,
+            tracking=tracking,
+            watch=watch,
+            repair=repair,
+            signs=sign_reading,
         )
 
 
@@ -140,16 +158,16 @@ def drive_perceiving(
     spec = orders[0].spec
     if spec["settings"] is None:
         return *drive(orders, device=device, key=_paired)[:2], None
-    own = PerceivingSystem.model_validate(spec["settings"])
-    watcher = Watcher(front(own.width, own.cameras), len(orders), every)
-    driver = own.make(watcher, repair=repair, device=device)
+    system = PerceivingSystem.model_validate(spec["settings"])
+    watcher = Watcher(front(system.width, system.cameras), len(orders), every)
+    driver = system.make(watcher, repair=repair, device=device)
     name, severity = spec["perturbation"], spec["severity"]
-    attack = worn(name, spec["wearer"], severity=severity, seed=seed) if "wearer" in spec else None
+    agent_edit = worn(name, spec["wearer"], severity=severity, seed=seed) if "wearer" in spec else None
     weather = at_hour(DAY, hour_of(name)) if family_of(name) == LIGHT else DAY
-    onboard = Onboard(weather=weather, device=device, resident=True, attack=attack)
+    onboard = Onboard(weather=weather, device=device, resident=True, attack=agent_edit)
     sensors, changes = perturbed(onboard, driver.cameras, name, severity, detector=driver.detector, seed=seed)
-    found = drive(orders, device=device, key=_paired, driver=driver, sensors=sensors, perturbation=changes)
-    return *found[:2], watcher
+    driven = drive(orders, device=device, key=_paired, driver=driver, sensors=sensors, perturbation=changes)
+    return *driven[:2], watcher
 
 
 def drive_repaired(
@@ -166,18 +184,22 @@ def drive_repaired(
     Returns:
         By the drive's number: whether there is a collision now, and whether with the same agent.
     """
-    first = {k: np.flatnonzero(trace.contact_agent > 0) for k, trace in enumerate(traces)}
-    hit = {k: int(traces[k].contact_agent[steps[0]]) for k, steps in first.items() if len(steps)}
-    if not hit:
+    contacts = {index: np.flatnonzero(trace.contact_agent > 0) for index, trace in enumerate(traces)}
+    struck_agents = {
+        index: int(traces[index].contact_agent[steps[0]]) for index, steps in contacts.items() if len(steps)
+    }
+    if not struck_agents:
         return {}
-    repair = Repair(dict(enumerate(hit.values())))
-    _, again, _ = drive_perceiving([orders[k] for k in hit], device=device, seed=seed, repair=repair, every=None)
+    repair = Repair(dict(enumerate(struck_agents.values())))
+    _, repaired_traces, _ = drive_perceiving(
+        [orders[index] for index in struck_agents], device=device, seed=seed, repair=repair, every=None
+    )
     return {
-        k: {
-            "collision": bool(episode_metrics(one, stop_signs=False).collision),
-            "same": bool((one.contact_agent == agent).any()),
+        index: {
+            "collision": bool(episode_metrics(repaired_trace, stop_signs=False).collision),
+            "same": bool((repaired_trace.contact_agent == agent).any()),
         }
-        for (k, agent), one in zip(hit.items(), again, strict=True)
+        for (index, agent), repaired_trace in zip(struck_agents.items(), repaired_traces, strict=True)
     }
 
 
@@ -188,7 +210,7 @@ def _paired(order: Order) -> str:
 
 @lru_cache(maxsize=4)
 def _detector(name: str, weights: str | None, width: int | None, device: str = "cpu") -> Any:
-    """A detector, made once a process."""
+    """Return a detector, built once per process."""
     from ssad.detectors import make_detector
 
     options: dict[str, Any] = {} if width is None else {"input_width": width}

@@ -30,69 +30,77 @@ _FOUND: dict[tuple[object, ...], Universal] = {}
 def universal(
     fit: UniversalFit, detector: Detector, camera: Camera, budget: Budget, *, device: str, batch: int
 ) -> Universal:
-    """The attack that adds the change that was found for a detector and a camera; found once a process.
+    """Return the attack that adds the change fitted for a detector and a camera; fitted once per process.
 
-    What the detector finds in the clean pictures is taken for the truth, as in `LiveAttack`.
+    The detections in the clean images serve as the truth, as in `LiveAttack`.
 
     Args:
-        fit: How it is found.
-        detector: Who is attacked.
-        camera: Whose pictures.
-        budget: How far each picture may be moved.
-        device: Where pictures are rendered and the detector is.
-        batch: Pictures at once; it changes no result.
+        fit: Settings of the fit.
+        detector: The attacked detector.
+        camera: The camera.
+        budget: Maximum change of each image.
+        device: Device of renderer and detector.
+        batch: Images at once; it changes no result.
 
     Raises:
-        ConfigError: The detector finds nothing in any of the pictures.
+        ConfigError: The detector finds nothing in any of the images.
     """
-    who = state_hash(detector) or id(detector)
-    key = (fit, who, camera.channel, camera.width, camera.intrinsic.tobytes(), budget, device)
-    if key not in _FOUND:
-        pictures = pictures_of_other_drives(camera, fit.frames, device)
-        lens = torch.from_numpy(camera.intrinsic).float().to(pictures.device) if detector.task == "3d" else None
+    detector_key = state_hash(detector) or id(detector)
+    cache_key = (fit, detector_key, camera.channel, camera.width, camera.intrinsic.tobytes(), budget, device)
+    if cache_key not in _FOUND:
+        clean_images = pictures_of_other_drives(camera, fit.frames, device)
+        intrinsic = (
+            torch.from_numpy(camera.intrinsic).float().to(clean_images.device) if detector.task == "3d" else None
+        )
         victims = []
         with steady(detector):
-            for part in torch.split(pictures, batch):
-                own = None if lens is None else lens.expand(len(part), 3, 3).contiguous()
-                truth = own_truth(detector, part, own)
-                if not any(len(one.label) for one in truth):
+            for image_batch in torch.split(clean_images, batch):
+                intrinsic_batch = None if intrinsic is None else intrinsic.expand(len(image_batch), 3, 3).contiguous()
+                truth = own_truth(detector, image_batch, intrinsic_batch)
+                if not any(len(image_truth.label) for image_truth in truth):
                     continue
                 try:
-                    victims.append(Victim(detector, part, truth, make_objective(LOSS), intrinsic=own))
+                    victims.append(
+                        Victim(detector, image_batch, truth, make_objective(LOSS), intrinsic=intrinsic_batch)
+                    )
                 except NothingToAttackError:
                     continue
         if not victims:
             raise ConfigError(f"attack universal: {detector.name} finds nothing in pictures of other drives")
-        _FOUND[key] = fit.fit(victims, budget)
-    return _FOUND[key]
+        _FOUND[cache_key] = fit.fit(victims, budget)
+    return _FOUND[cache_key]
 
 
 @lru_cache(maxsize=1)
 def _drives() -> list[tuple[EpisodeTrace, LaneGraph]]:
-    """Traces of the Autopilot in drives of other towns, with their towns."""
+    """Return traces of the Autopilot in drives of other towns, with their towns."""
     from ssad.drivers import make_system
     from ssad.scenarios.dynamic import build_episode, load_scenarios
     from ssad.simulators.closed_loop import town
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
-    natural = [one for one in load_scenarios(OTHERS) if one.type == "NaturalJunction"]
-    chosen = natural[:: len(natural) // DRIVES][:DRIVES]
-    found = []
-    for scenario in chosen:
+    natural_scenarios = [
+        scenario_candidate
+        for scenario_candidate in load_scenarios(OTHERS)
+        if scenario_candidate.type == "NaturalJunction"
+    ]
+    selected = natural_scenarios[:: len(natural_scenarios) // DRIVES][:DRIVES]
+    traces = []
+    for scenario in selected:
         graph = town(scenario.town)
         world = World([build_episode(scenario, graph, seed=0)], {graph.name: graph})
-        found += [(trace, graph) for trace in rollout(world, make_system("autopilot"))]
-    return found
+        traces += [(trace, graph) for trace in rollout(world, make_system("autopilot"))]
+    return traces
 
 
 def pictures_of_other_drives(camera: Camera, count: int, device: str) -> torch.Tensor:
-    """Pictures [count, 3, H, W] in [0, 1], spread evenly over some drives."""
-    onboard = Onboard(device=device).camera(camera)
-    shown = []
-    for k, (trace, graph) in enumerate(_drives()):
-        share = count * (k + 1) // DRIVES - count * k // DRIVES
-        steps = np.linspace(0, len(trace.x) - 1, share + 2).round().astype(int).tolist()[1:-1]
-        shown.append(onboard.of_trace(trace, graph, steps=steps))
-    where = torch.device("cuda" if device != "cpu" else "cpu")
-    return torch.from_numpy(np.concatenate(shown)).to(where).float() / LEVELS
+    """Return images [count, 3, H, W] in [0, 1], spread evenly over some drives."""
+    onboard_camera = Onboard(device=device).camera(camera)
+    image_parts = []
+    for index, (trace, graph) in enumerate(_drives()):
+        drive_count = count * (index + 1) // DRIVES - count * index // DRIVES
+        steps = np.linspace(0, len(trace.x) - 1, drive_count + 2).round().astype(int).tolist()[1:-1]
+        image_parts.append(onboard_camera.of_trace(trace, graph, steps=steps))
+    image_device = torch.device("cuda" if device != "cpu" else "cpu")
+    return torch.from_numpy(np.concatenate(image_parts)).to(image_device).float() / LEVELS

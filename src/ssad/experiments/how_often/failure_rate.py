@@ -1,4 +1,4 @@
-"""How often a driving system fails in an episode whose traffic has chance in it, by several estimators."""
+"""Failure probability of a driving system in an episode with random traffic, by several estimators."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ Crash = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ChanceEpisode:
-    """An episode with chance in its traffic, and who drives it.
+    """Episode with random traffic, and its driver.
 
     Attributes:
-        episode: Where, who and when.
-        graph: Its town.
-        driver: The system under test, which remembers nothing.
+        episode: The episode.
+        graph: Lane graph of its town.
+        driver: The system under test, which must be memoryless.
         noise: Fields of `ssad.world.noise.Noise`.
-        device: Where the world computes.
-        seed: Of the random numbers.
+        device: Device of the world.
+        seed: Seed of the random numbers.
     """
 
     episode: Episode
@@ -48,8 +48,8 @@ class ChanceEpisode:
         graphs = {self.episode.town: self.graph}
         if keys:
             return Told([self.episode], graphs, keys=keys, means=means, device=self.device, noise=noise)
-        order = np.zeros(rows, np.int64)
-        return World([self.episode], graphs, assign=order, device=self.device, noise=noise)
+        assignment = np.zeros(rows, np.int64)
+        return World([self.episode], graphs, assign=assignment, device=self.device, noise=noise)
 
     def process(self, rows: int) -> Any:
         """So many copies with their driver, as the estimators take them.
@@ -84,50 +84,55 @@ class ChanceEpisode:
     def estimate(
         self, method: Method, *, episodes: int, particles: int, repeats: int, components: int, batch: int
     ) -> tuple[dict[str, Any], Crash | None]:
-        """The probability of a collision.
+        """Estimate the probability of a collision.
 
         Args:
             method: The estimator.
-            episodes: Of Monte Carlo, and of importance sampling after it has learned.
-            particles: Of each repeat of splitting, and of the splitting that a proposal is first learned from.
-            repeats: Of splitting.
-            components: Of the learned proposal.
+            episodes: Episodes of Monte Carlo, and of importance sampling after its learning phase.
+            particles: Particles of each repeat of splitting, and of the splitting that a proposal is first learned
+                from.
+            repeats: Repeats of splitting.
+            components: Components of the learned proposal.
             batch: Episodes side by side.
 
         Returns:
-            Metrics, and the likeliest collision that was found.
+            Metrics, and the likeliest sampled collision.
         """
         from ssad.world.rare.brute import monte_carlo
         from ssad.world.rare.importance import importance, learn
         from ssad.world.rare.splitting import keys_of, splitting
 
-        random = generator("how often", self.seed)
-        crash: dict[str, Any] | None = None
+        rng = generator("how often", self.seed)
+        collision: dict[str, Any] | None = None
         if method == "splitting":
             process = self.process(particles * repeats)
-            branched = splitting(process, random, repeats=repeats)
-            found = branched.estimate()
-            if branched.failed.any():
-                row = int(np.flatnonzero(branched.failed)[0])
-                crash = {"keys": {str(step): str(key) for step, key in keys_of(branched, row).items()}, "means": []}
+            splitting_result = splitting(process, rng, repeats=repeats)
+            found = splitting_result.estimate()
+            if splitting_result.failed.any():
+                row = int(np.flatnonzero(splitting_result.failed)[0])
+                collision = {
+                    "keys": {str(step): str(key) for step, key in keys_of(splitting_result, row).items()},
+                    "means": [],
+                }
         elif method == "importance":
             process = self.process(particles)
-            proposal = learn(process, random, components=components, episodes=episodes // 4)
+            proposal = learn(process, rng, components=components, episodes=episodes // 4)
             training = process.work()
             process = self.process(batch)
-            found, drawn = importance(process, proposal, random, episodes=episodes, training=training)
-            if drawn.failed.any():
-                row = int(np.argmax(np.where(drawn.failed, drawn.weight, 0.0)))
-                part = int(drawn.component[row])
-                means = proposal.means[part - 1].tolist() if part else []
-                crash = {"keys": {"0": str(int(drawn.keys[row]))}, "means": means}
+            found, importance_samples = importance(process, proposal, rng, episodes=episodes, training=training)
+            if importance_samples.failed.any():
+                # A large weight means that the failure is likely in the real traffic, not only in the proposal.
+                row = int(np.argmax(np.where(importance_samples.failed, importance_samples.weight, 0.0)))
+                component = int(importance_samples.component[row])
+                means = proposal.means[component - 1].tolist() if component else []
+                collision = {"keys": {"0": str(int(importance_samples.keys[row]))}, "means": means}
         else:
             process = self.process(batch)
-            *_, (found, keys) = monte_carlo(process, random, episodes=episodes)
+            *_, (found, keys) = monte_carlo(process, rng, episodes=episodes)
             if len(keys):
-                crash = {"keys": {"0": str(int(keys[0]))}, "means": []}
-        hours, km = self.usual()
-        driven = found.work * process.world.dt / 3600.0 / process.world.agents
+                collision = {"keys": {"0": str(int(keys[0]))}, "means": []}
+        duration_hours, distance_km = self.usual()
+        driven_hours = found.work * process.world.dt / 3600.0 / process.world.agents
         metrics = {
             "per_million": 1e6 * found.probability,
             "low": 1e6 * found.low,
@@ -137,9 +142,9 @@ class ChanceEpisode:
             "episodes": found.episodes,
             "work": found.work / 1e6,
             "training": found.training / 1e6,
-            "hours": driven,
-            "km": driven * km / hours,
-            "per_hour": 1e3 * found.probability / hours,
-            "per_km": 1e3 * found.probability / km,
+            "hours": driven_hours,
+            "km": driven_hours * distance_km / duration_hours,
+            "per_hour": 1e3 * found.probability / duration_hours,
+            "per_km": 1e3 * found.probability / distance_km,
         }
-        return metrics, crash
+        return metrics, collision

@@ -1,6 +1,6 @@
-"""What detectors find in one scene under one condition, kept as files: the work that cells of a suite share.
+"""Detections in one scene under one condition, stored as files: the work that cells of a suite share.
 
-A condition is what the pictures went through: nothing, a shift, a digital attack.
+A condition is the treatment of the images: none, a shift, or a digital attack.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ _COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label", "at
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """What is the same for all scenes of a run.
+    """Settings shared by all scenes of a run.
 
     Attributes:
         folder: of the results.
         root, version: of the data set.
         detectors: name -> weights ("" for the shipped ones).
         seed: of the random numbers.
-        device: where detectors, shifts and attacks run.
+        device: device of detectors, shifts and attacks.
         threads: of linear algebra.
         calibration: of the shifts.
-        defended: systems that are a detector behind a defence: name -> the detector's name and the defence. All other
-            systems are detectors.
+        defended: systems that are a detector behind a defence: name -> the detector's name and the defence. All
+            other systems are detectors.
     """
 
     folder: Path
@@ -80,14 +80,14 @@ class Examination:
 
 @dataclass(slots=True)
 class Shown:
-    """How detectors are shown a scene.
+    """Presentation of a scene to detectors.
 
     Attributes:
-        look: gives the pictures of camera frames; None: the files as they are.
-        notes: plain data for the file of boxes, complete when all was looked at.
-        ahead: the next pictures may be made while a detector looks at these.
-        at_once: samples that a GPU is shown at once.
-        done: is called when the boxes are written.
+        look: returns the images of camera frames; None: the unmodified files.
+        notes: plain data for the file of boxes, complete after the last image.
+        ahead: whether the next images may be made while a detector processes these.
+        at_once: samples per call on a GPU.
+        done: called when the boxes are written.
     """
 
     look: Look | None = None
@@ -102,7 +102,7 @@ class Condition(Protocol):
 
     Attributes:
         scene: name of the scene.
-        name: its place below the folder of a detector's boxes: CONDITION/SCENE.
+        name: place of its boxes below the folder of a detector: CONDITION/SCENE.
     """
 
     @property
@@ -111,10 +111,10 @@ class Condition(Protocol):
 
     @property
     def name(self) -> str:
-        """Its place below the folder of a detector's boxes: CONDITION/SCENE."""
+        """Place of its boxes below the folder of a detector: CONDITION/SCENE."""
 
     def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
-        """How these detectors are shown the scene."""
+        """Return the presentation of the scene to these detectors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,51 +127,52 @@ class ShiftedScene:
 
     @property
     def name(self) -> str:
-        """See `Condition`."""
+        """Place of the boxes of this shift, severity and scene below the folder of a detector."""
         return f"{'clean' if self.shift is None else f'{self.shift}-{self.severity}'}/{self.scene}"
 
     def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
-        """See `Condition`: all detectors are shown the same pictures; noted is how often the shift was applied."""
+        """Return the shifted images, the same for all detectors, and note how often the shift was applied."""
         shifter = shifter_of(examination, data, self)
         if shifter is None:
             return Shown()
-        applied: Counter[str] = Counter()
+        applied_counts: Counter[str] = Counter()
 
         def look(frames: Sequence[SensorFrame]) -> Sequence[U8]:
             device = None if examination.device == "cpu" else examination.device
-            images, done = shifter.images(frames, device=device)
-            applied.update("applied" if one.applied else "not applied" for one in done)
-            for one in done:
-                applied.update({f"skipped: {why}": int(count) for why, count in one.skipped.items()})
+            images, reports = shifter.images(frames, device=device)
+            applied_counts.update("applied" if report.applied else "not applied" for report in reports)
+            for report in reports:
+                applied_counts.update({f"skipped: {reason}": int(count) for reason, count in report.skipped.items()})
             return images
 
-        return Shown(look, lambda: applied)
+        return Shown(look, lambda: applied_counts)
 
 
 def detector_of(name: str, weights: str, device: str) -> Any:
-    """A detector by name (what follows an @ is a label of the suite's own) and weights."""
+    """Return a detector by name (a part after @ is a label of the suite's own) and weights."""
     return make_detector(name, weights=weights or None, device=device)
 
 
 def boxes_path(folder: Path, detector: str, scene: Condition) -> Path:
-    """Where the boxes of a detector lie: detections/DETECTOR/CONDITION/SCENE.npz."""
+    """Return the path of the boxes of a detector: detections/DETECTOR/CONDITION/SCENE.npz."""
     return folder / FOLDER / file_name(detector) / f"{scene.name}.npz"
 
 
 def file_name(name: str) -> str:
     """A name as a file's: what is no letter, digit, ., @ or - becomes -, and then a hash keeps names apart."""
-    plain = re.sub(r"[^\w.@-]", "-", name)
-    return plain if plain == name else f"{plain}-{digest(name)[:6]}"
+    safe_name = re.sub(r"[^\w.@-]", "-", name)
+    # The hash keeps names apart that differ only in replaced characters.
+    return safe_name if safe_name == name else f"{safe_name}-{digest(name)[:6]}"
 
 
 class Watched:
-    """A detector whose failure is a result: once it has raised, or broken a promise, it finds nothing more.
+    """Detector whose failure is a result: after an error or a broken promise it returns no more detections.
 
-    Memory that is used up and a device that is lost are raised. What it finds is on the host.
+    Exhausted memory and a lost device are raised. Detections are on the host.
 
     Attributes:
         name: of the system.
-        reason: why it failed, in one line; "" while it works.
+        reason: reason of its failure, in one line; "" while it works.
     """
 
     def __init__(self, detector: Any, name: str = "") -> None:
@@ -179,34 +180,40 @@ class Watched:
 
     @property
     def task(self) -> str:
-        """That of the detector."""
+        """Task of the detector."""
         return str(getattr(self.detector, "task", "3d"))
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Those of the detector."""
+        """Classes of the detector."""
         return tuple(self.detector.classes)
 
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
-        """As the detector, or nothing."""
+        """Return the detector's predictions, or empty ones after a failure."""
         if not self.reason:
             try:
-                found = to_host(self.detector.predict(images, intrinsic, threshold=threshold))
-                self.reason = self._broken(found, len(images))
+                detections = to_host(self.detector.predict(images, intrinsic, threshold=threshold))
+                self.reason = self._broken(detections, len(images))
                 if not self.reason:
-                    return found
+                    return detections
             except Exception as error:  # whatever a stranger's detector raises
                 self.failed(error)
-        nothing, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
+        empty_floats, empty_integers = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
         solid = None
         if self.task != "2d":
-            solid = Solids(nothing.reshape(0, 3), nothing.reshape(0, 3), nothing, nothing.reshape(0, 2), whole)
-        return [Detections(nothing, whole, nothing.reshape(0, 4), solid)] * len(images)
+            solid = Solids(
+                empty_floats.reshape(0, 3),
+                empty_floats.reshape(0, 3),
+                empty_floats,
+                empty_floats.reshape(0, 2),
+                empty_integers,
+            )
+        return [Detections(empty_floats, empty_integers, empty_floats.reshape(0, 4), solid)] * len(images)
 
     def failed(self, error: Exception) -> None:
-        """Takes note of what the detector raised; raises it if memory is used up or the device is lost."""
+        """Record an error of the detector; raise it if memory is exhausted or the device is lost."""
         if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA error" in str(error):
             raise error
         text = " ".join(str(error).split())
@@ -215,9 +222,9 @@ class Watched:
     def _broken(self, found: Sequence[Detections], images: int) -> str:
         if len(found) != images:
             return "broken promise: predict answers for each image"
-        for one in found:
-            for kept, promise in promises(one, classes=len(self.detector.classes), three=self.task != "2d"):
-                if not kept:
+        for single in found:
+            for is_kept, promise in promises(single, classes=len(self.detector.classes), three=self.task != "2d"):
+                if not is_kept:
                     return f"broken promise: {promise}"
         return ""
 
@@ -232,15 +239,15 @@ def _loaded(name: str, weights: str, device: str, threads: int) -> Any:
 
 
 def system_of(examination: Examination, name: str) -> Any:
-    """A system of a run by name: a detector, or one behind a defence; a detector is loaded once.
+    """Return a system of a run by name: a detector, or one behind a defence; a detector is loaded once.
 
     Args:
         examination: of the run.
         name: of the system.
     """
-    bare, defence = examination.defended.get(name, (name, None))
-    weights = dict(examination.detectors)[bare]
-    detector = _loaded(bare, weights, examination.device, examination.threads)
+    detector_name, defence = examination.defended.get(name, (name, None))
+    weights = dict(examination.detectors)[detector_name]
+    detector = _loaded(detector_name, weights, examination.device, examination.threads)
     return detector if defence is None else Defended(detector, defence)
 
 
@@ -248,41 +255,47 @@ def shifter_of(examination: Examination, data: NuScenes, scene: ShiftedScene) ->
     """The scene through its shift; None for the clean one."""
     if scene.shift is None:
         return None
-    drawn = scene.severity == "random"
-    severity = 1 if drawn else int(scene.severity)
+    is_random = scene.severity == "random"
+    severity = 1 if is_random else int(scene.severity)
     spec = ShiftSpec(scene.shift, severity, seed=examination.seed, calibration=examination.calibration)
-    return SceneShifter(examination.root, data.scene(scene.scene), spec, random=drawn)
+    return SceneShifter(examination.root, data.scene(scene.scene), spec, random=is_random)
 
 
 def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[str]) -> None:
-    """Writes the boxes that detectors find in a scene, unless they are there.
+    """Write the boxes that detectors find in a scene, unless the files exist.
 
-    A detector that raises, or breaks a promise, leaves the reason in place of its boxes. Memory that is used up, and a
-    device that is lost, raise.
+    The file of a detector that fails, or breaks a promise, contains the reason instead of boxes. Exhausted memory
+    and a lost device are raised.
 
     Raises:
         SSADError: the data are broken.
     """
     folder = examination.folder
-    names = [name for name in detectors if not boxes_path(folder, name, scene).is_file()]
-    if not names:
+    missing_names = [name for name in detectors if not boxes_path(folder, name, scene).is_file()]
+    if not missing_names:
         return
-    with NuScenes(examination.root, examination.version) as data:
-        watched = [Watched(system_of(examination, name), name) for name in names]
-        shown = scene.shown(examination, data, watched)
-        eyes: list[Any] = list(watched)
-        found = detect_with(
-            eyes,
+    with NuScenes(examination.root, examination.version) as dataset:
+        monitored = [Watched(system_of(examination, name), name) for name in missing_names]
+        presentation = scene.shown(examination, dataset, monitored)
+        detector_objects: list[Any] = list(monitored)
+        boxes_by_detector = detect_with(
+            detector_objects,
             examination.root,
-            data.scene(scene.scene),
+            dataset.scene(scene.scene),
             device=examination.device,
-            look=shown.look,
-            ahead=shown.ahead,
-            at_once=shown.at_once,
+            look=presentation.look,
+            ahead=presentation.ahead,
+            at_once=presentation.at_once,
         )
-    for name, samples, one in zip(names, found, watched, strict=True):
-        _write(boxes_path(folder, name, scene), samples, one.reason, shown.notes(), flat=one.task == "2d")
-    shown.done()
+    for name, samples, monitored_detector in zip(missing_names, boxes_by_detector, monitored, strict=True):
+        _write(
+            boxes_path(folder, name, scene),
+            samples,
+            monitored_detector.reason,
+            presentation.notes(),
+            flat=monitored_detector.task == "2d",
+        )
+    presentation.done()
 
 
 def _write(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, Any], *, flat: bool) -> None:
@@ -290,57 +303,63 @@ def _write(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, 
     if not reason:
         boxes = [sample.boxes for sample in samples]
         columns["sample"] = np.array([sample.token for sample in samples])
-        columns["count"] = np.array([len(b) for b in boxes], np.int32)
+        columns["count"] = np.array([len(sample_boxes) for sample_boxes in boxes], np.int32)
         for name in _FLAT if flat else ():
-            columns[name] = np.concatenate([getattr(one, name) for one in boxes])
-        for name, parts in () if flat else zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True):
-            columns[name] = np.concatenate(parts)
+            columns[name] = np.concatenate([getattr(boxes_2d, name) for boxes_2d in boxes])
+        for name, column_parts in (
+            () if flat else zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True)
+        ):
+            columns[name] = np.concatenate(column_parts)
         columns["applied"] = np.array(safeio.dump_json(dict(sorted(notes.items()))))
-    file = io.BytesIO()
-    np.savez_compressed(file, **columns)
-    safeio.write_atomic(path, file.getvalue())
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **columns)
+    safeio.write_atomic(path, buffer.getvalue())
 
 
 def _to_columns(boxes: DetectedBoxes) -> tuple[Any, ...]:
-    """What a file holds of the boxes of a sample."""
-    names = np.array(boxes.attribute, "U40")
-    return boxes.centre, boxes.size_wlh, boxes.rotation, boxes.velocity, boxes.score, boxes.label, names
+    """Return the columns of a file for the boxes of a sample."""
+    attribute_names = np.array(boxes.attribute, "U40")
+    return boxes.centre, boxes.size_wlh, boxes.rotation, boxes.velocity, boxes.score, boxes.label, attribute_names
 
 
 def _from_columns(translation: Any, size_wlh: Any, *others: Any) -> DetectedBoxes:
-    """The boxes of a sample from a file's columns."""
-    rotation, velocity, score, label, names = others
+    """Return the boxes of a sample from a file's columns."""
+    rotation, velocity, score, label, attribute_names = others
     size_lwh = size_wlh[:, size_columns("wlh", "lwh")]
-    return DetectedBoxes(translation, size_lwh, rotation, velocity, score, label, tuple(map(str, names)))
+    return DetectedBoxes(translation, size_lwh, rotation, velocity, score, label, tuple(map(str, attribute_names)))
 
 
 class DetectorFailed(SSADError):
-    """A detector failed on a scene; why."""
+    """Failure of a detector on a scene, with its reason."""
 
 
 def read_boxes(path: Path) -> tuple[list[Any], dict[str, Any]]:
-    """Boxes by sample (`SampleBoxes`, or `SamplePictures` of a 2D detector), and what the condition noted.
+    """Read boxes by sample (`SampleBoxes`, or `SamplePictures` of a 2D detector), and the notes of the condition.
 
     Raises:
-        DetectorFailed: it has a reason instead.
-        FormatError: a broken file.
+        DetectorFailed: the file holds a reason instead.
+        FormatError: the file is broken.
     """
     try:
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            if "failed" in file:
-                raise DetectorFailed(str(file["failed"]))
-            ends = np.cumsum(file["count"])
-            flat = "camera" in file
-            parts = [np.split(file[c], ends[:-1]) for c in (_FLAT if flat else _COLUMNS)]
-            tokens = [str(token) for token in file["sample"]]
-            notes = safeio.parse_json(str(file["applied"]))
+        with open(path, "rb") as raw_file, np.load(raw_file, allow_pickle=False) as archive:
+            if "failed" in archive:
+                raise DetectorFailed(str(archive["failed"]))
+            sample_ends = np.cumsum(archive["count"])
+            is_2d = "camera" in archive
+            sample_parts = [np.split(archive[column], sample_ends[:-1]) for column in (_FLAT if is_2d else _COLUMNS)]
+            tokens = [str(token) for token in archive["sample"]]
+            notes = safeio.parse_json(str(archive["applied"]))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
-    found: list[Any] = []
-    for k, token in enumerate(tokens):
-        own = [part[k] for part in parts]
-        found.append(SamplePictures(token, PictureBoxes(*own)) if flat else SampleBoxes(token, _from_columns(*own)))
-    return found, {str(k): v for k, v in notes.items()}
+    samples: list[Any] = []
+    for sample_number, token in enumerate(tokens):
+        sample_columns = [column_parts[sample_number] for column_parts in sample_parts]
+        samples.append(
+            SamplePictures(token, PictureBoxes(*sample_columns))
+            if is_2d
+            else SampleBoxes(token, _from_columns(*sample_columns))
+        )
+    return samples, {str(sample_number): note for sample_number, note in notes.items()}
 
 
 def forget_failures(paths: Sequence[Path]) -> None:
@@ -366,17 +385,17 @@ Sum = Callable[[Sequence[Mapping[str, Any]]], Mapping[str, Any]]
 
 
 def sum_applied(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How often a shift was applied, over all scenes."""
-    applied: Counter[str] = Counter()
-    for one in notes:
-        applied.update({name: int(count) for name, count in one.items()})
-    return {"applied": dict(sorted(applied.items()))}
+    """Count over all scenes how often a shift was applied."""
+    applied_counts: Counter[str] = Counter()
+    for scene_notes in notes:
+        applied_counts.update({name: int(count) for name, count in scene_notes.items()})
+    return {"applied": dict(sorted(applied_counts.items()))}
 
 
 def score_scenes(
     examination: Examination, detector: str, scenes: Sequence[Condition], *, replicates: int, notes: Sum = sum_applied
 ) -> dict[str, Any]:
-    """Metrics of a detector over scenes whose boxes are there, for a record.
+    """Return the metrics of a detector over scenes whose boxes exist, for a record.
 
     Args:
         examination: of the run.
@@ -384,29 +403,29 @@ def score_scenes(
         scenes: each under its condition.
         replicates: of the bootstrap over scenes; the draws are the same for every detector and condition, so that
             differences are paired. Scenes of equal truth are copies: they are drawn, and count, together.
-        notes: makes a record's columns of what the conditions noted.
+        notes: makes a record's columns from the notes of the conditions.
 
     Returns:
-        metrics, intervals (95 %, see `replicate_estimate`), replicates, n (samples of different scenes), scenes, and
-        the columns of the notes.
+        metrics, intervals (95 %, see `replicate_estimate`), replicates, n (samples of different scenes), scenes,
+        and the columns of the notes.
 
     Raises:
         DetectorFailed: it failed on a scene.
     """
-    found, noted = read_scenes(examination, detector, scenes)
-    truth = truth_of(examination, [one.scene for one in scenes])
-    return {**score_found(examination, found, truth, replicates=replicates), **notes(noted)}
+    boxes, scene_notes = read_scenes(examination, detector, scenes)
+    truth = truth_of(examination, [condition.scene for condition in scenes])
+    return {**score_found(examination, boxes, truth, replicates=replicates), **notes(scene_notes)}
 
 
 def truth_of(examination: Examination, scenes: Sequence[str]) -> GroundTruth:
-    """The ground truth of some scenes."""
+    """Return the ground truth of some scenes."""
     return _truth(examination.root, examination.version, tuple(scenes))
 
 
 def read_scenes(
     examination: Examination, detector: str, scenes: Sequence[Condition]
 ) -> tuple[list[Any], list[dict[str, Any]]]:
-    """Boxes of a system in scenes, and what was noted in each.
+    """Read the boxes of a system in scenes, and the notes of each.
 
     Args:
         examination: of the run.
@@ -416,16 +435,16 @@ def read_scenes(
     Raises:
         DetectorFailed: it failed on a scene.
     """
-    found: list[Any] = []
-    noted = []
-    for one in scenes:
+    all_boxes: list[Any] = []
+    scene_notes = []
+    for condition in scenes:
         try:
-            boxes, own = read_boxes(boxes_path(examination.folder, detector, one))
+            boxes, condition_notes = read_boxes(boxes_path(examination.folder, detector, condition))
         except DetectorFailed as error:
-            raise DetectorFailed(f"{one.scene}: {error}") from None
-        found += boxes
-        noted.append(own)
-    return found, noted
+            raise DetectorFailed(f"{condition.scene}: {error}") from None
+        all_boxes += boxes
+        scene_notes.append(condition_notes)
+    return all_boxes, scene_notes
 
 
 def score_found(
@@ -440,7 +459,7 @@ def score_found(
         replicates: of the bootstrap over scenes.
     """
     matches = match_boxes(found, truth)
-    figures = lambda weights, few: numbers(matches.scores(weights), few=few)  # noqa: E731
+    figures = lambda weights, summary_only: numbers(matches.scores(weights), few=summary_only)  # noqa: E731
     return _resampled(examination, figures, truth, replicates)
 
 
@@ -457,12 +476,12 @@ def score_pictures(
         replicates: of the bootstrap over scenes.
     """
     matches = match_pictures(found, picture_truth_of(examination, truth), detector.classes)
-    figures = lambda weights, few: picture_figures(matches.scores(weights), few=few)  # noqa: E731
+    figures = lambda weights, summary_only: picture_figures(matches.scores(weights), few=summary_only)  # noqa: E731
     return _resampled(examination, figures, truth, replicates)
 
 
 def picture_truth_of(examination: Examination, truth: GroundTruth) -> PictureTruth:
-    """The true boxes in the images of the samples of a truth."""
+    """Return the true boxes in the images of the samples of a truth."""
     return read_picture_truth(examination.root, examination.version, truth.scenes, truth.samples)
 
 
@@ -471,46 +490,67 @@ Figures = Callable[[Any, bool], dict[str, float]]
 
 
 def _resampled(examination: Examination, figures: Figures, truth: GroundTruth, replicates: int) -> dict[str, Any]:
-    """Figures, and their intervals by the bootstrap over scenes."""
-    case = distinct_scenes(truth)
-    count = int(case.max()) + 1
-    draws: list[dict[str, float]] = []
-    if count > 1:
-        chance = generator("detection suite", examination.seed, count)  # the same draws for every cell
-        for draw in chance.multinomial(count, np.full(count, 1.0 / count), size=replicates):
-            draws.append(figures(draw[case[truth.scene]], True))
-    common = [name for name in (draws[0] if draws else {}) if all(name in draw for draw in draws)]
-    values = {name: [round(d[name], 5) for d in draws] for name in common}
-    first = np.unique(case, return_index=True)[1]
-    samples = int(np.isin(truth.scene, first).sum())
+    """Return figures, and their intervals by the bootstrap over scenes."""
+    drive_of_scene = distinct_scenes(truth)
+    drive_count = int(drive_of_scene.max()) + 1
+    replicate_figures: list[dict[str, float]] = []
+    if drive_count > 1:
+        rng = generator("detection suite", examination.seed, drive_count)  # the same draws for every cell
+        for multiplicities in rng.multinomial(drive_count, np.full(drive_count, 1.0 / drive_count), size=replicates):
+            replicate_figures.append(figures(multiplicities[drive_of_scene[truth.scene]], True))
+    # A draw without any object of a class has no AP for it.
+    common_names = [
+        name
+        for name in (replicate_figures[0] if replicate_figures else {})
+        if all(name in multiplicities for multiplicities in replicate_figures)
+    ]
+    values = {name: [round(replicate[name], 5) for replicate in replicate_figures] for name in common_names}
+    first_scenes = np.unique(drive_of_scene, return_index=True)[1]
+    samples = int(np.isin(truth.scene, first_scenes).sum())
     metrics = figures(None, False)
-    limits = {k: replicate_estimate(metrics[k], v, n=samples, clusters=count) for k, v in values.items()}
+    estimates = {
+        figure_name: replicate_estimate(metrics[figure_name], replicate_values, n=samples, clusters=drive_count)
+        for figure_name, replicate_values in values.items()
+    }
     return {
         "metrics": metrics,
-        "intervals": {k: [round(e.low, 5), round(e.high, 5)] for k, e in limits.items() if np.isfinite(e.low)},
+        "intervals": {
+            figure_name: [round(estimate.low, 5), round(estimate.high, 5)]
+            for figure_name, estimate in estimates.items()
+            if np.isfinite(estimate.low)
+        },
         "replicates": values,
         "n": samples,
-        "scenes": count,
+        "scenes": drive_count,
     }
 
 
 def distinct_scenes(truth: GroundTruth) -> Any:
-    """Which scenes are copies of one drive: those whose true boxes are equal, sample by sample.
+    """Find scenes that are copies of one drive: those whose true boxes are equal, sample by sample.
 
     Args:
         truth: True boxes of all scenes.
 
     Returns:
-        Number of the drive that each scene shows [scenes].
+        Number of the drive of each scene [scenes].
     """
-    names: dict[str, int] = {}
-    found = []
+    numbers_by_digest: dict[str, int] = {}
+    drive_numbers = []
     boxes = truth.boxes
     for scene in range(len(truth.scenes)):
         samples = np.flatnonzero(truth.scene == scene)
         rows = np.flatnonzero(np.isin(boxes.sample, samples))
-        values = [boxes.sample[rows] - (samples[0] if len(samples) else 0), boxes.label[rows], boxes.centre[rows]]
-        values += [boxes.size_lwh[rows], boxes.rotation[rows]]
-        text = digest(len(samples), *[np.ascontiguousarray(v).tobytes().hex() for v in values])
-        found.append(names.setdefault(text if len(rows) else f"empty {scene}", len(names)))
-    return np.array(found)
+        compared_arrays = [
+            boxes.sample[rows] - (samples[0] if len(samples) else 0),
+            boxes.label[rows],
+            boxes.centre[rows],
+        ]
+        compared_arrays += [boxes.size_lwh[rows], boxes.rotation[rows]]
+        content_digest = digest(
+            len(samples), *[np.ascontiguousarray(array).tobytes().hex() for array in compared_arrays]
+        )
+        # Scenes without boxes look alike but need not be copies.
+        drive_numbers.append(
+            numbers_by_digest.setdefault(content_digest if len(rows) else f"empty {scene}", len(numbers_by_digest))
+        )
+    return np.array(drive_numbers)

@@ -1,4 +1,4 @@
-"""Data and detectors that a suite scores: looked up and checked, with what results depend on of them."""
+"""Data and detectors that a suite scores: resolved and checked, with everything that results depend on."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ RECORDED = "recorded"
 
 
 class Recorded(Schema):
-    """The validation set that is recorded where none is given: drives in towns that the shipped detectors never saw.
+    """Validation set that is recorded by default: drives in towns that the shipped detectors never saw.
 
     Attributes:
         towns: names.
-        scenes: of each town.
-        seconds: of a scene, two samples each.
-        width: of the pictures.
-        seed: of the drives.
+        scenes: number of scenes in each town.
+        seconds: length of a scene, with two samples a second.
+        width: width of the images.
+        seed: seed of the drives.
     """
 
     towns: Names = Field(default=["Oldmarket", "Larkhill"])
@@ -44,14 +44,14 @@ class Recorded(Schema):
 
 
 class DetectorTable(Schema):
-    """Which detectors are scored, on which data.
+    """Detectors to score and the data to score them on.
 
     Attributes:
         name: of the suite.
         detectors: names, with weights of your own as NAME=FILE, or module:object.
-        data: "recorded", or the root of a data set in the nuScenes schema, with version (default: the one that is
-            there) and split.
-        recorded: what is recorded.
+        data: "recorded", or the root of a data set in the nuScenes schema, with version (default: the only one in
+            the folder) and split.
+        recorded: settings of the recording.
     """
 
     name: str
@@ -78,19 +78,24 @@ def detectors_of(
     weights: dict[str, str] = {}
     files: dict[str, str] = {}
     tasks: dict[str, str] = {}
-    for text in table.detectors if names is None else names:
-        name, file = split_weights(text)
+    for entry in table.detectors if names is None else names:
+        name, weights_file = split_weights(entry)
         if name in files:
             raise ConfigError(
                 f"suite {table.name}: detectors: {name} appears twice; tell two of a kind apart by a label, "
                 f"{name}@mine=FILE"
             )
-        path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
-        kind = Reference.of(name).name
-        if not path and kind in DETECTORS and not (SHIPPED / f"{kind}.json").is_file():
+        # Workers may run in another folder; "random" stands for untrained weights.
+        path = (
+            str(Path(weights_file).expanduser().resolve())
+            if weights_file and weights_file != "random"
+            else weights_file
+        )
+        detector_name = Reference.of(name).name
+        if not path and detector_name in DETECTORS and not (SHIPPED / f"{detector_name}.json").is_file():
             raise ConfigError(
-                f"suite {table.name}: no weights of {kind} are shipped; give a file, {kind}=FILE "
-                f"(docs/detectors.md: ssad train detector {kind}, or official ones)"
+                f"suite {table.name}: no weights of {detector_name} are shipped; give a file, {detector_name}=FILE "
+                f"(docs/detectors.md: ssad train detector {detector_name}, or official ones)"
             )
         detector = detector_of(name, path, "cpu")
         tasks[name] = str(getattr(detector, "task", ""))
@@ -99,16 +104,16 @@ def detectors_of(
                 raise ConfigError(f"suite {table.name}: {name} finds 2D boxes; this suite takes 3D detectors")
             if not set(detector.classes) & set(MMDET3D_CLASSES):
                 raise ConfigError(f"suite {table.name}: {name} knows none of the ten classes of nuScenes")
-        own = f" {source_version(kind.partition(':')[0])}" if ":" in kind else ""
-        weights[name], files[name] = state_hash(detector) + own, path
+        user_source = f" {source_version(detector_name.partition(':')[0])}" if ":" in detector_name else ""
+        weights[name], files[name] = state_hash(detector) + user_source, path
     return weights, files, tasks
 
 
 def data_of(table: DetectorTable) -> dict[str, Any]:
-    """What the results depend on of the data set, which is checked.
+    """Check the data set and return everything of it that the results depend on.
 
     Raises:
-        ConfigError: There is no such version, split or scene.
+        ConfigError: Unknown version, split or scene.
         FormatError: The data set is broken.
     """
     if table.data == RECORDED:
@@ -118,17 +123,19 @@ def data_of(table: DetectorTable) -> dict[str, Any]:
     root = Path(table.data).expanduser()
     if not root.is_dir():
         raise ConfigError(f"suite {table.name}: data: {root} is no folder; give the root of a data set, or {RECORDED}")
-    with NuScenes(root, table.version) as data:
-        version, scenes = data.version, scenes_of(data, table.split)
-    about: dict[str, Any] = {"version": version, "split": table.split, "scenes": list(scenes)}
+    with NuScenes(root, table.version) as dataset:
+        version, scenes = dataset.version, scenes_of(dataset, table.split)
+    identity: dict[str, Any] = {"version": version, "split": table.split, "scenes": list(scenes)}
     for name in ("sample", "sample_annotation", "sample_data", "calibrated_sensor"):
         content = safeio.read_bytes(root / version / f"{name}.json", limit=1 << 34)
-        about[name] = hashlib.sha256(content).hexdigest()[:16]
-    return about
+        identity[name] = hashlib.sha256(content).hexdigest()[:16]
+    return identity
 
 
 def recording_of(table: DetectorTable, out: Path) -> Recording:
-    """On the CPU, on any machine: it decides bits."""
-    own = table.recorded
-    towns = tuple(own.towns)
-    return Recording(out, towns, towns, scenes=own.scenes, seconds=own.seconds, width=own.width, seed=own.seed)
+    """Return the recording of a table; always on the CPU, because the device decides bits."""
+    settings = table.recorded
+    towns = tuple(settings.towns)
+    return Recording(
+        out, towns, towns, scenes=settings.scenes, seconds=settings.seconds, width=settings.width, seed=settings.seed
+    )

@@ -1,4 +1,4 @@
-"""nuScenes-N: the distribution shifts on a nuScenes folder, on the fly or written out."""
+"""nuScenes-N: the distribution shifts on a nuScenes folder, on the fly or written to disk."""
 
 from ssad.recorders.shifted.manifest import check_manifest, read_manifest, verify
 from ssad.recorders.shifted.options import Options, Shard

@@ -1,7 +1,7 @@
-"""Contact sheets: one picture under all shifts, and every shift at all severities.
+"""Contact sheets: one image under all shifts, and every shift at all severities.
 
-For a camera image of a dataset, whose boxes, pose and LiDAR are known, or for any picture of the user's own, for which
-a typical camera is assumed; objects then are boxes that the user names in the picture.
+The image is a camera image of a dataset, whose boxes, pose and LiDAR are known, or any image of the user's own,
+with a typical camera; its objects then are boxes that the user names in the image.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from ssad.scenarios.static.shifts.sun import choose_sun
 
 
 def box_at(camera: Camera, rectangle: Sequence[float]) -> TrackedBoxes:
-    """A 3D box for a rectangle in the picture of a level camera.
+    """Return a 3D box for a rectangle in the image of a level camera.
 
-    The box stands on the road where the rectangle ends, faces the camera, and its depth is 1.6 times its width.
+    The box stands on the road at the lower edge of the rectangle, faces the camera, and its depth is 1.6 times its
+    width.
 
     Args:
         camera: The camera; it must look horizontally.
@@ -40,34 +41,37 @@ def box_at(camera: Camera, rectangle: Sequence[float]) -> TrackedBoxes:
         ConfigError: The rectangle is narrower or lower than 4 pixels, or does not end below the horizon.
     """
     x0, y0, x1, y1 = map(float, rectangle)
-    k = camera.intrinsic
+    intrinsic = camera.intrinsic
     height = float(camera.to_ego[2, 3])
-    drop = (y1 - k[1, 2]) / k[1, 1]
-    if x1 - x0 < 4 or y1 - y0 < 4 or drop < 0.005:
-        raise ConfigError(f"box {x0:g},{y0:g},{x1:g},{y1:g}: it must end below the horizon (y = {k[1, 2]:.0f})")
-    near = height / drop
-    wide, tall = (x1 - x0) / k[0, 0] * near, (y1 - y0) / k[1, 1] * near
-    deep = 1.6 * wide
-    across = ((x0 + x1) / 2 - k[0, 2]) / k[0, 0] * near
-    place = camera.to_ego @ np.array([across, height - tall / 2, near + deep / 2, 1.0])
-    size_lwh = np.array([[deep, wide, tall]])
+    slope = (y1 - intrinsic[1, 2]) / intrinsic[1, 1]
+    if x1 - x0 < 4 or y1 - y0 < 4 or slope < 0.005:
+        raise ConfigError(f"box {x0:g},{y0:g},{x1:g},{y1:g}: it must end below the horizon (y = {intrinsic[1, 2]:.0f})")
+    near_depth = height / slope
+    width, box_height = (x1 - x0) / intrinsic[0, 0] * near_depth, (y1 - y0) / intrinsic[1, 1] * near_depth
+    depth = 1.6 * width
+    lateral = ((x0 + x1) / 2 - intrinsic[0, 2]) / intrinsic[0, 0] * near_depth
+    centre = camera.to_ego @ np.array([lateral, height - box_height / 2, near_depth + depth / 2, 1.0])
+    size_lwh = np.array([[depth, width, box_height]])
     rotation = np.array([[1.0, 0, 0, 0]])
     # drives away a little to the left, so that there is something to blur
     velocity = np.array([[2.0, 4.0, 0.0]])
-    return TrackedBoxes(place[None, :3], size_lwh, rotation, velocity, (f"box {x0:g},{y0:g}",), np.ones(1))
+    return TrackedBoxes(centre[None, :3], size_lwh, rotation, velocity, (f"box {x0:g},{y0:g}",), np.ones(1))
 
 
 def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
-    """What is assumed of a picture [H, W, 3] of the user's own."""
+    """Return the assumed frame of a user's image [H, W, 3]."""
     camera = Camera.typical(image.shape[1], image.shape[0])
-    found = [box_at(camera, rectangle) for rectangle in rectangles]
+    boxes_list = [box_at(camera, rectangle) for rectangle in rectangles]
     frame = Frame(camera, "picture", "picture", 3.0)
-    if not found:
+    if not boxes_list:
         return frame
     columns = {
-        n: np.concatenate([getattr(b, n) for b in found]) for n in ("centre", "size_lwh", "rotation", "velocity")
+        field_name: np.concatenate([getattr(single_box, field_name) for single_box in boxes_list])
+        for field_name in ("centre", "size_lwh", "rotation", "velocity")
     }
-    boxes = TrackedBoxes(**columns, instance=tuple(b.instance[0] for b in found), visible=np.ones(len(found)))
+    boxes = TrackedBoxes(
+        **columns, instance=tuple(single_box.instance[0] for single_box in boxes_list), visible=np.ones(len(boxes_list))
+    )
     return replace(frame, boxes=boxes)
 
 
@@ -88,31 +92,36 @@ def pick_frame(
     Raises:
         ConfigError: There is no such scene or camera.
     """
-    chosen = data.scene(data.scenes()[0].token if scene is None else scene)
-    shifter = SceneShifter(data.root, chosen, ShiftSpec("scale", 3))
-    frames = [f for f in chosen.frames if f.channel == channel and f.key_frame]
+    scene_data = data.scene(data.scenes()[0].token if scene is None else scene)
+    shifter = SceneShifter(data.root, scene_data, ShiftSpec("scale", 3))
+    frames = [candidate for candidate in scene_data.frames if candidate.channel == channel and candidate.key_frame]
     if not frames:
-        known = sorted({f.channel for f in chosen.frames if f.modality == "camera"})
-        raise ConfigError(f"{data.root}: no camera {channel}; there are: {', '.join(known)}")
-    best = max(frames, key=lambda f: _in_view(shifter.camera_frame(f)))
-    weather = SceneShifter(data.root, chosen, ShiftSpec("fog", 3))
-    view = shifter.camera_frame(best)
-    seen, image = weather.camera_frame(best), shifter.read(best)
-    # the sun stands over where the ego goes; here, over what this camera sees
-    context = replace(weather.context, heading=viewing_direction(view))
-    context = replace(context, sun=choose_sun(ShiftSpec("sunlight", 3, seed), context, [(seen, image)]))
-    return image, replace(view, points=seen.points, depth=seen.depth), context
+        channels = sorted({candidate.channel for candidate in scene_data.frames if candidate.modality == "camera"})
+        raise ConfigError(f"{data.root}: no camera {channel}; there are: {', '.join(channels)}")
+    best_frame = max(frames, key=lambda candidate: _in_view(shifter.camera_frame(candidate)))
+    fog_shifter = SceneShifter(data.root, scene_data, ShiftSpec("fog", 3))
+    camera_view = shifter.camera_frame(best_frame)
+    lidar_frame, image = fog_shifter.camera_frame(best_frame), shifter.read(best_frame)
+    # the sun stands over the ego's heading by default; here, over the view of this camera
+    context = replace(fog_shifter.context, heading=viewing_direction(camera_view))
+    context = replace(context, sun=choose_sun(ShiftSpec("sunlight", 3, seed), context, [(lidar_frame, image)]))
+    return image, replace(camera_view, points=lidar_frame.points, depth=lidar_frame.depth), context
 
 
 def _in_view(frame: Frame) -> float:
-    """How much there is to see of the boxes: the sum of their apparent heights, in pixels, at most 300 each."""
-    local = np.linalg.inv(camera_to_world(frame))
-    points = frame.boxes.centre @ local[:3, :3].T + local[:3, 3]
-    k = frame.camera.intrinsic
-    z = np.maximum(points[:, 2], 0.1)
-    x, y = k[0, 0] * points[:, 0] / z + k[0, 2], k[1, 1] * points[:, 1] / z + k[1, 2]
-    inside = (points[:, 2] > 4) & (x > 0) & (x < frame.camera.width) & (y > 0) & (y < frame.camera.height)
-    return float(np.minimum(k[1, 1] * frame.boxes.size_lwh[:, 2] / z, 300)[inside].sum())
+    """Return the sum of the apparent heights of the boxes, in pixels, at most 300 each."""
+    world_to_camera = np.linalg.inv(camera_to_world(frame))
+    centres = frame.boxes.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    intrinsic = frame.camera.intrinsic
+    depth = np.maximum(centres[:, 2], 0.1)
+    columns, rows = (
+        intrinsic[0, 0] * centres[:, 0] / depth + intrinsic[0, 2],
+        intrinsic[1, 1] * centres[:, 1] / depth + intrinsic[1, 2],
+    )
+    is_inside = (
+        (centres[:, 2] > 4) & (columns > 0) & (columns < frame.camera.width) & (rows > 0) & (rows < frame.camera.height)
+    )
+    return float(np.minimum(intrinsic[1, 1] * frame.boxes.size_lwh[:, 2] / depth, 300)[is_inside].sum())
 
 
 def contact_sheet(
@@ -130,7 +139,7 @@ def contact_sheet(
     for name in SHIFTS:
         spec = ShiftSpec(name, severity, seed, calibration)
         panels.append(captioned(*_shifted(image, frame, spec, context), width))
-    return np.vstack([np.hstack(panels[k : k + 3]) for k in range(0, len(panels), 3)])
+    return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
 
 def severity_sheet(
@@ -142,27 +151,27 @@ def severity_sheet(
     calibration: Calibration = "physical",
     width: int = 300,
 ) -> U8:
-    """One row a shift, severities 1 to 5 from left to right."""
+    """Draw one row per shift, severities 1 to 5 from left to right."""
     rows = []
     for name in SHIFTS:
         specs = [ShiftSpec(name, severity, seed, calibration) for severity in SEVERITIES]
         cells = [_shifted(image, frame, spec, context) for spec in specs]
-        named = [
-            (picture, text or f"{name} {spec.severity}") for (picture, text), spec in zip(cells, specs, strict=True)
+        captioned_cells = [
+            (panel, text or f"{name} {spec.severity}") for (panel, text), spec in zip(cells, specs, strict=True)
         ]
-        rows.append(np.hstack([captioned(picture, text, width) for picture, text in named]))
+        rows.append(np.hstack([captioned(panel, text, width) for panel, text in captioned_cells]))
     return np.vstack(rows)
 
 
 def _shifted(image: U8, frame: Frame, spec: ShiftSpec, context: SceneContext | None) -> tuple[U8, str]:
-    """A shifted picture and its caption; a shift that did nothing says why."""
+    """Return a shifted image and its caption, which states why a shift was not applied."""
     contexts = {context.scene: context} if context is not None else None
-    out, done = shift_images(image, frame, spec, contexts=contexts)
+    shifted_image, applied = shift_images(image, frame, spec, contexts=contexts)
     caption = f"{spec.name.replace('_', ' ')} {spec.severity}"
-    if not done[0].applied:
-        reason = next(iter(done[0].skipped), "no 3D boxes in this picture")
+    if not applied[0].applied:
+        reason = next(iter(applied[0].skipped), "no 3D boxes in this picture")
         caption += f": not applied ({reason})"
-    return out, caption
+    return shifted_image, caption
 
 
 def write_sheets(
@@ -185,23 +194,23 @@ def write_sheets(
     else:
         image = read_image(source)
         frame = own_frame(image, boxes)
-    second = out.with_name(f"{out.stem}-severities{out.suffix}")
+    severities_path = out.with_name(f"{out.stem}-severities{out.suffix}")
     sheet = contact_sheet(image, frame, context=context, severity=severity, seed=seed, calibration=calibration)
     save_picture(out, sheet)
-    save_picture(second, severity_sheet(image, frame, context=context, seed=seed, calibration=calibration))
-    return out, second
+    save_picture(severities_path, severity_sheet(image, frame, context=context, seed=seed, calibration=calibration))
+    return out, severities_path
 
 
 def parse_box(text: str) -> tuple[float, ...]:
-    """Four numbers from the text x0,y0,x1,y1.
+    """Parse four numbers from the text x0,y0,x1,y1.
 
     Raises:
-        ConfigError: The text is something else.
+        ConfigError: The text has another form.
     """
     try:
-        found = tuple(float(part) for part in text.split(","))
+        numbers = tuple(float(number_text) for number_text in text.split(","))
     except ValueError:
-        found = ()
-    if len(found) != 4 or not np.isfinite(found).all():
+        numbers = ()
+    if len(numbers) != 4 or not np.isfinite(numbers).all():
         raise ConfigError(f"--box {text}: expected x0,y0,x1,y1 in pixels")
-    return found
+    return numbers

@@ -1,8 +1,8 @@
-"""`ssad shift` on a folder of pictures that is no nuScenes root, such as KITTI's or COCO's: each picture by itself.
+"""`ssad shift` on a folder of pictures that is not a nuScenes root, such as KITTI or COCO: each picture alone.
 
-Of a picture nothing is known but, in KITTI, the camera matrix (`calib/NUMBER.txt` beside `image_2`). A typical camera,
-level on a flat road, is assumed of others. So what needs boxes or depth of the scene is refused: the object shifts, and
-objects that are placed. All that is no picture (labels, calibration, LiDAR) is linked: LiDAR points stay clean.
+Nothing is known of a picture but, in KITTI, the camera matrix (`calib/NUMBER.txt` beside `image_2`). For others a
+typical camera, level on a flat road, is assumed. Shifts that need boxes or depth of the scene are therefore refused:
+the object shifts, and placed objects. Other files (labels, calibration, LiDAR) are linked: LiDAR points stay clean.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ssad.scenarios.static.shifts.spec import PLACING
 
 PICTURES = (".jpg", ".jpeg", ".png")
 JPEG, PAGE, LINES = (".jpg", ".jpeg"), "manifest.json", "manifest.jsonl"
-PICTURE_S = 600.0  # s that a picture may take
+PICTURE_S = 600.0  # time limit of a picture, s
 KITTI = {"image_2": "P2", "image_3": "P3"}
 
 
@@ -40,11 +40,11 @@ class ShiftedFolder:
     """A written folder.
 
     Attributes:
-        root: Where it is.
+        root: Path of the folder.
         shifted: Number of pictures that were written.
         linked: Number of other files.
-        applied: Share of the pictures that the shift has changed.
-        reasons: Why pictures failed, a line each.
+        applied: Share of the pictures that the shift changed.
+        reasons: Reasons of failed pictures, one line each.
     """
 
     root: Path
@@ -55,16 +55,16 @@ class ShiftedFolder:
 
 
 def picture_shifts(names: Sequence[str]) -> tuple[str, ...]:
-    """Those of some shifts that pictures alone can have; "all" was resolved to the paper's 11 before.
+    """Return the shifts that pictures alone allow; "all" is already resolved to the paper's 11 shifts.
 
     Raises:
-        ConfigError: A shift needs boxes of the scene, and was asked for by name.
+        ConfigError: A shift that was requested by name needs boxes of the scene.
     """
     possible = tuple(name for name in names if KNOWN[name][0] != "object" and name not in PLACING)
-    missing = [name for name in names if name not in possible]
-    if missing and set(names) != set(SHIFTS):
+    impossible = [name for name in names if name not in possible]
+    if impossible and set(names) != set(SHIFTS):
         raise ConfigError(
-            f"{missing[0]} needs boxes in space, which pictures alone do not have; take a nuScenes folder, "
+            f"{impossible[0]} needs boxes in space, which pictures alone do not have; take a nuScenes folder, "
             "or one picture with --box"
         )
     return possible
@@ -72,13 +72,13 @@ def picture_shifts(names: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One picture under one shift: what a worker is given.
+    """One picture under one shift: the unit of work of a worker.
 
     Attributes:
-        path: Where it is.
-        key: Its name in the folder.
-        root: Folder of the new one.
-        spec: The shift; under `random` with any severity.
+        path: Path of the picture.
+        key: Name of the picture in the folder.
+        root: Folder of the shifted picture.
+        spec: The shift; its severity is arbitrary under `random`.
         random: Whether the severity is drawn for each picture.
         quality, subsampling: See `shift_pictures`.
     """
@@ -103,26 +103,26 @@ def shift_pictures(
     ray: str | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[ShiftedFolder]:
-    """Write OUT/SHIFT-SEVERITY with the files of a folder, its pictures shifted; goes on where it was stopped.
+    """Write OUT/SHIFT-SEVERITY with the files of a folder and its pictures shifted; resumes an interrupted run.
 
-    The bytes depend neither on the number of workers nor on the cluster. OUT also holds the record of the work, as the
-    results folder of a run does.
+    The bytes depend neither on the number of workers nor on the cluster. OUT also holds the record of the work,
+    like the results folder of a run.
 
     Args:
-        source: Folder with pictures in it, however deep.
-        out: Folder of the new ones.
+        source: Folder of pictures, at any depth.
+        out: Folder of the new folders.
         shifts: See `picture_shifts`.
         severities: 1 to 5, or "random": drawn for each picture.
         settings: seed, calibration, quality, subsampling.
-        workers: Number of processes; None: one for each core; 0: all in this process.
+        workers: Number of processes; None: one per core; 0: all in this process.
         ray: Address of a cluster that sees the same folders.
-        progress: Called with the number of pictures that are done, and of all.
+        progress: Called with the number of finished pictures and of all pictures.
 
     Returns:
-        One entry a folder.
+        One entry per folder.
 
     Raises:
-        ConfigError: There is no picture, or OUT lies in the source.
+        ConfigError: The folder has no picture, or OUT lies in the source.
         StoreError: OUT holds shifts with other settings, or cannot be written.
     """
     source = source.resolve()
@@ -133,31 +133,38 @@ def shift_pictures(
     if not pictures:
         raise ConfigError(f"{source}: no nuScenes folder, and no picture (.jpg, .png) in it")
     conditions = {out / f"{name}-{strength}": (name, strength) for name in shifts for strength in severities}
-    told = {"source": str(source), "version": VERSIONS[settings["calibration"]], **settings}
+    identity = {"source": str(source), "version": VERSIONS[settings["calibration"]], **settings}
     for root in conditions:
         if root.exists() and not (out / RUN).is_file():
             raise StoreError(f"{root}: holds something else; choose another OUT")
     with Store.open(
-        out, {"identity": told, "suite": {"name": "ssad shift", **told}}, retry=True, what="ssad shift"
+        out, {"identity": identity, "suite": {"name": "ssad shift", **identity}}, retry=True, what="ssad shift"
     ) as store:
-        wanted = [
-            _picture(path, source, root, how=how, settings=settings)
-            for root, how in conditions.items()
+        tasks = [
+            _picture(path, source, root, how=condition, settings=settings)
+            for root, condition in conditions.items()
             for path in pictures
         ]
-        for folder in {(one.root / one.key).parent for one in wanted}:
+        for folder in {(picture.root / picture.key).parent for picture in tasks}:
             remove_unfinished(folder)
-        missing = [one for one in wanted if _name(one) not in store.results or not (one.root / one.key).is_file()]
+        missing = [
+            picture
+            for picture in tasks
+            if _name(picture) not in store.results or not (picture.root / picture.key).is_file()
+        ]
         with open_pool(len(missing), workers=workers, ray=ray) as pool:
-            for one in missing:
-                pool.add(Task(_written, one, PICTURE_S, label=one))
-            for done, outcome in enumerate(pool.outcomes(), 1):
-                one = outcome.task.label
+            for picture in missing:
+                pool.add(Task(_written, picture, PICTURE_S, label=picture))
+            for finished, outcome in enumerate(pool.outcomes(), 1):
+                picture = outcome.task.label
                 record = outcome.value or {"status": outcome.status, "reason": outcome.reason}
-                if _name(one) not in store.results:  # else only the file was missing
-                    store.append({"key": _name(one), **record}, None)
-                progress(len(wanted) - len(missing) + done, len(wanted))
-        return [_ended(root, source, files, told=told, how=how, done=store.results) for root, how in conditions.items()]
+                if _name(picture) not in store.results:  # else only the file was missing, and its record stands
+                    store.append({"key": _name(picture), **record}, None)
+                progress(len(tasks) - len(missing) + finished, len(tasks))
+        return [
+            _ended(root, source, files, told=identity, how=condition, done=store.results)
+            for root, condition in conditions.items()
+        ]
 
 
 def _picture(
@@ -189,44 +196,48 @@ def _written(one: Picture) -> dict[str, Any]:
     try:
         image = read_image(one.path)
         frame = Frame(camera_of(one.path, image), scene=one.key, sample=one.key)
-        shifted, (done,) = shift_images(image, [frame], spec)
+        shifted, (application,) = shift_images(image, [frame], spec)
         make_folder((one.root / one.key).parent)
         write_atomic(one.root / one.key, _encoded(shifted, one))
     except SSADError as error:
         return {"status": "failed", "severity": spec.severity, "reason": str(error)}
-    about = {"applied": done.applied, "details": dict(done.details), "skipped": dict(done.skipped)}
-    return {"status": "ok", "severity": spec.severity, **about}
+    details = {
+        "applied": application.applied,
+        "details": dict(application.details),
+        "skipped": dict(application.skipped),
+    }
+    return {"status": "ok", "severity": spec.severity, **details}
 
 
 def _encoded(image: U8, one: Picture) -> bytes:
     if one.path.suffix.lower() not in JPEG:
         return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1].tobytes())
     chroma = one.subsampling
-    if chroma == "auto":  # 420 would weaken noise
+    if chroma == "auto":  # 420 averages the chroma of neighbours, which would weaken noise
         chroma = "444" if one.spec.family == "sensor" else "420"
     return encode_jpeg(image, one.quality, chroma)
 
 
 def camera_of(path: Path, image: U8) -> Camera:
-    """The camera of a picture: that of KITTI's calibration where it lies beside, else a typical one.
+    """Return the camera of a picture: that of KITTI's calibration if it exists, else a typical one.
 
     Raises:
-        ConfigError: The calibration has no such camera.
+        ConfigError: The calibration does not contain the camera.
     """
     camera = Camera.typical(image.shape[1], image.shape[0])
     calibration = path.parent.parent / "calib" / f"{path.stem}.txt"
     if path.parent.name not in KITTI or not calibration.is_file():
         return camera
-    name = KITTI[path.parent.name]
+    matrix_name = KITTI[path.parent.name]
     for line in read_text(calibration).splitlines():
-        key, _, numbers = line.partition(":")
-        if key.strip() == name:
+        line_name, _, matrix_text = line.partition(":")
+        if line_name.strip() == matrix_name:
             try:
-                matrix = np.array(numbers.split(), np.float64).reshape(3, 4)[:, :3]
+                matrix = np.array(matrix_text.split(), np.float64).reshape(3, 4)[:, :3]
             except ValueError:
                 break
             return replace(camera, intrinsic=matrix)
-    raise ConfigError(f"{calibration}: no line '{name}:' with 12 numbers")
+    raise ConfigError(f"{calibration}: no line '{matrix_name}:' with 12 numbers")
 
 
 def _ended(
@@ -239,20 +250,23 @@ def _ended(
     done: Mapping[str, Mapping[str, Any]],
 ) -> ShiftedFolder:
     """Link what is no picture, say what was done, and count."""
-    linked = 0
+    link_count = 0
     for path in files:
         target = root / path.relative_to(source)
         if path.suffix.lower() in PICTURES:
             continue
-        linked += 1
+        link_count += 1
         if not target.is_symlink():
             make_folder(target.parent)
             os.symlink(path, target)
-    own = {key.removeprefix(f"{root.name}/"): line for key, line in done.items() if key.startswith(f"{root.name}/")}
-    lines = [{**own[key], "key": key} for key in sorted(own)]
-    write_atomic(make_folder(root) / LINES, "".join(dump_json(line) + "\n" for line in lines))
+    folder_records = {
+        key.removeprefix(f"{root.name}/"): line for key, line in done.items() if key.startswith(f"{root.name}/")
+    }
+    # The store is in the order of completion; sorting makes the manifest independent of it.
+    manifest_lines = [{**folder_records[key], "key": key} for key in sorted(folder_records)]
+    write_atomic(make_folder(root) / LINES, "".join(dump_json(line) + "\n" for line in manifest_lines))
     write_atomic(root / PAGE, dump_json({"shift": how[0], "severity": how[1], **told}, indent=1) + "\n")
-    good = [line for line in lines if line["status"] == "ok"]
-    reasons = tuple(f"{line['key']}: {line['reason']}" for line in lines if line["status"] != "ok")
-    applied = sum(bool(line["applied"]) for line in good) / max(len(good), 1)
-    return ShiftedFolder(root, len(good), linked, applied, reasons)
+    successes = [line for line in manifest_lines if line["status"] == "ok"]
+    reasons = tuple(f"{line['key']}: {line['reason']}" for line in manifest_lines if line["status"] != "ok")
+    applied = sum(bool(line["applied"]) for line in successes) / max(len(successes), 1)
+    return ShiftedFolder(root, len(successes), link_count, applied, reasons)

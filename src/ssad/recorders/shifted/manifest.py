@@ -1,9 +1,9 @@
-"""The manifest of a nuScenes-N root: one line a file while it is written, one page when it is done.
+"""Manifest of a nuScenes-N root: one line per file while the root is written, one page when it is complete.
 
-ROOT/manifest/SCENE.jsonl has a line a file: its state, what was applied, severity, hash of the pixels before encoding,
-hash and size of the file, what was skipped and why. States: shifted; linked (the clean file: the shift was not asked
-for it or changed nothing in it); absent (not asked for, and not in the dataset either); failed. ROOT/manifest.json sums
-it up; it is there only when the root is complete.
+ROOT/manifest/SCENE.jsonl has one line per file: its state, the shift applied, severity, hash of the pixels before
+encoding, hash and size of the file, and skipped objects with the reason. States: shifted; linked (the clean file: the
+shift was not requested for it or changed nothing in it); absent (not requested, and not in the dataset either);
+failed. ROOT/manifest.json is the summary; it exists only when the root is complete.
 """
 
 from __future__ import annotations
@@ -28,47 +28,49 @@ STATES: Final = ("shifted", "linked", "absent", "failed")
 
 
 def shard_path(root: Path, scene: str) -> Path:
-    """The lines of a scene."""
+    """Return the path of a scene's manifest lines."""
     return root / FOLDER / f"{scene}.jsonl"
 
 
 def read_lines(path: Path) -> dict[str, dict[str, Any]]:
-    """The lines of a shard by file name, a later line of a file before an earlier; what was cut off is left out."""
-    found: dict[str, dict[str, Any]] = {}
+    """Read the lines of a shard by file name; a file's last line counts, and truncated lines are skipped."""
+    records: dict[str, dict[str, Any]] = {}
     if not path.exists():
-        return found
+        return records
     for line in safeio.read_bytes(path, limit=1 << 30).split(b"\n"):
         try:
             record = safeio.parse_json(line.decode(), str(path)) if line else None
         except (FormatError, UnicodeDecodeError):
-            continue  # torn by a kill: the file is done again
+            continue  # truncated by a kill: the file is made again
         if _whole(record):
-            found[record["file"]] = record
-    return found
+            records[record["file"]] = record
+    return records
 
 
 def _whole(record: Any) -> TypeGuard[dict[str, Any]]:
-    """Whether a line has what the rest of the toolbox asks of it."""
+    """Return whether a line has all the fields that the toolbox reads."""
     if not isinstance(record, dict) or record.get("state") not in STATES:
         return False
-    names = ["file", "kind"] + (["hash"] if record["state"] == "shifted" else [])
-    names += ["reason"] if record["state"] == "failed" else []
-    sized = record["state"] != "shifted" or isinstance(record.get("bytes"), int)
-    return sized and all(isinstance(record.get(name), str) for name in names)
+    text_fields = ["file", "kind"] + (["hash"] if record["state"] == "shifted" else [])
+    text_fields += ["reason"] if record["state"] == "failed" else []
+    size_valid = record["state"] != "shifted" or isinstance(record.get("bytes"), int)
+    return size_valid and all(isinstance(record.get(field_name), str) for field_name in text_fields)
 
 
 def text(records: Iterable[Mapping[str, Any]]) -> str:
-    """Lines sorted by file name: the same whatever order the files were made in."""
-    return "".join(safeio.dump_json(dict(r)) + "\n" for r in sorted(records, key=lambda r: str(r["file"])))
+    """Serialise lines sorted by file name: the text does not depend on the order in which files were made."""
+    return "".join(
+        safeio.dump_json(dict(record)) + "\n" for record in sorted(records, key=lambda record: str(record["file"]))
+    )
 
 
 def digest_bytes(data: bytes | memoryview) -> str:
-    """Hash that manifests use: 32 hex digits of BLAKE2b."""
+    """Return the hash used in manifests: 32 hex digits of BLAKE2b."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
 def digest_file(path: Path) -> str:
-    """The same of a file of any size. FormatError when it cannot be read."""
+    """Return the hash of a file of any size, as `digest_bytes`. FormatError if the file cannot be read."""
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
@@ -80,7 +82,7 @@ def digest_file(path: Path) -> str:
 
 @dataclass(slots=True)
 class Tally:
-    """Counts over the lines of a root, added scene by scene so that memory is that of one scene."""
+    """Counts over the lines of a root, added scene by scene so that only one scene is in memory."""
 
     scenes: dict[str, str] = field(default_factory=dict)
     files: Counter[str] = field(default_factory=Counter)
@@ -91,7 +93,7 @@ class Tally:
     reasons: list[str] = field(default_factory=list)
 
     def add(self, scene: str, records: Iterable[Mapping[str, Any]]) -> None:
-        """The lines of a scene."""
+        """Add the lines of a scene."""
         rows = list(records)
         self.scenes[scene] = digest_bytes(text(rows).encode())
         for record in rows:
@@ -115,7 +117,7 @@ class Tally:
 def page(
     identity: Mapping[str, Any], source: Mapping[str, Any], tally: Tally, *, labels: str, transformed: str
 ) -> dict[str, Any]:
-    """manifest.json of a complete root: identity, source, counts, hashes of each scene's lines and of the new boxes."""
+    """Build manifest.json of a complete root: identity, source, counts, and hashes of lines and new boxes."""
     return {
         "identity": dict(identity),
         "source": dict(source),
@@ -130,31 +132,36 @@ def page(
 
 
 def read_manifest(root: Path) -> dict[str, Any] | None:
-    """manifest.json of a root; None for a clean dataset. StoreError for a root that is not complete."""
+    """Read manifest.json of a root; None for a clean dataset. StoreError for an incomplete root."""
     path = Path(root) / PAGE
     if not path.is_file():
         if (Path(root) / FOLDER).is_dir():
             raise StoreError(f"{root}: nuScenes-N that is not complete (no {PAGE}); run the same ssad shift again")
         return None
-    data = safeio.read_json(path)
-    kinds = {"identity": dict, "source": dict, "scenes": dict, "images": int, "labels": str, "transformed": str}
-    if not isinstance(data, dict) or any(not isinstance(data.get(name), kind) for name, kind in kinds.items()):
+    manifest = safeio.read_json(path)
+    field_types = {"identity": dict, "source": dict, "scenes": dict, "images": int, "labels": str, "transformed": str}
+    if not isinstance(manifest, dict) or any(
+        not isinstance(manifest.get(field_name), field_type) for field_name, field_type in field_types.items()
+    ):
         raise FormatError(f"{path}: not a manifest written by ssad shift")
-    if any(not isinstance(data["source"].get(n), k) for n, k in (("root", str), ("version", str), ("tables", dict))):
+    if any(
+        not isinstance(manifest["source"].get(source_field), source_type)
+        for source_field, source_type in (("root", str), ("version", str), ("tables", dict))
+    ):
         raise FormatError(f"{path}: not a manifest written by ssad shift")
-    return data
+    return manifest
 
 
 def manifest_digest(root: Path) -> str:
-    """The hash by which a results file can say on which data it was made."""
+    """Return the hash by which a results file names the data it was made on."""
     return digest_file(Path(root) / PAGE)
 
 
 def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) -> dict[str, Any] | None:
-    """The manifest of a root, after a check that its data are indeed shifted.
+    """Read the manifest of a root and check that its data are indeed shifted.
 
-    Lines must be those that the page has hashes of; each file must be there with its size, and not be a link to the
-    clean one; `sample` of them, by a fixed draw, are hashed; the boxes must be those that the page names.
+    Lines must match the hashes in the summary; each file must exist with its size, and not be a link to the
+    clean file; `sample` of them, by a fixed draw, are hashed; the boxes must be those that the summary names.
 
     Args:
         root: A nuScenes root.
@@ -171,34 +178,35 @@ def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) 
     manifest = read_manifest(root)
     if manifest is None:
         return None
-    wanted = sorted(set(scenes))
-    missing = [scene for scene in wanted if scene not in manifest["scenes"]]
+    scene_names = sorted(set(scenes))
+    missing = [scene for scene in scene_names if scene not in manifest["scenes"]]
     if missing:
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        remainder = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise StoreError(
-            f"{root}: these scenes are not shifted: {', '.join(missing[:3])}{more}; run ssad shift for them"
+            f"{root}: these scenes are not shifted: {', '.join(missing[:3])}{remainder}; run ssad shift for them"
         )
-    for found in _wrong_boxes(root, manifest):
-        raise StoreError(f"{found}; run the same ssad shift again")
-    draw: list[tuple[str, str, str]] = []
-    for scene in wanted or manifest["scenes"]:
-        lines = read_lines(shard_path(root, scene))
-        if digest_bytes(text(lines.values()).encode()) != manifest["scenes"][scene]:
+    for box_problem in _wrong_boxes(root, manifest):
+        raise StoreError(f"{box_problem}; run the same ssad shift again")
+    smallest: list[tuple[str, str, str]] = []
+    for scene in scene_names or manifest["scenes"]:
+        records = read_lines(shard_path(root, scene))
+        if digest_bytes(text(records.values()).encode()) != manifest["scenes"][scene]:
             raise StoreError(f"{shard_path(root, scene)}: not the lines that {PAGE} was made of; run ssad shift again")
-        for record in lines.values():
+        for record in records.values():
             problem = _wrong(root, record, manifest)
             if problem:
                 raise StoreError(f"{root / record['file']}: {problem}; run the same ssad shift again")
-        shifted = ((r["file"], r["hash"]) for r in lines.values() if r["state"] == "shifted")
-        draw = heapq.nsmallest(sample, [*draw, *((digest("manifest check", *pair), *pair) for pair in shifted)])
-    for _, name, expected in draw:
+        shifted = ((entry["file"], entry["hash"]) for entry in records.values() if entry["state"] == "shifted")
+        # The smallest digests are a reproducible random sample, and need one scene in memory at a time.
+        smallest = heapq.nsmallest(sample, [*smallest, *((digest("manifest check", *pair), *pair) for pair in shifted)])
+    for _, name, expected in smallest:
         if digest_file(root / name) != expected:
             raise StoreError(f"{root / name}: not the bytes in the manifest; run the same ssad shift again")
     return manifest
 
 
 def _wrong(root: Path, record: Mapping[str, Any], manifest: Mapping[str, Any]) -> str | None:
-    """What is wrong with a file, going by its name, size and link alone."""
+    """Return the problem of a file, judged by its name, size and link alone; None if there is none."""
     path = root / record["file"]
     if record["state"] == "failed":
         return f"failed: {record['reason']}"
@@ -217,7 +225,7 @@ def _wrong(root: Path, record: Mapping[str, Any], manifest: Mapping[str, Any]) -
 
 
 def leads_to(link: Path, source: Path) -> bool:
-    """Whether `link` is a symbolic link to `source`, which is there."""
+    """Return whether `link` is a symbolic link to `source`, and `source` exists."""
     try:
         return link.is_symlink() and os.path.samefile(link, source)
     except OSError:
@@ -225,12 +233,14 @@ def leads_to(link: Path, source: Path) -> bool:
 
 
 def _wrong_boxes(root: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
-    """Whether sample_annotation.json is the set of boxes that the page names."""
+    """Yield a problem unless sample_annotation.json is the set of boxes that the summary names."""
     version = manifest["source"]["version"]
     path = root / version / f"{TABLE}.json"
-    new = manifest["labels"] == "transformed"
-    expected = root / version / f"{TABLE}.transformed.json"
-    if not leads_to(path, expected if new else Path(manifest["source"]["root"]) / version / f"{TABLE}.json"):
+    is_transformed = manifest["labels"] == "transformed"
+    transformed_path = root / version / f"{TABLE}.transformed.json"
+    if not leads_to(
+        path, transformed_path if is_transformed else Path(manifest["source"]["root"]) / version / f"{TABLE}.json"
+    ):
         yield f"{path}: no link to the {manifest['labels']} boxes, which {PAGE} names"
 
 
@@ -238,7 +248,7 @@ def verify(root: Path) -> tuple[int, list[str]]:
     """Compare every file and table of a root with the manifest, by their hashes.
 
     Returns:
-        Number of files; and a line for each that differs from the manifest.
+        Number of files; and one line for each that differs from the manifest.
 
     Raises:
         StoreError: The root has no manifest.
@@ -248,29 +258,31 @@ def verify(root: Path) -> tuple[int, list[str]]:
     manifest = read_manifest(root)
     if manifest is None:
         raise StoreError(f"{root}: not written by ssad shift (no {PAGE})")
-    count, problems = 0, list(_wrong_boxes(root, manifest))
+    file_count, problems = 0, list(_wrong_boxes(root, manifest))
     version = manifest["source"]["version"]
-    expected = {name: text for name, text in manifest["source"]["tables"].items() if name != TABLE}
-    expected |= {f"{TABLE}.original": manifest["source"]["tables"].get(TABLE)}
-    expected |= {f"{TABLE}.transformed": manifest["transformed"]}
-    for name, hashed in sorted(expected.items()):
-        problems += _wrong_bytes(root / version / f"{name}.json", hashed)
-    for scene, hashed in manifest["scenes"].items():
-        lines = read_lines(shard_path(root, scene))
-        if digest_bytes(text(lines.values()).encode()) != hashed:
+    table_hashes = {
+        table_name: text for table_name, text in manifest["source"]["tables"].items() if table_name != TABLE
+    }
+    table_hashes |= {f"{TABLE}.original": manifest["source"]["tables"].get(TABLE)}
+    table_hashes |= {f"{TABLE}.transformed": manifest["transformed"]}
+    for table_name, expected_hash in sorted(table_hashes.items()):
+        problems += _wrong_bytes(root / version / f"{table_name}.json", expected_hash)
+    for scene, expected_hash in manifest["scenes"].items():
+        records = read_lines(shard_path(root, scene))
+        if digest_bytes(text(records.values()).encode()) != expected_hash:
             problems.append(f"{shard_path(root, scene)}: not the lines that {PAGE} was made of")
-        for record in lines.values():
-            count += 1
+        for record in records.values():
+            file_count += 1
             problem = _wrong(root, record, manifest)
             if problem:
                 problems.append(f"{root / record['file']}: {problem}")
             elif record["state"] == "shifted":
                 problems += _wrong_bytes(root / record["file"], record["hash"])
-    return count, problems
+    return file_count, problems
 
 
 def _wrong_bytes(path: Path, expected: str) -> list[str]:
-    """A line when a file has another hash or cannot be read."""
+    """Return one line if a file has another hash or cannot be read."""
     try:
         return [] if digest_file(path) == expected else [f"{path}: not the bytes in the manifest"]
     except FormatError as error:

@@ -1,4 +1,4 @@
-"""What `ssad shift` is asked for, and the pieces of work it falls into."""
+"""Options of `ssad shift`, and the shards that the work is divided into."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SUBSAMPLING = ("auto", "444", "422", "420")
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What to write. A file in which nothing changes is linked, so that severity 0 gives the dataset itself.
+    """Options of `ssad shift`. Files in which nothing changes are linked, so severity 0 reproduces the dataset.
 
     Attributes:
         source: A nuScenes root.
@@ -28,12 +28,13 @@ class Options:
         severities: 0 to 5, or "random".
         seed: Seed of all draws.
         calibration: Calibration of the shifts.
-        labels: Which boxes sample_annotation.json holds; the other set is written beside it.
+        labels: Set of boxes in sample_annotation.json; the other set is written beside it.
         scenes: Names of scenes; empty: all.
         sweeps: Whether files between key frames are shifted too; else they are linked.
         lidar: Whether LiDAR files are shifted too; else they are linked.
-        quality: Of JPEG files.
-        subsampling: Of JPEG files; "auto": 444 for sensor noise, which 420 would weaken by 29 %, else 420.
+        quality: Quality of JPEG files.
+        subsampling: Chroma subsampling of JPEG files; "auto": 444 for sensor noise, which 420 would weaken by
+            29 %, else 420.
     """
 
     source: Path
@@ -51,7 +52,7 @@ class Options:
     subsampling: str = "auto"
 
     def __post_init__(self) -> None:
-        for name in ("shifts", "severities", "scenes"):  # asked for twice: written once
+        for name in ("shifts", "severities", "scenes"):  # a repeated name is written only once
             object.__setattr__(self, name, tuple(dict.fromkeys(getattr(self, name))))
         if not self.shifts or not self.severities:
             raise ConfigError("no shift or no severity to apply")
@@ -61,6 +62,7 @@ class Options:
             raise ConfigError(f"subsampling '{self.subsampling}': expected auto, 444, 422 or 420")
         if not 1 <= self.quality <= 100:
             raise ConfigError(f"quality {self.quality}: expected 1 to 100")
+        # Building the specs checks the names of shifts and severities before anything is written.
         for shard in self.shards(("",)):
             shard.spec()
         out, source = self.out.resolve(), self.source.resolve()
@@ -70,28 +72,31 @@ class Options:
             )
 
     def absolute(self) -> Options:
-        """The same with folders whose names hold in another process."""
+        """Return the options with absolute folders, which other processes can resolve."""
         return replace(self, source=self.source.absolute(), out=self.out.absolute())
 
     def shards(self, scenes: tuple[str, ...]) -> list[Shard]:
-        """One piece of work a shift, severity and scene."""
+        """Return one shard for each shift, severity and scene."""
         return [
-            Shard(self, shift, severity, s) for shift in self.shifts for severity in self.severities for s in scenes
+            Shard(self, shift, severity, scene)
+            for shift in self.shifts
+            for severity in self.severities
+            for scene in scenes
         ]
 
     def root(self, shift: str, severity: Strength) -> Path:
-        """The nuScenes root of a shift and severity."""
+        """Return the nuScenes root of a shift and severity."""
         return self.out / f"{shift}-{severity}"
 
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """One scene under one shift: what a worker is given.
+    """One scene under one shift: the unit of work of a worker.
 
     Attributes:
-        options: What to write.
+        options: Options of the command.
         shift: Name of the shift.
-        severity: As asked for.
+        severity: Requested severity.
         scene: Name of the scene.
     """
 
@@ -102,28 +107,28 @@ class Shard:
 
     @property
     def root(self) -> Path:
-        """The nuScenes root it belongs to."""
+        """The nuScenes root that the shard belongs to."""
         return self.options.root(self.shift, self.severity)
 
     @property
     def random(self) -> bool:
-        """Whether the severity is drawn."""
+        """True if the severity is drawn at random."""
         return self.severity == "random"
 
     @property
     def subsampling(self) -> str:
-        """Of its JPEG files."""
+        """Chroma subsampling of the shard's JPEG files."""
         if self.options.subsampling != "auto":
             return self.options.subsampling
         return "444" if KNOWN[self.shift][0] == "sensor" else "420"
 
     def spec(self) -> ShiftSpec:
-        """The shift; severity 1 stands for a random one until it is drawn."""
+        """Return the shift; severity 1 stands for a random one until it is drawn."""
         severity = 1 if self.severity == "random" else self.severity
         return ShiftSpec(self.shift, severity, self.options.seed, self.options.calibration)
 
     def identity(self) -> Mapping[str, Any]:
-        """What decides the bytes of its files: two shards of one identity and source are equal."""
+        """Return all that determines the bytes of the files: shards of one identity and source are equal."""
         options = self.options
         return {
             "shift": self.shift,

@@ -1,4 +1,4 @@
-"""One scene under one shift, written out: what a worker does. It can be killed at any moment and started again."""
+"""Worker that writes one scene under one shift. It can be killed at any moment and started again."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from ssad.recorders.shifted.manifest import (
 from ssad.recorders.shifted.options import Shard
 from ssad.scenarios.static.shifts.scene_shifter import SceneShifter
 
-UNFINISHED: Final = ".unfinished"  # folder of a root for files that are being written; removed when it is done
+UNFINISHED: Final = ".unfinished"  # folder of a root for partly written files; removed when the root is complete
 _DATA: dict[object, NuScenes] = {}
 
 
@@ -54,43 +54,51 @@ class SceneLabels(msgspec.Struct):
 
 
 def labels_path(root: Path, scene: str) -> Path:
-    """The boxes of a scene after the shift: written last, so that they are there only for a finished scene."""
+    """Return the path of a scene's shifted boxes: written last, so that they exist only for a finished scene."""
     return root / FOLDER / f"{scene}.labels.json"
 
 
 def finished(root: Path, scene: str) -> SceneLabels | None:
-    """The boxes of a scene all of whose files were made; None for one that is still to be done."""
+    """Return the boxes of a scene all of whose files were made; None for an unfinished scene."""
     try:
-        data = safeio.read_bytes(labels_path(root, scene), limit=1 << 30)
-        labels = msgspec.json.decode(data, type=SceneLabels)
+        encoded = safeio.read_bytes(labels_path(root, scene), limit=1 << 30)
+        labels = msgspec.json.decode(encoded, type=SceneLabels)
         return labels if labels.lines == digest_file(shard_path(root, scene)) else None
     except (FormatError, msgspec.MsgspecError):
-        return None  # not there, or damaged: the scene is looked through again
+        return None  # missing or damaged: the scene is checked again
 
 
 def make_shard(shard: Shard) -> dict[str, int]:
-    """Writes the files of a scene, its manifest lines and its labels; counts by state.
+    """Write the files of a scene, its manifest lines and its labels.
 
-    Files that are there as their line says are left alone. A file that cannot be made because of the dataset is
-    recorded as failed. StoreError when the output cannot be written; FormatError for broken tables.
+    Files that match their line are left alone. A file that cannot be made because of the dataset is recorded as
+    failed.
+
+    Returns:
+        Number of files by state.
+
+    Raises:
+        StoreError: The output cannot be written.
+        FormatError: The tables are broken.
     """
     threads = cv2.getNumThreads()
+    # Each worker has one core: threads of OpenCV would only compete with other workers.
     cv2.setNumThreads(1)
     quiet_warp()
     try:
-        done = _files(shard)
+        records = _files(shard)
     finally:
         cv2.setNumThreads(threads)
-    return {state: sum(r["state"] == state for r in done.values()) for state in STATES}
+    return {state: sum(record["state"] == state for record in records.values()) for state in STATES}
 
 
 def _open(shard: Shard) -> NuScenes:
-    """The dataset, kept open between shards for as long as its tables stay the same."""
+    """Return the dataset, kept open between shards while its tables stay the same."""
     source, version = shard.options.source, shard.options.version
     key = (source, version, fingerprint(source, version))
     if key not in _DATA:
-        for old in _DATA.values():
-            old.close()
+        for dataset in _DATA.values():
+            dataset.close()
         _DATA.clear()
         _DATA[key] = NuScenes(source, version)
     return _DATA[key]
@@ -99,65 +107,66 @@ def _open(shard: Shard) -> NuScenes:
 def _files(shard: Shard) -> dict[str, dict[str, Any]]:
     scene = _open(shard).scene(shard.scene)
     shifter = SceneShifter(shard.options.source, scene, shard.spec(), random=shard.random)
-    path, labels = shard_path(shard.root, shard.scene), labels_path(shard.root, shard.scene)
-    known = read_lines(path)
-    done: dict[str, dict[str, Any]] = {}
+    lines_path, labels_file = shard_path(shard.root, shard.scene), labels_path(shard.root, shard.scene)
+    previous_records = read_lines(lines_path)
+    records: dict[str, dict[str, Any]] = {}
     for frame in scene.frames:
-        old = known.get(frame.filename)
-        if old is not None and _stands(shard, old) and not shifter.outdated(frame, old):
-            done[frame.filename] = old
-    if len(done) == len({f.filename for f in scene.frames}):
-        made = finished(shard.root, shard.scene)
-        if made is not None and made.lines == digest_bytes(text(done.values()).encode()):
-            return done
-    _remove(labels)
-    check_folders(shard.root, {Path(f.filename).parent for f in scene.frames}, shard.options.source)
-    safeio.make_folder(path.parent)
-    with _appending(path) as lines:
+        previous = previous_records.get(frame.filename)
+        if previous is not None and _stands(shard, previous) and not shifter.outdated(frame, previous):
+            records[frame.filename] = previous
+    if len(records) == len({other_frame.filename for other_frame in scene.frames}):
+        scene_labels = finished(shard.root, shard.scene)
+        if scene_labels is not None and scene_labels.lines == digest_bytes(text(records.values()).encode()):
+            return records
+    # The labels mark a finished scene, so they must go before any file changes.
+    _remove(labels_file)
+    check_folders(shard.root, {Path(other_frame.filename).parent for other_frame in scene.frames}, shard.options.source)
+    safeio.make_folder(lines_path.parent)
+    with _appending(lines_path) as lines_file:
         for frame in scene.frames:
-            if frame.filename not in done:
-                record = done[frame.filename] = _make(shard, shifter, frame)
-                _append(path, lines, record)
+            if frame.filename not in records:
+                record = records[frame.filename] = _make(shard, shifter, frame)
+                _append(lines_path, lines_file, record)
     boxes = {}
     for sample in scene.samples:
-        boxes.update(_boxes(shard, shifter, sample.token, done))
-    lines_text = text(done.values())
-    safeio.write_atomic(path, lines_text)
-    found = {"lines": digest_bytes(lines_text.encode()), "boxes": boxes}
-    safeio.write_atomic(labels, safeio.dump_json(found) + "\n")
-    return done
+        boxes.update(_boxes(shard, shifter, sample.token, records))
+    manifest_text = text(records.values())
+    safeio.write_atomic(lines_path, manifest_text)
+    content = {"lines": digest_bytes(manifest_text.encode()), "boxes": boxes}
+    safeio.write_atomic(labels_file, safeio.dump_json(content) + "\n")
+    return records
 
 
 def check_folders(root: Path, folders: Iterable[str | Path], source: Path) -> None:
-    """StoreError when a folder to write into leads into the dataset itself, whose files must not be replaced."""
-    clean = os.path.realpath(source)
+    """Raise StoreError if an output folder leads into the dataset, whose files must not be replaced."""
+    dataset_folder = os.path.realpath(source)
     for folder in sorted(map(str, folders)):
-        if Path(os.path.realpath(root / folder)).is_relative_to(clean):
+        if Path(os.path.realpath(root / folder)).is_relative_to(dataset_folder):
             raise StoreError(f"{root / folder}: leads into the dataset {source}; remove that link and run again")
 
 
 @contextlib.contextmanager
 def _appending(path: Path) -> Iterator[RawIOBase]:
-    """The file, open to append whole lines, on disk when the block ends."""
+    """Open a file to append whole lines; it is on disk when the block ends."""
     try:
-        file = open(path, "ab", buffering=0)  # noqa: SIM115 (errors of the block are not those of the file)
+        stream = open(path, "ab", buffering=0)  # noqa: SIM115 (errors of the block are not those of the file)
     except OSError as error:
         raise _cannot(path, error) from None
-    with file:
-        if file.tell():
-            _append(path, file, None)  # ends a line that a kill may have torn
-        yield file
+    with stream:
+        if stream.tell():
+            _append(path, stream, None)  # ends a line that a kill may have truncated
+        yield stream
         try:
-            os.fsync(file.fileno())
+            os.fsync(stream.fileno())
         except OSError as error:
             raise _cannot(path, error) from None
 
 
 def _append(path: Path, file: RawIOBase, record: Mapping[str, Any] | None) -> None:
-    data = (safeio.dump_json(record) if record else "").encode() + b"\n"
+    remaining = (safeio.dump_json(record) if record else "").encode() + b"\n"
     try:
-        while data:
-            data = data[file.write(data) :]
+        while remaining:
+            remaining = remaining[file.write(remaining) :]
     except OSError as error:
         raise _cannot(path, error) from None
 
@@ -167,7 +176,7 @@ def _cannot(path: Path, error: OSError) -> StoreError:
 
 
 def _stands(shard: Shard, record: Mapping[str, Any]) -> bool:
-    """Whether a file is as its line says."""
+    """Return whether a file matches its manifest line."""
     path, source = shard.root / str(record["file"]), shard.options.source / str(record["file"])
     if record["state"] == "linked":
         return leads_to(path, source)
@@ -179,7 +188,7 @@ def _stands(shard: Shard, record: Mapping[str, Any]) -> bool:
 
 
 def _make(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> dict[str, Any]:
-    """Makes one file, shifted or linked, and says what was done."""
+    """Make one file, shifted or linked, and return its manifest line."""
     kind = "camera" if frame.modality == "camera" else "lidar" if frame.channel == LIDAR else frame.modality
     record: dict[str, Any] = {"file": frame.filename, "kind": kind, "token": frame.token}
     if kind not in ("camera", "lidar"):
@@ -187,29 +196,34 @@ def _make(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> dict[str, 
     if (kind == "lidar" and not shard.options.lidar) or not (frame.key_frame or shard.options.sweeps):
         return _link(shard, record | {"reason": "not asked for"}, needed=False)
     try:
-        data, pixels, applied = (_image if kind == "camera" else _points)(shard, shifter, frame)
+        encoded, pixels, applied = (_image if kind == "camera" else _points)(shard, shifter, frame)
     except FormatError as error:
         return _failed(shard, record, str(error))
     except (ArithmeticError, np.linalg.LinAlgError) as error:
-        why = f"{frame.filename}: its boxes, pose or calibration make no picture: {error}"
-        return _failed(shard, record, why)
-    told = {"applied": applied.applied, "details": dict(applied.details), "skipped": dict(applied.skipped)}
-    record |= {"severity": shifter.spec(frame).severity, "changed": data is not None, **told, **shifter.basis(frame)}
-    if data is None:
+        message = f"{frame.filename}: its boxes, pose or calibration make no picture: {error}"
+        return _failed(shard, record, message)
+    application = {"applied": applied.applied, "details": dict(applied.details), "skipped": dict(applied.skipped)}
+    record |= {
+        "severity": shifter.spec(frame).severity,
+        "changed": encoded is not None,
+        **application,
+        **shifter.basis(frame),
+    }
+    if encoded is None:
         return _link(shard, record if applied.skipped else record | {"reason": _idle(shifter, frame)})
-    _write(shard.root, shard.root / frame.filename, data)
-    return record | {"state": "shifted", "pixels": pixels, "hash": digest_bytes(data), "bytes": len(data)}
+    _write(shard.root, shard.root / frame.filename, encoded)
+    return record | {"state": "shifted", "pixels": pixels, "hash": digest_bytes(encoded), "bytes": len(encoded)}
 
 
 def _idle(shifter: SceneShifter, frame: SensorFrame) -> str:
-    """Why a file did not change, where the shift does not say."""
+    """Return the reason why a file did not change, for shifts that state none."""
     if shifter.spec(frame).severity == 0:
         return "severity 0 changes nothing"
     return "no object in it" if shifter.base.family == "object" else "the shift changed nothing in it"
 
 
 def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, Applied]:
-    """Bytes of a shifted image (None: unchanged), hash of its pixels, what was done."""
+    """Return bytes of a shifted image (None: unchanged), hash of its pixels, and the application of the shift."""
     clean = shifter.read(frame)
     image, applied = shifter.image(frame, clean=clean)
     if not applied.applied or np.array_equal(image, clean):
@@ -219,12 +233,12 @@ def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[byt
 
 
 def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, Applied]:
-    """Bytes of a shifted sweep (None: unchanged), their hash, what was done."""
+    """Return bytes of a shifted sweep (None: unchanged), their hash, and the application of the shift."""
     points, applied = shifter.points(frame)
     if not applied.applied or np.array_equal(points, shifter.cloud(frame)):
         return None, "", applied
-    data = points_bytes(points)
-    return data, digest_bytes(data), applied
+    encoded = points_bytes(points)
+    return encoded, digest_bytes(encoded), applied
 
 
 def _boxes(shard: Shard, shifter: SceneShifter, sample: str, done: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -232,42 +246,44 @@ def _boxes(shard: Shard, shifter: SceneShifter, sample: str, done: dict[str, dic
     sweep = shifter.key_sweep(sample)
     state = "absent" if sweep is None else done[sweep.filename]["state"]
     try:
-        found = shifter.labels(sample, lidar=None if state in ("absent", "failed") else shard.options.lidar)
-    except FormatError as error:  # linked unseen, now found to be broken
+        labels = shifter.labels(sample, lidar=None if state in ("absent", "failed") else shard.options.lidar)
+    except FormatError as error:  # it was linked without being read
         assert sweep is not None
-        kept = {name: done[sweep.filename][name] for name in ("file", "kind", "token")}
-        done[sweep.filename] = _failed(shard, kept, str(error))
-        found = shifter.labels(sample, lidar=None)
-    sizes = found.size_wlh
+        identity = {name: done[sweep.filename][name] for name in ("file", "kind", "token")}
+        done[sweep.filename] = _failed(shard, identity, str(error))
+        labels = shifter.labels(sample, lidar=None)
+    sizes = labels.size_wlh
     return {
         token: {
-            "translation": found.centre[n].tolist(),
-            "size": sizes[n].tolist(),
-            "rotation": found.rotation[n].tolist(),
-            "num_lidar_pts": int(found.lidar_points[n]),
+            "translation": labels.centre[row].tolist(),
+            "size": sizes[row].tolist(),
+            "rotation": labels.rotation[row].tolist(),
+            "num_lidar_pts": int(labels.lidar_points[row]),
         }
-        for n, token in enumerate(found.token)
+        for row, token in enumerate(labels.token)
     }
 
 
 def _failed(shard: Shard, record: dict[str, Any], message: str) -> dict[str, Any]:
-    """A line for a file that cannot be made; nothing is left of an older one."""
+    """Return the manifest line of a file that cannot be made, and remove any older version of it."""
     _remove(shard.root / record["file"])
     return record | {"state": "failed", "reason": message.replace(f"{shard.options.source}{os.sep}", "")}
 
 
 def _encode(image: U8, shard: Shard, name: str) -> bytes:
-    """The file's bytes, in the format of the original."""
+    """Encode an image in the format of the original file."""
     if name.lower().endswith(".png"):
-        fine, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        if not fine:
+        succeeded, encoded = cv2.imencode(
+            ".png", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        )
+        if not succeeded:
             raise FormatError(f"{name}: cannot be encoded as PNG")
-        return data.tobytes()
+        return encoded.tobytes()
     return encode_jpeg(image, shard.options.quality, shard.subsampling)
 
 
 def _link(shard: Shard, record: dict[str, Any], *, needed: bool = True) -> dict[str, Any]:
-    """A link to the clean file; one that is not needed may be absent."""
+    """Link a file to the clean one and return its manifest line; a file that is not needed may be absent."""
     source = shard.options.source / record["file"]
     if not os.path.isfile(source):
         if needed or os.path.lexists(source):
@@ -283,43 +299,44 @@ def _temporary(root: Path) -> Path:
 
 
 def link(root: Path, source: Path, target: Path) -> None:
-    """Put a symbolic link in place of whatever was there.
+    """Put a symbolic link in place of any existing file.
 
-    It names the file that `source` finally resolves to; a file beside it is named relatively, so that a root may be
-    moved.
+    The link names the file that `source` finally resolves to; a file in the same folder is named relatively, so
+    that a root may be moved.
 
     Args:
         root: Folder of the dataset.
-        source: What the link leads to.
-        target: Where the link is put.
+        source: File that the link leads to.
+        target: Path of the link.
 
     Raises:
         StoreError: The link cannot be written.
     """
-    end = source.name if source.parent == target.parent else os.path.realpath(source)
+    destination = source.name if source.parent == target.parent else os.path.realpath(source)
     try:
-        if os.path.islink(target) and os.readlink(target) == end:
+        if os.path.islink(target) and os.readlink(target) == destination:
             return
     except OSError as error:
         raise _cannot(target, error) from None
     with _replacing(root, target) as temporary:
-        temporary.symlink_to(end)
+        temporary.symlink_to(destination)
 
 
 def _write(root: Path, target: Path, data: bytes) -> None:
-    """The whole file or nothing. Not synced one by one: its size and hash are in the manifest, which is."""
+    """Write a whole file or nothing. Files are not synced: their size and hash are in the manifest, which is."""
     with _replacing(root, target) as temporary:
         temporary.write_bytes(data)
 
 
 @contextlib.contextmanager
 def _replacing(root: Path, target: Path) -> Iterator[Path]:
-    """A path in the folder of unfinished files that replaces `target` when the block ends well. StoreError."""
+    """Yield a path in the folder of unfinished files that replaces `target` if the block succeeds. StoreError."""
     temporary = _temporary(root)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary.parent.mkdir(exist_ok=True)
         yield temporary
+        # A rename within one file system is atomic: a kill leaves either the old file or the new one.
         os.replace(temporary, target)
     except OSError as error:
         raise _cannot(target, error) from None

@@ -1,4 +1,4 @@
-"""`ssad shift`: plans the shards, hands them to processes or to Ray, and finishes each root."""
+"""`ssad shift`: plan the shards, run them in processes or on Ray, and finish each root."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ssad.recorders.shifted.scene_writer import UNFINISHED, check_folders, finis
 from ssad.scenarios.static.shifts.sun import NO_SUN
 
 Progress = Callable[[int, int], None]
-SHARD_S = 7200.0  # s that a scene under a shift may take
+SHARD_S = 7200.0  # time limit of a scene under a shift, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Written:
         linked: Number of files linked to the original.
         failed: Number of files that failed.
         applied: Share of the images that changed.
-        reasons: Why files failed.
+        reasons: Reasons of failed files.
     """
 
     root: Path
@@ -50,15 +50,15 @@ class Written:
 def materialise(
     options: Options, *, workers: int | None = None, ray: str | None = None, progress: Progress = lambda done, of: None
 ) -> list[Written]:
-    """Write one nuScenes root for each shift and severity; run again, it resumes and keeps what is there.
+    """Write one nuScenes root for each shift and severity; a repeated run resumes and keeps existing files.
 
     The bytes depend neither on the number of workers nor on the cluster.
 
     Args:
-        options: What to write.
-        workers: Number of processes; None: one for each core; 0: all in this process.
+        options: Options of the command.
+        workers: Number of processes; None: one per core; 0: all in this process.
         ray: Address of a cluster that sees the same folders.
-        progress: Called with the number of finished parts and of all parts.
+        progress: Called with the number of finished shards and of all shards.
 
     Returns:
         The state of each root.
@@ -72,55 +72,57 @@ def materialise(
         raise ConfigError(f"{workers} workers: expected 1 or more (0: in this process)")
     if (options.source / FOLDER / "identity.json").exists():
         raise ConfigError(f"{options.source}: shifted already; give the clean dataset")
-    data = NuScenes(options.source, options.version)
-    names = tuple(record.name for record in data.scenes())
-    unknown = sorted(set(options.scenes) - set(names))
+    dataset = NuScenes(options.source, options.version)
+    all_scenes = tuple(record.name for record in dataset.scenes())
+    unknown = sorted(set(options.scenes) - set(all_scenes))
     if unknown:
         raise ConfigError(f"{options.source}: no scene {', '.join(unknown[:5])} in {options.version}")
-    chosen = options.scenes or names
-    if not chosen:
+    scene_names = options.scenes or all_scenes
+    if not scene_names:
         raise ConfigError(f"{options.source}: {options.version} has no scenes")
-    data.scene(chosen[0])  # broken tables are found before anything is written; builds the index once
-    data.close()
-    roots = [(shift, severity) for shift in options.shifts for severity in options.severities]
+    dataset.scene(scene_names[0])  # broken tables are found before anything is written; builds the index once
+    dataset.close()
+    conditions = [(shift, severity) for shift in options.shifts for severity in options.severities]
     source = {"root": str(options.source.resolve()), "version": options.version, "tables": _tables(options)}
     with locked(options.out, "ssad shift"):
-        for shift, severity in roots:
+        for shift, severity in conditions:
             _begin(options, shift, severity, source)
-        shards = options.absolute().shards(chosen)
+        shards = options.absolute().shards(scene_names)
         run_all(
             open_pool(len(shards), workers=workers, ray=ray), make_shard, shards, timeout_s=SHARD_S, progress=progress
         )
-        written, problems = [], []
-        for shift, severity in roots:
+        written_roots, errors = [], []
+        for shift, severity in conditions:
             try:
-                written.append(_finish(options, shift, severity, source=source, scenes=chosen, known=names))
-            except StoreError as error:  # the other roots are finished nevertheless
-                problems.append(error)
-        if problems:
-            raise StoreError(" | ".join(map(str, problems)))
-        return written
+                written_roots.append(
+                    _finish(options, shift, severity, source=source, scenes=scene_names, known=all_scenes)
+                )
+            except StoreError as error:  # finish the other roots nevertheless
+                errors.append(error)
+        if errors:
+            raise StoreError(" | ".join(map(str, errors)))
+        return written_roots
 
 
 def _tables(options: Options) -> dict[str, str]:
-    """Hashes of the tables: a shifted root belongs to one dataset."""
+    """Return the hashes of the tables: a shifted root belongs to one dataset."""
     return {name: digest_file(table_path(options.source, options.version, name)) for name in sorted(TABLES)}
 
 
 def _begin(options: Options, shift: str, severity: Strength, source: dict[str, Any]) -> None:
-    """A new root, or one of the same identity to go on with. StoreError for another's."""
+    """Create a root, or resume one with the same identity. StoreError for a root of another identity."""
     root = options.root(shift, severity)
     check_folders(root, ("", FOLDER, options.version, UNFINISHED), options.source)
     safeio.make_folder(root / FOLDER)
     identity = {"identity": dict(Shard(options, shift, severity, "").identity()), "source": source}
-    path = root / FOLDER / "identity.json"
-    if path.exists():
-        if _read_identity(path) != identity:
+    identity_path = root / FOLDER / "identity.json"
+    if identity_path.exists():
+        if _read_identity(identity_path) != identity:
             raise StoreError(f"{root}: holds a shift of other data or options; choose another folder")
     else:
-        safeio.write_atomic(path, safeio.dump_json(identity, indent=1) + "\n")
+        safeio.write_atomic(identity_path, safeio.dump_json(identity, indent=1) + "\n")
     try:
-        (root / PAGE).unlink(missing_ok=True)  # not complete until it is again
+        (root / PAGE).unlink(missing_ok=True)  # the root is incomplete until this run finishes it
         _clear(root, options.version)
     except OSError as error:
         raise StoreError(f"{root}: cannot be written: {error.strerror or error}") from None
@@ -128,14 +130,15 @@ def _begin(options: Options, shift: str, severity: Strength, source: dict[str, A
         if entry.name in ("samples", "sweeps", PAGE, FOLDER) or entry.name.startswith(("v1.0-", ".")):
             continue
         link(root, entry, root / entry.name)
-    own = {f"{TABLE}.json", f"{TABLE}.original.json", f"{TABLE}.transformed.json"}
+    # The annotation tables are written at the end; all other tables are linked.
+    annotation_tables = {f"{TABLE}.json", f"{TABLE}.original.json", f"{TABLE}.transformed.json"}
     for table in sorted((options.source / options.version).glob("*.json")):
-        if table.name not in own:
+        if table.name not in annotation_tables:
             link(root, table, root / options.version / table.name)
 
 
 def _read_identity(path: Path) -> Any:
-    """What a root says that it holds; None when that is damaged."""
+    """Read the identity file of a root; None if it is damaged."""
     try:
         return safeio.read_json(path)
     except FormatError:
@@ -143,7 +146,7 @@ def _read_identity(path: Path) -> Any:
 
 
 def _clear(root: Path, version: str) -> None:
-    """Removes what a killed run left half written."""
+    """Remove files that a killed run left unfinished."""
     if (root / UNFINISHED).exists():
         shutil.rmtree(root / UNFINISHED, ignore_errors=True)
     for folder in (root.parent, root, root / FOLDER, root / version):
@@ -164,26 +167,28 @@ def _finish(
     The page covers the scenes of earlier runs as well, if they are whole: scenes may be spread over runs.
     """
     root = options.root(shift, severity)
-    tally, labels = Tally(), dict[str, msgspec.Raw]()
+    tally, scene_boxes = Tally(), dict[str, msgspec.Raw]()
     for scene in known:
-        made = finished(root, scene)
-        if made is None and scene in scenes:
+        scene_labels = finished(root, scene)
+        if scene_labels is None and scene in scenes:
             raise StoreError(f"{root}: the lines of {scene} are gone; run the same ssad shift again")
-        lines = read_lines(shard_path(root, scene)).values() if made is not None else ()
-        if made is None or (scene not in scenes and any(r["state"] == "failed" for r in lines)):
+        records = read_lines(shard_path(root, scene)).values() if scene_labels is not None else ()
+        if scene_labels is None or (scene not in scenes and any(record["state"] == "failed" for record in records)):
             continue
-        tally.add(scene, lines)
-        labels |= made.boxes
-    transformed = _write_labels(options, root, labels)
+        tally.add(scene, records)
+        scene_boxes |= scene_labels.boxes
+    transformed = _write_labels(options, root, scene_boxes)
     changed = tally.changed if tally.images else tally.states["shifted"]
     if not tally.reasons and severity != 0 and not changed and not (tally.skipped.keys() & NO_SUN):
-        why = "; ".join(f"{reason} ({count})" for reason, count in sorted(tally.skipped.items()))
-        raise StoreError(f"{root}: {shift} changed none of {tally.images} images: {why or 'no reason was given'}")
+        explanation = "; ".join(f"{reason} ({count})" for reason, count in sorted(tally.skipped.items()))
+        raise StoreError(
+            f"{root}: {shift} changed none of {tally.images} images: {explanation or 'no reason was given'}"
+        )
     shutil.rmtree(root / UNFINISHED, ignore_errors=True)
     if not tally.reasons:
         identity = Shard(options, shift, severity, "").identity()
-        found = page(identity, source, tally, labels=options.labels, transformed=transformed)
-        safeio.write_atomic(root / PAGE, safeio.dump_json(found, indent=1) + "\n")
+        manifest = page(identity, source, tally, labels=options.labels, transformed=transformed)
+        safeio.write_atomic(root / PAGE, safeio.dump_json(manifest, indent=1) + "\n")
     states = tally.states
     return Written(
         root, states["shifted"], states["linked"], states["failed"], tally.applied, tuple(sorted(tally.reasons))
@@ -191,22 +196,26 @@ def _finish(
 
 
 def _write_labels(options: Options, root: Path, labels: dict[str, msgspec.Raw]) -> str:
-    """sample_annotation.json as asked for; both sets of boxes beside it. One pass, a block at a time.
+    """Write sample_annotation.json as requested, and both sets of boxes beside it, a block at a time.
 
-    The hash of the transformed ones.
+    Returns:
+        Hash of the transformed table.
     """
     original = table_path(options.source, options.version, TABLE)
     folder = table_path(root, options.version, TABLE).parent
-    moved = folder / f"{TABLE}.transformed.json"
+    transformed = folder / f"{TABLE}.transformed.json"
     encoder = msgspec.json.Encoder()
-    with safeio.atomic_path(moved) as temporary, open(temporary, "wb") as file:
+    with safeio.atomic_path(transformed) as temporary, open(temporary, "wb") as output:
         separator = b"[\n"
         for block in stream(original, dict[str, Any]):
-            for row in block:
-                new = labels.get(row.get("token", ""))
-                file.write(separator + encoder.encode(row if new is None else row | msgspec.json.decode(new)))
+            for annotation in block:
+                moved_box = labels.get(annotation.get("token", ""))
+                output.write(
+                    separator
+                    + encoder.encode(annotation if moved_box is None else annotation | msgspec.json.decode(moved_box))
+                )
                 separator = b",\n"
-        file.write(b"\n]\n" if separator == b",\n" else b"[\n]\n")
+        output.write(b"\n]\n" if separator == b",\n" else b"[\n]\n")
     link(root, original, folder / f"{TABLE}.original.json")
-    link(root, original if options.labels == "original" else moved, folder / f"{TABLE}.json")
-    return digest_file(moved)
+    link(root, original if options.labels == "original" else transformed, folder / f"{TABLE}.json")
+    return digest_file(transformed)

@@ -23,7 +23,7 @@ DETAILS = (0, 1, 2)
 
 @dataclass(frozen=True, slots=True)
 class BodyStyle:
-    """Mean size (length, width, height) m, its relative spread, and how often the style is drawn."""
+    """Mean size (length, width, height) m, relative spread of the size, and weight in random draws."""
 
     size: Point
     spread: float = 0.04
@@ -32,7 +32,7 @@ class BodyStyle:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A kind of body: its maker and its styles. `phased` bodies move with a phase (rad)."""
+    """Maker and styles of a kind of body. `phased` bodies move with a phase (rad)."""
 
     make: Callable[..., Mesh]
     styles: Mapping[str, BodyStyle]
@@ -256,11 +256,11 @@ PAINT_SHARES: dict[str, float] = {
 
 
 def draw_paint(generator: np.random.Generator) -> tuple[float, float, float]:
-    """A car paint (linear RGB), as common as on the road, with a small shift of its brightness."""
+    """Draw a car paint (linear RGB) with the frequency of new cars and a small shift of its brightness."""
     shares = np.array([PAINT_SHARES[name] for name in PAINTS])
-    r, g, b = list(PAINTS.values())[int(generator.choice(len(shares), p=shares / shares.sum()))]
-    k = float(generator.uniform(0.9, 1.1))
-    return r * k, g * k, b * k
+    red, green, blue = list(PAINTS.values())[int(generator.choice(len(shares), p=shares / shares.sum()))]
+    brightness = float(generator.uniform(0.9, 1.1))
+    return red * brightness, green * brightness, blue * brightness
 
 
 def draw_style(kind: str, *, generator: np.random.Generator) -> str:
@@ -270,7 +270,7 @@ def draw_style(kind: str, *, generator: np.random.Generator) -> str:
         UnknownNameError: There is no such kind.
     """
     styles = _body(kind).styles
-    weights = np.array([s.weight for s in styles.values()])
+    weights = np.array([body_style.weight for body_style in styles.values()])
     return list(styles)[int(generator.choice(len(weights), p=weights / weights.sum()))]
 
 
@@ -280,9 +280,9 @@ def draw_size(kind: str, style: str, *, generator: np.random.Generator) -> Point
     Raises:
         UnknownNameError: There is no such kind or style.
     """
-    entry = _style(kind, style)
-    share = 1.0 + entry.spread * np.clip(generator.normal(size=3), -2.0, 2.0) * [1.0, 0.5, 0.7]
-    length, width, height = (float(v) for v in np.asarray(entry.size) * share)
+    body_style = _style(kind, style)
+    scale = 1.0 + body_style.spread * np.clip(generator.normal(size=3), -2.0, 2.0) * [1.0, 0.5, 0.7]
+    length, width, height = (float(extent) for extent in np.asarray(body_style.size) * scale)
     return (length, length, height) if kind == "traffic_cone" else (length, width, height)
 
 
@@ -295,11 +295,11 @@ def make_body(
     detail: int = 2,
     phase: float | None = None,
 ) -> Mesh:
-    """The mesh of a kind of road user or furniture, see `BODIES`; base centred on the origin, x forward.
+    """Make the mesh of a kind of road user or furniture (see `BODIES`), base centred on the origin, x forward.
 
-    The mesh fills its size exactly; a walker fills it over the whole walking cycle. A panel has the same place in the
-    texture atlas in every body of a style, whatever its size and detail. The generator always yields the same number of
-    draws for a style.
+    The mesh fills its size exactly; a walker fills it over the whole walking cycle. A panel has the same place
+    in the texture atlas in every body of a style, whatever its size and detail. The generator always yields the
+    same number of draws for a style.
 
     Args:
         kind: Name of the kind.
@@ -309,47 +309,58 @@ def make_body(
         detail: 2 is full, 0 is for far away; draws and size do not depend on it.
         phase: Place in the cycle of a walker, or angle of a bicycle's crank, rad.
 
+    Returns:
+        The mesh.
+
     Raises:
         UnknownNameError: There is no such kind or style.
         ConfigError: The size is not three lengths in [0.01, 100] m, or there is no such detail.
     """
     body = _body(kind)
-    drawn_style = draw_style(kind, generator=generator)
-    chosen = drawn_style if style is None else style
-    _style(kind, chosen)
-    drawn_size = draw_size(kind, chosen, generator=generator)
-    full = drawn_size if size is None else size
-    lengths = np.asarray(full, np.float64)
+    # Drawn even if given, so that the generator advances equally in both cases.
+    random_style = draw_style(kind, generator=generator)
+    style_name = random_style if style is None else style
+    _style(kind, style_name)
+    random_size = draw_size(kind, style_name, generator=generator)
+    full_size = random_size if size is None else size
+    lengths = np.asarray(full_size, np.float64)
     if lengths.shape != (3,) or not ((lengths >= 0.01) & (lengths <= 100.0)).all():
-        raise ConfigError(f"{kind}: size {full} is not three lengths in [0.01, 100] m")
+        raise ConfigError(f"{kind}: size {full_size} is not three lengths in [0.01, 100] m")
     if detail not in DETAILS:
         raise ConfigError(f"{kind}: detail {detail} is not one of 0, 1, 2")
-    extra = {"phase": phase} if body.phased else {}
-    length, width, height = (float(v) for v in lengths)
-    mesh = body.make(chosen, (length, width, height), generator=generator, detail=detail, **extra)
-    return _in_atlas(mesh, _atlas(kind, chosen))
+    options = {"phase": phase} if body.phased else {}
+    length, width, height = (float(extent) for extent in lengths)
+    mesh = body.make(style_name, (length, width, height), generator=generator, detail=detail, **options)
+    return _in_atlas(mesh, _atlas(kind, style_name))
 
 
 @lru_cache
 def _atlas(kind: str, style: str) -> Mapping[str, Rectangle]:
-    """The rectangle of each panel of a style: that of its mean size, so that one texture fits every size."""
+    """Return the rectangle of each panel of a style.
+
+    It is that of the mean size, so that one texture fits every size.
+    """
     body = BODIES[kind]
-    mean = body.make(style, body.styles[style].size, generator=seeded("atlas", kind, style), detail=0)
-    return dict(zip(mean.panels, mean.rectangles, strict=True))
+    mean_body = body.make(style, body.styles[style].size, generator=seeded("atlas", kind, style), detail=0)
+    return dict(zip(mean_body.panels, mean_body.rectangles, strict=True))
 
 
 def _in_atlas(mesh: Mesh, atlas: Mapping[str, Rectangle]) -> Mesh:
-    """The mesh with each panel moved and stretched into its rectangle of the atlas, parts of one panel together."""
+    """Move and stretch each panel into its rectangle of the atlas, parts of one panel together."""
     uv = mesh.uv.astype(np.float64)
-    whole = [name.split("/")[0] for name in mesh.panels]
-    places = tuple(atlas[name] for name in mesh.panels)
-    for panel in set(whole):
-        parts = [k for k, name in enumerate(whole) if name == panel]
-        own, wanted = (np.array([table[k] for k in parts]) for table in (mesh.rectangles, places))
-        (low, high), (left, right) = ((r[:, :2].min(0), r[:, 2:].max(0)) for r in (own, wanted))
-        faces = np.isin(mesh.panel, parts)
-        uv[faces] = left + (uv[faces] - low) / np.maximum(high - low, 1e-9) * (right - left)
-    return replace(mesh, uv=np.clip(uv, 0.0, 1.0).astype(np.float32), rectangles=places)
+    panel_names = [name.split("/")[0] for name in mesh.panels]
+    targets = tuple(atlas[name] for name in mesh.panels)
+    for panel in set(panel_names):
+        part_indices = [index for index, name in enumerate(panel_names) if name == panel]
+        part_rectangles, atlas_rectangles = (
+            np.array([table[index] for index in part_indices]) for table in (mesh.rectangles, targets)
+        )
+        (lower, upper), (atlas_lower, atlas_upper) = (
+            (rectangles[:, :2].min(0), rectangles[:, 2:].max(0)) for rectangles in (part_rectangles, atlas_rectangles)
+        )
+        faces = np.isin(mesh.panel, part_indices)
+        uv[faces] = atlas_lower + (uv[faces] - lower) / np.maximum(upper - lower, 1e-9) * (atlas_upper - atlas_lower)
+    return replace(mesh, uv=np.clip(uv, 0.0, 1.0).astype(np.float32), rectangles=targets)
 
 
 def _body(kind: str) -> Body:

@@ -1,4 +1,4 @@
-"""Which body plays an actor: from a model of the world to kind and styles, from a kind to its nuScenes category."""
+"""Bodies of actors: from a model of the world to kind and styles, and from a kind to its nuScenes category."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Final
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, box
 
-# model of the world -> kind of body and its styles, the usual one first (twice: drawn twice as often); what is not here
-# is a plain box
+# model of the world -> kind of body and its styles, the usual one first (listed twice: drawn twice as often);
+# other models get a plain box
 ACTOR_BODIES: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "car": ("car", ("sedan", "estate", "sedan", "suv")),
     "suv": ("car", ("suv",)),
@@ -43,16 +43,16 @@ PLAIN_CLASSES: Final = ("stop_sign",)
 
 
 def class_of(kind: str) -> str:
-    """The nuScenes class of a kind of body.
+    """Return the nuScenes class of a kind of body.
 
     Raises:
-        KeyError: It has none.
+        KeyError: The kind has no class.
     """
     return CATEGORY_TO_CLASS[BODY_CATEGORIES[kind]]
 
 
 def plain_body(size: Point) -> Mesh:
-    """A box of sheet metal for what has no body of its own.
+    """Return a box of sheet metal for models without a body of their own.
 
     Args:
         size: Length, width, height, m.

@@ -1,4 +1,4 @@
-"""What does not belong on a road and to no class of nuScenes: debris, animals, overturned vehicles, fallen trees."""
+"""Anomalies outside the classes of nuScenes: debris, animals, overturned vehicles, fallen trees."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Path = Sequence[tuple[float, float, float]]  # along x: x, z, radius; m
 
 
 def debris(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """What fell off a vehicle or a tree, lying on the road; it fills its size, m."""
+    """Return debris that lies on the road and fills its size, m."""
     if style == "tyre":
         return _tyre(size, detail)
     if style == "pallet":
@@ -45,94 +45,109 @@ def debris(style: str, size: Point, *, generator: np.random.Generator, detail: i
 
 
 def _tyre(size: Point, detail: int) -> Mesh:
-    """A tyre without a rim, lying on its side."""
+    """Return a tyre without a rim, lying on its side."""
     length, _, height = size
-    around = (4, 6, 10)[detail]
-    tyre = ring(0.5 * length, 0.55 * height, material=RUBBER, segments=(8, 14, 28)[detail], around=around)
-    # from an upright ring to a flat one; the tread is wider than the wall is thick
-    flat = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.8, 0.0]])
-    return finish([tyre.transformed(flat)], [], size)
+    tube_segments = (4, 6, 10)[detail]
+    tyre = ring(0.5 * length, 0.55 * height, material=RUBBER, segments=(8, 14, 28)[detail], around=tube_segments)
+    # from an upright ring to a lying one; the tread is wider than the side wall is thick
+    lay_down = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.8, 0.0]])
+    return finish([tyre.transformed(lay_down)], [], size)
 
 
 def _pallet(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
-    """A pallet: boards across x above and below, three beams or rows of blocks along x between."""
+    """Return a pallet: boards across x above and below, three beams or rows of blocks along x between."""
     length, width, height = size
-    grey = float(generator.uniform(0.0, 1.0))
-    half, board = 0.5 * width, 0.16 * height
-    fresh, old = np.array([0.42, 0.29, 0.16]), np.array([0.24, 0.22, 0.20])
-    shades = [
-        replace(WOOD, name=f"board_{k}", colour=_colour(shade * (fresh + grey * (old - fresh))))
-        for k, shade in enumerate(generator.uniform(0.8, 1.15, 3))
+    weathering = float(generator.uniform(0.0, 1.0))
+    half_width, board_height = 0.5 * width, 0.16 * height
+    new_wood, grey_wood = np.array([0.42, 0.29, 0.16]), np.array([0.24, 0.22, 0.20])
+    materials = [
+        replace(WOOD, name=f"board_{index}", colour=_colour(shade * (new_wood + weathering * (grey_wood - new_wood))))
+        for index, shade in enumerate(generator.uniform(0.8, 1.15, 3))
     ]
     parts = []
-    across = 0.105 * length
-    for k, x in enumerate(np.linspace(-0.5 * length, 0.5 * length - across, 7)):
-        low, high = (float(x), -half, height - board), (float(x) + across, half, height)
-        parts.append(crate(low, high, shades[k % 3]))
-        if k % 3 == 0:
-            parts.append(crate((float(x), -half, 0.0), (float(x) + across, half, board), shades[(k + 1) % 3]))
-    for y in (-half, -0.05 * width, 0.4 * width):
+    board_length = 0.105 * length
+    for index, x in enumerate(np.linspace(-0.5 * length, 0.5 * length - board_length, 7)):
+        lower, upper = (float(x), -half_width, height - board_height), (float(x) + board_length, half_width, height)
+        parts.append(crate(lower, upper, materials[index % 3]))
+        if index % 3 == 0:
+            parts.append(
+                crate(
+                    (float(x), -half_width, 0.0),
+                    (float(x) + board_length, half_width, board_height),
+                    materials[(index + 1) % 3],
+                )
+            )
+    for y in (-half_width, -0.05 * width, 0.4 * width):
         if detail == 0:
-            low, high = (-0.5 * length, y, board), (0.5 * length, y + 0.1 * width, height - board)
-            parts.append(crate(low, high, shades[0]))
+            lower, upper = (-0.5 * length, y, board_height), (0.5 * length, y + 0.1 * width, height - board_height)
+            parts.append(crate(lower, upper, materials[0]))
             continue
         for x in (-0.5 * length, -0.06 * length, 0.38 * length):
-            low, high = (x, y, board), (x + 0.12 * length, y + 0.1 * width, height - board)
-            parts.append(crate(low, high, shades[0]))
+            lower, upper = (x, y, board_height), (x + 0.12 * length, y + 0.1 * width, height - board_height)
+            parts.append(crate(lower, upper, materials[0]))
     return finish(parts, [], size)
 
 
 def _boxes(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
-    """Three cardboard boxes: two on the ground, turned, and one on top."""
+    """Return three cardboard boxes: two on the ground, turned, and one on top."""
     length, width, height = size
-    turns = generator.uniform(-0.35, 0.35, 3)
+    yaws = generator.uniform(-0.35, 0.35, 3)
     shades = generator.uniform(0.8, 1.15, 3)
     # middle and size of each as shares
-    places = (
+    layout = (
         ((-0.22, 0.05, 0.0), (0.52, 0.72, 0.55)),
         ((0.27, -0.08, 0.0), (0.40, 0.60, 0.42)),
         ((-0.20, 0.00, 0.55), (0.42, 0.55, 0.45)),
     )
     parts: list[Mesh] = []
-    for turn, shade, (place, share) in zip(turns, shades, places, strict=True):
-        own = np.array(size) * share
+    for yaw, shade, (position, size_share) in zip(yaws, shades, layout, strict=True):
+        box_size = np.array(size) * size_share
         carton = replace(CARDBOARD, name=f"cardboard_{len(parts)}", colour=_colour(shade * np.array(CARDBOARD.colour)))
-        x, y, z = (0.5 * own).tolist()
+        x, y, z = (0.5 * box_size).tolist()
         pieces = [crate((-x, -y, 0.0), (x, y, 2.0 * z), carton)]
         if detail:
             pieces.append(crate((-x - 0.002, -0.05 * y, 1.3 * z), (x + 0.002, 0.05 * y, 2.0 * z + 0.002), TAPE))
-        if detail == 2:  # the flaps of the lid stand open a little
+        if detail == 2:  # the flaps of the lid are slightly open
             pieces += [
                 box((1.9 * x, 0.9 * y, 0.006), material=carton)
                 .transformed(_turned("x", side * 0.25))
                 .moved(0.0, side * 0.5 * y, 2.0 * z - 0.01)
                 for side in (-1.0, 1.0)
             ]
-        made = merge(pieces).transformed(_turned("z", turn))
-        parts.append(made.moved(place[0] * length, place[1] * width, place[2] * height))
+        box_mesh = merge(pieces).transformed(_turned("z", yaw))
+        parts.append(box_mesh.moved(position[0] * length, position[1] * width, position[2] * height))
     return finish(parts, [], size)
 
 
 def _mattress(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
-    """A mattress that lies flat: rounded corners, a bulging top, a darker seam around."""
+    """Return a flat mattress: rounded corners, a bulging top, a darker seam around."""
     length, width, height = size
-    age = float(generator.uniform(0.6, 1.0))
-    cloth = replace(TICKING, colour=_colour(age * np.array(TICKING.colour)))
-    angle = np.linspace(0.0, 2.0 * np.pi, (8, 16, 32)[detail], endpoint=False)
-    square = np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle))) ** -0.85
-    outline = np.stack([np.cos(angle) * square, np.sin(angle) * square], 1)
+    brightness = float(generator.uniform(0.6, 1.0))
+    cloth_material = replace(TICKING, colour=_colour(brightness * np.array(TICKING.colour)))
+    angles = np.linspace(0.0, 2.0 * np.pi, (8, 16, 32)[detail], endpoint=False)
+    # An exponent of -1 would give sharp corners.
+    corner_radius = np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles))) ** -0.85
+    outline = np.stack([np.cos(angles) * corner_radius, np.sin(angles) * corner_radius], 1)
     outline /= np.abs(outline).max(axis=0)
 
     def slab(levels: Sequence[tuple[float, float]], look: Material) -> Mesh:
-        inset = 0.5 * height
-        rows = [
-            np.column_stack([outline * [0.5 * length - inset * i, 0.5 * width - inset * i], np.full(len(outline), z)])
-            for i, z in levels
+        half_height = 0.5 * height
+        sections = [
+            np.column_stack(
+                [
+                    outline * [0.5 * length - half_height * inset_share, 0.5 * width - half_height * inset_share],
+                    np.full(len(outline), z),
+                ]
+            )
+            for inset_share, z in levels
         ]
-        return loft(np.array(rows), material=look)
+        return loft(np.array(sections), material=look)
 
     parts = [
-        slab([(0.3, 0.0), (0.04, 0.12 * height), (0.04, 0.88 * height), (0.4, 0.97 * height), (1.6, height)], cloth)
+        slab(
+            [(0.3, 0.0), (0.04, 0.12 * height), (0.04, 0.88 * height), (0.4, 0.97 * height), (1.6, height)],
+            cloth_material,
+        )
     ]
     for z in (0.12, 0.88):
         parts.append(slab([(0.0, (z - 0.05) * height), (0.0, (z + 0.05) * height)], PIPING))
@@ -140,43 +155,58 @@ def _mattress(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
 
 
 def _ladder(size: Point, detail: int) -> Mesh:
-    """A ladder of aluminium that lies along x."""
+    """Return an aluminium ladder that lies along x."""
     length, width, height = size
-    rail = 0.03
+    rail_width = 0.03
     parts = [
-        both_sides(crate((-0.5 * length, 0.5 * width - rail, 0.0), (0.5 * length, 0.5 * width, height), ALUMINIUM))
+        both_sides(
+            crate((-0.5 * length, 0.5 * width - rail_width, 0.0), (0.5 * length, 0.5 * width, height), ALUMINIUM)
+        )
     ]
-    rungs = max(3, round(length / 0.29))
-    middle = 0.5 * height
-    for x in np.linspace(-0.46, 0.46, rungs) * length:
-        ends = [(float(x), -0.5 * width + rail, middle), (float(x), 0.5 * width - rail, middle)]
-        parts.append(tube(ends, 0.22 * height, material=ALUMINIUM, segments=(3, 4, 6)[detail]))
+    rung_count = max(3, round(length / 0.29))
+    middle_height = 0.5 * height
+    for x in np.linspace(-0.46, 0.46, rung_count) * length:
+        rung_ends = [
+            (float(x), -0.5 * width + rail_width, middle_height),
+            (float(x), 0.5 * width - rail_width, middle_height),
+        ]
+        parts.append(tube(rung_ends, 0.22 * height, material=ALUMINIUM, segments=(3, 4, 6)[detail]))
     return finish(parts, [], size)
 
 
 def _branch(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
-    """A limb with twigs and some leaves."""
+    """Return a limb with twigs and some leaves."""
     length, width, height = size
-    green = _greens(generator)
-    bends = generator.uniform(-1.0, 1.0, (6, 2))
-    x = np.linspace(-0.5, 0.5, 6)
-    thick = 0.04 + 0.01 * length
-    spine = np.stack([x * length, 0.10 * width * bends[:, 0], thick + 0.12 * height * np.abs(bends[:, 1])], 1)
-    radii = np.linspace(thick, 0.3 * thick, 6)
-    sides = (3, 5, 7)[detail]
-    parts = [tube(spine, radii, material=BARK, segments=sides)]
+    leaf_materials = _greens(generator)
+    bend_offsets = generator.uniform(-1.0, 1.0, (6, 2))
+    positions = np.linspace(-0.5, 0.5, 6)
+    radius = 0.04 + 0.01 * length
+    spine = np.stack(
+        [positions * length, 0.10 * width * bend_offsets[:, 0], radius + 0.12 * height * np.abs(bend_offsets[:, 1])], 1
+    )
+    radii = np.linspace(radius, 0.3 * radius, 6)
+    segment_count = (3, 5, 7)[detail]
+    parts = [tube(spine, radii, material=BARK, segments=segment_count)]
     twigs = generator.uniform(0.0, 1.0, (7, 3))
-    for k, (along, up, far) in enumerate(twigs):
-        start = spine[1 + k % 4]
-        side = 1.0 if k % 2 else -1.0
-        reach = (0.22 * length * (0.4 + along), side * width * (0.2 + 0.25 * far), height * (0.15 + 0.7 * up))
+    for twig_index, (forward_share, rise, side_share) in enumerate(twigs):
+        start = spine[1 + twig_index % 4]
+        side = 1.0 if twig_index % 2 else -1.0
+        offset = (
+            0.22 * length * (0.4 + forward_share),
+            side * width * (0.2 + 0.25 * side_share),
+            height * (0.15 + 0.7 * rise),
+        )
         end = np.clip(
-            start + np.array(reach), [-0.5 * length, -0.5 * width, 0.05], [0.5 * length, 0.5 * width, 0.95 * height]
+            start + np.array(offset), [-0.5 * length, -0.5 * width, 0.05], [0.5 * length, 0.5 * width, 0.95 * height]
         )
         path = np.stack([start, 0.5 * (start + end) + [0.0, 0.0, 0.05 * height], end])
-        parts.append(tube(path, [0.4 * thick, 0.25 * thick, 0.1 * thick], material=BARK, segments=max(sides - 1, 3)))
-        tuft = np.array([0.12 * length, 0.16 * width, 0.2 * height])
-        parts.append(foliage(end - 0.3 * (end - start), tuft, green, generator, detail=detail, leaf=0.11))
+        parts.append(
+            tube(path, [0.4 * radius, 0.25 * radius, 0.1 * radius], material=BARK, segments=max(segment_count - 1, 3))
+        )
+        tuft_radii = np.array([0.12 * length, 0.16 * width, 0.2 * height])
+        parts.append(
+            foliage(end - 0.3 * (end - start), tuft_radii, leaf_materials, generator, detail=detail, leaf=0.11)
+        )
     return finish(parts, [], size)
 
 
@@ -184,60 +214,68 @@ def _branch(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
 
 
 def fallen_tree(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """A tree that lies along x, its root plate behind and its crown ahead; it fills its size, m."""
+    """Return a fallen tree that fills its size, m: it lies along x, its root plate behind, its crown ahead."""
     length, width, height = size
-    green = _greens(generator)
-    thick = 0.025 * length + 0.04
-    bare = style == "bare"
-    sides = (5, 7, 10)[detail]
-    sway = generator.uniform(-1.0, 1.0, (5, 2))
-    x = np.linspace(-0.47, 0.36, 5) * length
-    spine = np.stack([x, 0.04 * width * sway[:, 0], thick * np.linspace(1.4, 2.2, 5) + 0.02 * sway[:, 1]], 1)
-    parts = [tube(spine, np.linspace(1.0, 0.4, 5) * thick, material=BARK, segments=sides)]
+    leaf_materials = _greens(generator)
+    radius = 0.025 * length + 0.04
+    is_bare = style == "bare"
+    segment_count = (5, 7, 10)[detail]
+    sway_offsets = generator.uniform(-1.0, 1.0, (5, 2))
+    positions = np.linspace(-0.47, 0.36, 5) * length
+    spine = np.stack(
+        [positions, 0.04 * width * sway_offsets[:, 0], radius * np.linspace(1.4, 2.2, 5) + 0.02 * sway_offsets[:, 1]], 1
+    )
+    parts = [tube(spine, np.linspace(1.0, 0.4, 5) * radius, material=BARK, segments=segment_count)]
     # the root plate stands on its edge
-    roots = generator.uniform(0.45, 1.0, 9)
-    angle = (np.arange(9) + generator.uniform(-0.4, 0.4, 9)) * (2.0 * np.pi / 9)
-    plate = 0.34 * height
-    for reach, a in zip(roots, angle, strict=True):
-        tip = spine[0] + [
+    root_lengths = generator.uniform(0.45, 1.0, 9)
+    angles = (np.arange(9) + generator.uniform(-0.4, 0.4, 9)) * (2.0 * np.pi / 9)
+    plate_radius = 0.34 * height
+    for length_share, bough_angle in zip(root_lengths, angles, strict=True):
+        root_tip = spine[0] + [
             -0.03 * length,
-            plate * 1.3 * reach * np.cos(a),
-            plate * 1.3 * reach * np.sin(a) + 0.4 * plate,
+            plate_radius * 1.3 * length_share * np.cos(bough_angle),
+            plate_radius * 1.3 * length_share * np.sin(bough_angle) + 0.4 * plate_radius,
         ]
-        tip[2] = max(tip[2], 0.03)
-        path = np.stack([spine[0] + [0.05 * length, 0.0, 0.0], 0.5 * (spine[0] + tip), tip])
-        parts.append(tube(path, [0.6 * thick, 0.35 * thick, 0.08 * thick], material=BARK, segments=max(sides - 3, 3)))
+        root_tip[2] = max(root_tip[2], 0.03)
+        path = np.stack([spine[0] + [0.05 * length, 0.0, 0.0], 0.5 * (spine[0] + root_tip), root_tip])
+        parts.append(
+            tube(path, [0.6 * radius, 0.35 * radius, 0.08 * radius], material=BARK, segments=max(segment_count - 3, 3))
+        )
     soil = Material("soil", (0.10, 0.065, 0.04), specular=0.0, gloss=0.0)
-    clod = sphere((0.02 * length, plate, 0.9 * plate), material=soil, segments=(6, 8, 12)[detail])
-    parts.append(clod.moved(float(spine[0, 0]), 0.0, 0.9 * plate))
+    clod = sphere((0.02 * length, plate_radius, 0.9 * plate_radius), material=soil, segments=(6, 8, 12)[detail])
+    parts.append(clod.moved(float(spine[0, 0]), 0.0, 0.9 * plate_radius))
     boughs = generator.uniform(0.0, 1.0, (12, 4))
-    for k, (along, turn, reach, swell) in enumerate(boughs):
-        start = spine[2] + (0.15 + 0.8 * along) * (spine[4] - spine[2])
-        a = np.pi * (k % 6 + turn) / 6.0  # from one side over the top to the other
-        far = 0.55 + 0.45 * reach
-        up, aside = 0.85 * height * far * np.sin(a), 0.46 * width * far * np.cos(a)
-        end = start + np.array([0.18 * length * (0.4 + reach), aside, up])
+    for bough_index, (trunk_share, turn_share, length_share, swell_share) in enumerate(boughs):
+        start = spine[2] + (0.15 + 0.8 * trunk_share) * (spine[4] - spine[2])
+        bough_angle = np.pi * (bough_index % 6 + turn_share) / 6.0  # from one side over the top to the other
+        span_share = 0.55 + 0.45 * length_share
+        rise, aside = 0.85 * height * span_share * np.sin(bough_angle), 0.46 * width * span_share * np.cos(bough_angle)
+        end = start + np.array([0.18 * length * (0.4 + length_share), aside, rise])
         end[2] = min(end[2], 0.9 * height)
         path = np.stack([start, 0.5 * (start + end) + [0.0, 0.0, 0.04 * height], end])
-        parts.append(tube(path, [0.45 * thick, 0.28 * thick, 0.06 * thick], material=BARK, segments=max(sides - 3, 3)))
-        if bare:
+        parts.append(
+            tube(path, [0.45 * radius, 0.28 * radius, 0.06 * radius], material=BARK, segments=max(segment_count - 3, 3))
+        )
+        if is_bare:
             for side in (-1.0, 1.0):
-                middle = path[1]
-                fork = middle + np.array([0.12 * length, side * 0.12 * width, 0.12 * height * (swell - 0.2)])
-                fork[2] = np.clip(fork[2], 0.05, 0.95 * height)
-                twig = np.stack([middle, fork])
-                parts.append(tube(twig, [0.2 * thick, 0.05 * thick], material=BARK, segments=3))
+                twig_start = path[1]
+                twig_end = twig_start + np.array(
+                    [0.12 * length, side * 0.12 * width, 0.12 * height * (swell_share - 0.2)]
+                )
+                twig_end[2] = np.clip(twig_end[2], 0.05, 0.95 * height)
+                twig = np.stack([twig_start, twig_end])
+                parts.append(tube(twig, [0.2 * radius, 0.05 * radius], material=BARK, segments=3))
         else:
-            tuft = np.array([0.11 * length, 0.2 * width, 0.24 * height]) * (0.8 + 0.3 * swell)
-            where = start + 0.75 * (end - start)
-            parts.append(foliage(where, tuft, green, generator, detail=detail, leaf=0.23))
+            tuft_radii = np.array([0.11 * length, 0.2 * width, 0.24 * height]) * (0.8 + 0.3 * swell_share)
+            tuft_centre = start + 0.75 * (end - start)
+            parts.append(foliage(tuft_centre, tuft_radii, leaf_materials, generator, detail=detail, leaf=0.23))
     return finish(parts, [], size)
 
 
 def _greens(generator: np.random.Generator) -> tuple[Material, Material, Material]:
-    """Two greens of leaves and the dark inside of a crown."""
-    hue, light = generator.uniform(0.0, 1.0), generator.uniform(0.8, 1.2)
-    base = light * (np.array([0.055, 0.105, 0.025]) + hue * np.array([0.055, 0.02, 0.0]))
+    """Draw two greens of leaves and the dark material inside a crown."""
+    hue_share, brightness = generator.uniform(0.0, 1.0), generator.uniform(0.8, 1.2)
+    base = brightness * (np.array([0.055, 0.105, 0.025]) + hue_share * np.array([0.055, 0.02, 0.0]))
     return (
         Material("leaves_round", _colour(1.25 * base), specular=0.02, gloss=0.2),
         Material("leaves_round", _colour(0.85 * base), specular=0.02, gloss=0.2),
@@ -254,7 +292,7 @@ def foliage(
     detail: int,
     leaf: float,
 ) -> Mesh:
-    """A tuft of leaves: a dark, uneven blob, and triangles around it.
+    """Return a tuft of leaves: a dark, uneven blob, and triangles around it.
 
     Args:
         middle: Middle of the blob [3], m.
@@ -262,33 +300,38 @@ def foliage(
         green: Two materials of the leaves, and that of the blob.
         generator: Source of randomness; the draws do not depend on the detail.
         detail: Level of detail, 0 (coarse) to 2.
-        leaf: Size of the triangles, m, roughly.
+        leaf: Approximate size of the triangles, m.
     """
     count = 48
-    tilt, spin = generator.normal(size=(count, 3)), generator.normal(size=(count, 3))
-    size = leaf * generator.uniform(0.6, 1.2, count)
-    k = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * k / count
-    angle = np.pi * (1.0 + 5.0**0.5) * k
-    flat = np.sqrt(1.0 - z * z)
-    unit = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
-    step, grow = ((8, 2.4), (3, 1.5), (1, 1.0))[detail]
-    unit, tilt, spin, size = (values[::step] for values in (unit, tilt, spin, size))
-    out = unit + 0.45 * tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
-    out /= np.linalg.norm(out, axis=1, keepdims=True)
-    side = np.cross(out, spin)
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    up = np.cross(out, side)
-    turn = np.array([0.0, 2.1, 4.2])[None, :, None]
-    spread = np.cos(turn) * side[:, None] + np.sin(turn) * up[:, None]
-    corners = (middle + unit * radius)[:, None] + grow * size[:, None, None] * spread
+    tilt_vectors, spin_vectors = generator.normal(size=(count, 3)), generator.normal(size=(count, 3))
+    leaf_sizes = leaf * generator.uniform(0.6, 1.2, count)
+    indices = np.arange(count) + 0.5
+    heights = 1.0 - 2.0 * indices / count
+    azimuths = np.pi * (1.0 + 5.0**0.5) * indices
+    circle_radii = np.sqrt(1.0 - heights * heights)
+    directions = np.stack([circle_radii * np.cos(azimuths), circle_radii * np.sin(azimuths), heights], 1)
+    stride, scale = ((8, 2.4), (3, 1.5), (1, 1.0))[detail]
+    # Drawn in full first: the generator must advance equally at every level of detail.
+    directions, tilt_vectors, spin_vectors, leaf_sizes = (
+        values[::stride] for values in (directions, tilt_vectors, spin_vectors, leaf_sizes)
+    )
+    normals = directions + 0.45 * tilt_vectors / np.linalg.norm(tilt_vectors, axis=1, keepdims=True)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    side_axes = np.cross(normals, spin_vectors)
+    side_axes /= np.maximum(np.linalg.norm(side_axes, axis=1, keepdims=True), 1e-9)
+    up_axes = np.cross(normals, side_axes)
+    corner_angles = np.array([0.0, 2.1, 4.2])[None, :, None]
+    corner_offsets = np.cos(corner_angles) * side_axes[:, None] + np.sin(corner_angles) * up_axes[:, None]
+    corners = (middle + directions * radius)[:, None] + scale * leaf_sizes[:, None, None] * corner_offsets
     corners[..., 2] = np.maximum(corners[..., 2], 0.01)
-    faces = np.arange(3 * len(unit)).reshape(-1, 3)
-    ragged = build(corners.reshape(-1, 3), faces, materials=green[:2], material=np.arange(len(unit)) % 2, smooth=0.0)
-    core = 0.85 * radius
-    inside = sphere(_point(core), material=green[2], segments=(4, 6, 8)[detail])
-    centre = np.maximum(middle, [-np.inf, -np.inf, core[2]])
-    return merge([inside.moved(*centre.tolist()), ragged])
+    faces = np.arange(3 * len(directions)).reshape(-1, 3)
+    leaf_mesh = build(
+        corners.reshape(-1, 3), faces, materials=green[:2], material=np.arange(len(directions)) % 2, smooth=0.0
+    )
+    core_radii = 0.85 * radius
+    core_mesh = sphere(_point(core_radii), material=green[2], segments=(4, 6, 8)[detail])
+    centre = np.maximum(middle, [-np.inf, -np.inf, core_radii[2]])
+    return merge([core_mesh.moved(*centre.tolist()), leaf_mesh])
 
 
 # ---------------------------------------------------------------- animals
@@ -300,11 +343,11 @@ class _Beast:
 
     Attributes:
         trunk: Path of x, z, radius (m) in the plane of symmetry.
-        neck: The same.
-        head: The same.
-        foreleg: The same.
-        hindleg: The same.
-        tail: The same.
+        neck: Path as for the trunk.
+        head: Path as for the trunk.
+        foreleg: Path as for the trunk.
+        hindleg: Path as for the trunk.
+        tail: Path as for the trunk.
         ear: x, z, length, width, m.
         narrow: Ratio of width to height of trunk and head.
         apart: Distance of the legs from the plane of symmetry, m.
@@ -424,49 +467,68 @@ BEASTS: Mapping[str, _Beast] = {
 
 
 def animal(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """An animal that stands; it fills its size, m."""
-    beast = BEASTS[style]
-    coat = beast.coats[int(generator.integers(len(beast.coats)))]
+    """Return a standing animal that fills its size, m."""
+    shape = BEASTS[style]
+    coat_colour = shape.coats[int(generator.integers(len(shape.coats)))]
     shade = float(generator.uniform(0.85, 1.15))
-    spots = generator.uniform(-1.0, 1.0, (14, 3))
-    antlers = bool(generator.random() < 0.6)
-    stride = generator.uniform(-0.5, 0.5, 2)
-    look = Material("coat", _colour(shade * np.array(coat)), specular=0.02, gloss=0.15)
-    below = Material("belly", _colour(0.8 * shade * np.array(coat) + 0.04), specular=0.02, gloss=0.1)
-    dark = Material("mane", _colour(0.35 * shade * np.array(coat)), specular=0.02, gloss=0.1)
-    rings = (6, 8, 14)[detail]
-    thin = (3, 5, 8)[detail]
-    finer = (1, 1, 3)[detail]
-    trunk = _along(_rounded(beast.trunk, finer), look, rings, beast.narrow)
-    if style == "cow" and coat[1] > 0.5:
-        trunk = _spotted(trunk, spots, Material("patches", (0.02, 0.018, 0.017), specular=0.02, gloss=0.15))
+    patch_centres = generator.uniform(-1.0, 1.0, (14, 3))
+    has_antlers = bool(generator.random() < 0.6)
+    leg_swings = generator.uniform(-0.5, 0.5, 2)
+    coat_material = Material("coat", _colour(shade * np.array(coat_colour)), specular=0.02, gloss=0.15)
+    belly_material = Material("belly", _colour(0.8 * shade * np.array(coat_colour) + 0.04), specular=0.02, gloss=0.1)
+    mane_material = Material("mane", _colour(0.35 * shade * np.array(coat_colour)), specular=0.02, gloss=0.1)
+    ring_segments = (6, 8, 14)[detail]
+    limb_segments = (3, 5, 8)[detail]
+    subdivision = (1, 1, 3)[detail]
+    trunk = _along(_rounded(shape.trunk, subdivision), coat_material, ring_segments, shape.narrow)
+    # Only white cows have dark patches.
+    if style == "cow" and coat_colour[1] > 0.5:
+        trunk = _spotted(trunk, patch_centres, Material("patches", (0.02, 0.018, 0.017), specular=0.02, gloss=0.15))
     elif style != "cow":
-        trunk = _spotted(trunk, np.array([[0.0, 0.0, -1.0]]), below, upright=True)
-    neck, head = (_rounded(path, finer) for path in (beast.neck, beast.head))
-    parts = [trunk, _along(neck, look, rings, beast.narrow), _along(head, look, rings, 0.8)]
-    x, z, radius = beast.head[-1]
-    parts.append(sphere((0.8 * radius, 0.8 * radius, 0.7 * radius), material=HOOF, segments=thin + 1).moved(x, 0.0, z))
-    parts.append(_along(beast.tail, dark if style in ("horse", "cow") else look, thin, 1.0))
-    for leg, swing in ((beast.foreleg, stride[0]), (beast.hindleg, stride[1])):
-        top = leg[0][1]
+        trunk = _spotted(trunk, np.array([[0.0, 0.0, -1.0]]), belly_material, upright=True)
+    neck, head = (_rounded(path, subdivision) for path in (shape.neck, shape.head))
+    parts = [
+        trunk,
+        _along(neck, coat_material, ring_segments, shape.narrow),
+        _along(head, coat_material, ring_segments, 0.8),
+    ]
+    x, z, radius = shape.head[-1]
+    parts.append(
+        sphere((0.8 * radius, 0.8 * radius, 0.7 * radius), material=HOOF, segments=limb_segments + 1).moved(x, 0.0, z)
+    )
+    parts.append(_along(shape.tail, mane_material if style in ("horse", "cow") else coat_material, limb_segments, 1.0))
+    for leg, swing_share in ((shape.foreleg, leg_swings[0]), (shape.hindleg, leg_swings[1])):
+        leg_top = leg[0][1]
         for side in (-1.0, 1.0):
-            path = [(x + side * swing * 0.35 * (top - z), z, r) for x, z, r in leg]
-            shoulder = (path[0][0], top + 0.9 * path[0][2], 0.35 * path[0][2])
-            path = _rounded([shoulder, *path], finer)
-            parts.append(_along(path, look, max(thin, 4), 0.9).moved(y=side * beast.apart))
+            path = [(x + side * swing_share * 0.35 * (leg_top - z), z, ring_radius) for x, z, ring_radius in leg]
+            shoulder = (path[0][0], leg_top + 0.9 * path[0][2], 0.35 * path[0][2])
+            path = _rounded([shoulder, *path], subdivision)
+            parts.append(_along(path, coat_material, max(limb_segments, 4), 0.9).moved(y=side * shape.apart))
             if style != "dog":
-                x, _, r = path[-1]
+                x, _, ring_radius = path[-1]
                 hoof = tube(
-                    [(x, 0.0, 0.0), (x - 0.2 * r, 0.0, 1.4 * r)], [1.05 * r, 0.9 * r], material=HOOF, segments=thin
+                    [(x, 0.0, 0.0), (x - 0.2 * ring_radius, 0.0, 1.4 * ring_radius)],
+                    [1.05 * ring_radius, 0.9 * ring_radius],
+                    material=HOOF,
+                    segments=limb_segments,
                 )
-                parts.append(hoof.moved(y=side * beast.apart))
-    x, z, long, wide = beast.ear
-    r = beast.head[1][2]
-    spread = 0.75 if style in ("cow", "deer") else 0.35
-    tip = (x - 0.2 * long, (0.6 * r + spread * long), z + long * (0.1 if style == "cow" else 0.6))
-    ear = tube([(x, 0.5 * r, z - 0.25 * r), tip], [0.5 * wide, 0.15 * wide], material=look, segments=max(thin - 1, 3))
+                parts.append(hoof.moved(y=side * shape.apart))
+    x, z, ear_length, ear_width = shape.ear
+    ring_radius = shape.head[1][2]
+    ear_spread = 0.75 if style in ("cow", "deer") else 0.35
+    tip = (
+        x - 0.2 * ear_length,
+        (0.6 * ring_radius + ear_spread * ear_length),
+        z + ear_length * (0.1 if style == "cow" else 0.6),
+    )
+    ear = tube(
+        [(x, 0.5 * ring_radius, z - 0.25 * ring_radius), tip],
+        [0.5 * ear_width, 0.15 * ear_width],
+        material=coat_material,
+        segments=max(limb_segments - 1, 3),
+    )
     parts.append(both_sides(ear))
-    parts += _headgear(style, beast, thin, antlers=antlers, dark=dark)
+    parts += _headgear(style, shape, limb_segments, antlers=has_antlers, dark=mane_material)
     return finish(parts, [], size)
 
 
@@ -478,22 +540,25 @@ def _headgear(style: str, beast: _Beast, sides: int, *, antlers: bool, dark: Mat
         udder = sphere((0.18, 0.15, 0.13), material=UDDER, segments=sides + 1).moved(-0.48, 0.0, 0.66)
         return [both_sides(tube(horn, [0.035, 0.028, 0.008], material=HORN, segments=sides)), udder]
     if style == "deer" and antlers:
-        beam = [
+        antler_beam = [
             (x + 0.03, 0.05, z + 0.08),
             (x - 0.08, 0.16, z + 0.24),
             (x - 0.02, 0.24, z + 0.42),
             (x + 0.08, 0.2, z + 0.52),
         ]
-        tines = [
+        antler_tines = [
             [(x + 0.02, 0.06, z + 0.10), (x + 0.16, 0.08, z + 0.20)],
             [(x - 0.08, 0.16, z + 0.24), (x + 0.06, 0.18, z + 0.36)],
             [(x - 0.02, 0.24, z + 0.42), (x - 0.10, 0.22, z + 0.54)],
         ]
-        parts = [tube(beam, [0.022, 0.02, 0.016, 0.006], material=HORN, segments=max(sides - 1, 3))]
-        parts += [tube(tine, [0.014, 0.005], material=HORN, segments=3) for tine in tines]
+        parts = [tube(antler_beam, [0.022, 0.02, 0.016, 0.006], material=HORN, segments=max(sides - 1, 3))]
+        parts += [tube(tine, [0.014, 0.005], material=HORN, segments=3) for tine in antler_tines]
         return [both_sides(part) for part in parts]
     if style == "horse":
-        crest = [(px - 0.45 * r, pz + 0.75 * r, 0.05) for px, pz, r in beast.neck]
+        crest = [
+            (neck_x - 0.45 * neck_radius, neck_z + 0.75 * neck_radius, 0.05)
+            for neck_x, neck_z, neck_radius in beast.neck
+        ]
         forelock = [(x + 0.06, z + 0.09, 0.04), (x + 0.17, z - 0.03, 0.02)]
         return [_along(crest, dark, sides, 0.7), _along(forelock, dark, sides, 0.9)]
     return []
@@ -503,17 +568,20 @@ def _rounded(path: Path, finer: int) -> list[tuple[float, float, float]]:
     """The path with `finer` pieces for each of its pieces, on smooth lines."""
     if finer == 1:
         return list(path)
-    at = np.linspace(0.0, len(path) - 1.0, finer * (len(path) - 1) + 1)
-    columns = [curve([(float(k), point[axis]) for k, point in enumerate(path)], at).tolist() for axis in range(3)]
+    positions = np.linspace(0.0, len(path) - 1.0, finer * (len(path) - 1) + 1)
+    columns = [
+        curve([(float(index), point[axis]) for index, point in enumerate(path)], positions).tolist()
+        for axis in range(3)
+    ]
     return [(x, z, radius) for x, z, radius in zip(*columns, strict=True)]
 
 
 def _along(path: Path, look: Material, sides: int, narrow: float) -> Mesh:
     """A round body along a path of (x, z, radius) in the plane y = 0, `narrow` times as wide as it is high."""
-    p = np.array(path)
-    points = np.stack([p[:, 0], np.zeros(len(p)), p[:, 1]], 1)
-    made = tube(points, p[:, 2], material=look, segments=sides)
-    return made.transformed(np.diag([1.0, narrow, 1.0]))
+    columns = np.array(path)
+    points = np.stack([columns[:, 0], np.zeros(len(columns)), columns[:, 1]], 1)
+    body = tube(points, columns[:, 2], material=look, segments=sides)
+    return body.transformed(np.diag([1.0, narrow, 1.0]))
 
 
 def _spotted(mesh: Mesh, spots: F64, look: Material, *, upright: bool = False) -> Mesh:
@@ -521,16 +589,16 @@ def _spotted(mesh: Mesh, spots: F64, look: Material, *, upright: bool = False) -
 
     upright: the faces that look down get it instead.
     """
-    low, high = mesh.bounds()
-    middle = (mesh.corners().mean(1) - low) / (high - low) * 2.0 - 1.0
+    lower, upper = mesh.bounds()
+    centres = (mesh.corners().mean(1) - lower) / (upper - lower) * 2.0 - 1.0
     if upright:
-        chosen = mesh.normals[..., 2].mean(1) < -0.75
+        is_spotted = mesh.normals[..., 2].mean(1) < -0.75
     else:
-        gap = np.linalg.norm((middle[:, None] - spots[None]) * [1.0, 0.8, 0.8], axis=-1)
-        chosen = gap.min(1) < 0.42
+        distances = np.linalg.norm((centres[:, None] - spots[None]) * [1.0, 0.8, 0.8], axis=-1)
+        is_spotted = distances.min(1) < 0.42
     return replace(
         mesh,
-        material=np.where(chosen, len(mesh.materials), mesh.material).astype(np.int32),
+        material=np.where(is_spotted, len(mesh.materials), mesh.material).astype(np.int32),
         materials=(*mesh.materials, look),
     )
 
@@ -541,71 +609,82 @@ OVERTURNED_CARS = {"car_side": "sedan", "suv_side": "suv", "car_roof": "hatchbac
 
 
 def overturned(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """A car or truck that lies on its side or roof and fills its size, m; its panels are those of the vehicle."""
+    """Return a car or truck on its side or roof that fills its size, m; its panels are those of the vehicle."""
     length, width, height = size
     side = 1.0 if generator.random() < 0.5 else -1.0
-    upside = style == "car_roof"
-    own = (length, width, height) if upside else (length, height, width)
+    is_on_roof = style == "car_roof"
+    # Lying on its side, a vehicle is as wide as it was tall.
+    upright_size = (length, width, height) if is_on_roof else (length, height, width)
     if style == "truck_side":
-        vehicle = truck("box", own, generator=generator, detail=detail)
-        under = _underside(own, 0.28 * own[2], truck=True)
+        vehicle = truck("box", upright_size, generator=generator, detail=detail)
+        underside = _underside(upright_size, 0.28 * upright_size[2], truck=True)
     else:
-        vehicle = car(OVERTURNED_CARS[style], own, generator=generator, detail=detail)
-        under = _underside(own, 0.17 * own[2], truck=False)
-    lying = merge([vehicle, under]).transformed(_turned("x", np.pi if upside else side * np.pi / 2.0))
-    return fit(_settled(lying, 0.05 * height if upside else None), size)
+        vehicle = car(OVERTURNED_CARS[style], upright_size, generator=generator, detail=detail)
+        underside = _underside(upright_size, 0.17 * upright_size[2], truck=False)
+    lying_mesh = merge([vehicle, underside]).transformed(_turned("x", np.pi if is_on_roof else side * np.pi / 2.0))
+    return fit(_settled(lying_mesh, 0.05 * height if is_on_roof else None), size)
 
 
 def _settled(mesh: Mesh, dent: float | None) -> Mesh:
-    """The mesh flat where it lies: what its mirrors hold off the ground, or `dent` m of its roof, is pressed in."""
+    """Flatten the mesh at the ground: press in its mirrors, or `dent` m of its roof."""
     corners = mesh.corners()
-    low = float(corners[..., 2].min())
-    ground = float(corners[mesh.panel >= 0, :, 2].min()) if dent is None else low + dent
+    lowest = float(corners[..., 2].min())
+    ground_height = float(corners[mesh.panel >= 0, :, 2].min()) if dent is None else lowest + dent
     vertices = mesh.vertices.copy()
-    vertices[:, 2] = np.maximum(vertices[:, 2], ground)
-    pressed = replace(mesh, vertices=vertices)
-    return part_of(pressed, pressed.areas() > 1e-7)
+    vertices[:, 2] = np.maximum(vertices[:, 2], ground_height)
+    pressed_mesh = replace(mesh, vertices=vertices)
+    # Pressed faces may have lost their area.
+    return part_of(pressed_mesh, pressed_mesh.areas() > 1e-7)
 
 
 def _underside(size: Point, top: float, *, truck: bool) -> Mesh:
-    """What is seen of a vehicle from below: floor, axles, exhaust or frame and tank, drive shaft."""
+    """Return the underside of a vehicle: floor, axles, exhaust or frame and tank, drive shaft."""
     length, width, _ = size
-    half = 0.5 * width
+    half_width = 0.5 * width
     if truck:
         parts = [
             crate((-0.48 * length, y - 0.06, top - 0.3), (0.45 * length, y + 0.06, top), FRAME) for y in (-0.4, 0.4)
         ]
-        parts.append(crate((-0.48 * length, -0.85 * half, top), (0.48 * length, 0.85 * half, top + 0.05), DARK))
-        axles, low = (-0.28 * length, 0.34 * length), 0.45
+        parts.append(
+            crate((-0.48 * length, -0.85 * half_width, top), (0.48 * length, 0.85 * half_width, top + 0.05), DARK)
+        )
+        axles, axle_height = (-0.28 * length, 0.34 * length), 0.45
     else:
-        parts = [crate((-0.46 * length, -0.78 * half, top), (0.46 * length, 0.78 * half, top + 0.06), DARK)]
+        parts = [crate((-0.46 * length, -0.78 * half_width, top), (0.46 * length, 0.78 * half_width, top + 0.06), DARK)]
         exhaust = [
             (0.25 * length, -0.25, top - 0.02),
             (-0.2 * length, -0.3, top - 0.02),
             (-0.46 * length, -0.45, top - 0.02),
         ]
         parts.append(tube(exhaust, 0.04, material=STEEL, segments=5))
-        silencer = (-0.43 * length, -0.35, top - 0.09), (-0.36 * length, 0.35, top + 0.02)
-        parts += [crate(*silencer, STEEL), crate((0.2 * length, -0.3, top - 0.06), (0.4 * length, 0.3, top), FRAME)]
+        silencer_box = (-0.43 * length, -0.35, top - 0.09), (-0.36 * length, 0.35, top + 0.02)
+        parts += [crate(*silencer_box, STEEL), crate((0.2 * length, -0.3, top - 0.06), (0.4 * length, 0.3, top), FRAME)]
         parts.append(crate((-0.3 * length, -0.4, top - 0.04), (-0.15 * length, 0.4, top), FRAME))
-        axles, low = (-0.285 * length, 0.335 * length), 0.3
-    parts += [tube([(x, -0.8 * half, low), (x, 0.8 * half, low)], 0.05, material=FRAME, segments=5) for x in axles]
-    parts.append(tube([(axles[0], 0.0, low), (0.2 * length, 0.0, low + 0.02)], 0.04, material=STEEL, segments=5))
+        axles, axle_height = (-0.285 * length, 0.335 * length), 0.3
+    parts += [
+        tube(
+            [(x, -0.8 * half_width, axle_height), (x, 0.8 * half_width, axle_height)], 0.05, material=FRAME, segments=5
+        )
+        for x in axles
+    ]
+    parts.append(
+        tube([(axles[0], 0.0, axle_height), (0.2 * length, 0.0, axle_height + 0.02)], 0.04, material=STEEL, segments=5)
+    )
     return merge(parts)
 
 
 def _turned(axis: str, angle: float) -> F64:
-    """A rotation [3, 3] about x or z."""
-    c, s = np.cos(angle), np.sin(angle)
+    """Return a rotation [3, 3] about x or z."""
+    cosine, sine = np.cos(angle), np.sin(angle)
     if axis == "x":
-        return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _colour(values: npt.ArrayLike) -> tuple[float, float, float]:
-    """Linear RGB within [0, 0.9], rounded so that equal looks are one material."""
-    r, g, b = np.round(np.clip(np.asarray(values, np.float64), 0.0, 0.9), 4).tolist()
-    return r, g, b
+    """Clip linear RGB to [0, 0.9] and round it, so that equal colours share a material."""
+    red, green, blue = np.round(np.clip(np.asarray(values, np.float64), 0.0, 0.9), 4).tolist()
+    return red, green, blue
 
 
 def _point(values: F64) -> Point:

@@ -206,82 +206,106 @@ STYLES: dict[str, Shell] = {
 
 
 def car(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """A car of a style that fills its size (length, width with mirrors, height), m."""
-    base = STYLES[style]
-    shift = generator.normal(0.0, 1.0, 4).clip(-2.0, 2.0)
+    """Return a car of a style that fills its size (length, width with mirrors, height), m."""
+    style_shell = STYLES[style]
+    variation = generator.normal(0.0, 1.0, 4).clip(-2.0, 2.0)
     chrome, roof_rails = generator.random(2)
     spokes = int(generator.integers(5, 8))
     shell = replace(
-        base,
-        radius=base.radius * (1.0 + 0.02 * shift[0]),
-        sill=base.sill * (1.0 + 0.04 * shift[1]),
-        tumble=base.tumble * (1.0 + 0.06 * shift[2]),
-        lamp_from=float(np.clip(base.lamp_from + 0.05 * shift[3], 0.45, 0.75)),
+        style_shell,
+        radius=style_shell.radius * (1.0 + 0.02 * variation[0]),
+        sill=style_shell.sill * (1.0 + 0.04 * variation[1]),
+        tumble=style_shell.tumble * (1.0 + 0.06 * variation[2]),
+        lamp_from=float(np.clip(style_shell.lamp_from + 0.05 * variation[3], 0.45, 0.75)),
     )
     parts = [skin(shell, size, detail=detail)]
     radius = shell.radius * size[2]
-    outer = 0.5 * size[1] * shell.body - 0.012
-    places = [(axle_x(shell, size, a), outer) for a in shell.axles]
-    rim = 0.60 if style in ("suv", "pickup", "van") else 0.66
-    metal = STEEL if style == "van" else RIM
-    look: dict[str, object] = {"rim": rim, "spokes": spokes, "steel": metal, "top": False}
-    parts.append(wheels(places, radius, shell.wheel_width, detail=detail, **look))
-    rails = roof_rails > 0.4 and style in ("suv", "estate")
-    parts += fittings(shell, size, detail=detail, chrome=chrome > 0.6, rails=rails)
+    wheel_y = 0.5 * size[1] * shell.body - 0.012
+    places = [(axle_x(shell, size, axle_share), wheel_y) for axle_share in shell.axles]
+    rim_share = 0.60 if style in ("suv", "pickup", "van") else 0.66
+    rim_material = STEEL if style == "van" else RIM
+    wheel_options: dict[str, object] = {"rim": rim_share, "spokes": spokes, "steel": rim_material, "top": False}
+    parts.append(wheels(places, radius, shell.wheel_width, detail=detail, **wheel_options))
+    has_rails = roof_rails > 0.4 and style in ("suv", "estate")
+    parts += fittings(shell, size, detail=detail, chrome=chrome > 0.6, rails=has_rails)
     return finish(parts, charts(shell, size), size)
 
 
 def fittings(shell: Shell, size: Point, *, detail: int, chrome: bool, rails: bool) -> list[Mesh]:
-    """Mirrors, plates, handles, roof rails, exhaust; at detail 0 mirrors and lamps alone."""
+    """Return mirrors, plates, handles, roof rails and exhaust; at detail 0 mirrors and lamps only."""
     _, width, height = size
-    at = np.array([shell.windows[0][0] + 0.012, 0.0, 1.0, shell.doors[0][2] - 0.02, shell.doors[-1][2] - 0.02])
-    cut = sections(shell, size, at, detail=2)
-    base = cut[0, U0]
-    reach = 0.5 * width - base[1]
-    bright: Material = CHROME if chrome else TRIM
-    middle = (base[0], 0.5 * width - 0.5 * reach, base[2] + 0.075)
+    positions = np.array([shell.windows[0][0] + 0.012, 0.0, 1.0, shell.doors[0][2] - 0.02, shell.doors[-1][2] - 0.02])
+    half_sections = sections(shell, size, positions, detail=2)
+    window_base = half_sections[0, U0]
+    mirror_reach = 0.5 * width - window_base[1]
+    bright_material: Material = CHROME if chrome else TRIM
+    mirror_centre = (window_base[0], 0.5 * width - 0.5 * mirror_reach, window_base[2] + 0.075)
     if detail == 2:
-        mirror = sphere((0.075, 0.5 * reach, 0.085), material=TRIM, centre=middle, segments=10)
+        mirror = sphere((0.075, 0.5 * mirror_reach, 0.085), material=TRIM, centre=mirror_centre, segments=10)
     elif detail == 1:
-        mirror = box((0.12, reach, 0.15), material=TRIM, centre=middle)
+        mirror = box((0.12, mirror_reach, 0.15), material=TRIM, centre=mirror_centre)
     else:
-        mirror = _plate_x(middle, (reach, 0.14), TRIM)
+        mirror = _plate_x(mirror_centre, (mirror_reach, 0.14), TRIM)
     parts = [both_sides(mirror)]
-    lamps = ((cut[1], shell.lamps, HEAD, 1.0, shell.lamp_from), (cut[2], shell.tail_lamps, TAIL, -1.0, shell.tail_from))
+    lamps = (
+        (half_sections[1], shell.lamps, HEAD, 1.0, shell.lamp_from),
+        (half_sections[2], shell.tail_lamps, TAIL, -1.0, shell.tail_from),
+    )
     if detail == 0:
-        for section, rows, look, sign, start in lamps:
-            low, high = section[rows[0]], section[min(rows[1], S5)]
-            y = 0.5 * (1.0 + start) * low[1]
-            centre = (low[0] + sign * 0.012, y, 0.5 * (low[2] + high[2]))
-            parts.append(both_sides(_plate_x(centre, ((1.0 - start) * low[1], high[2] - low[2]), look, sign)))
+        for section, lamp_rows, material, direction, lamp_start in lamps:
+            lower, upper = section[lamp_rows[0]], section[min(lamp_rows[1], S5)]
+            y = 0.5 * (1.0 + lamp_start) * lower[1]
+            centre = (lower[0] + direction * 0.012, y, 0.5 * (lower[2] + upper[2]))
+            parts.append(
+                both_sides(_plate_x(centre, ((1.0 - lamp_start) * lower[1], upper[2] - lower[2]), material, direction))
+            )
         return parts
-    plate_z = (cut[1, S3][2] - 0.10, cut[2, S4][2] - 0.02 if shell.deck < 0.97 else cut[2, S3][2] + 0.04)
+    plate_z = (
+        half_sections[1, S3][2] - 0.10,
+        half_sections[2, S4][2] - 0.02 if shell.deck < 0.97 else half_sections[2, S3][2] + 0.04,
+    )
     for front, z in zip((True, False), plate_z, strict=True):
         x = end_x(shell, size, float(z), front=front)
         parts.append(box((0.03, 0.50, 0.115), material=PLATE, centre=(x, 0.0, float(z))))
     if detail == 2:
-        for section in cut[3:]:
+        for section in half_sections[3:]:
             handle = as_point(section[S5] - [0.0, 0.0, 0.03])
-            parts.append(both_sides(box((0.17, 0.03, 0.028), material=bright, centre=handle)))
-        outlet = (float(cut[2, B3][0]) + 0.02, 0.3 * width, 0.8 * shell.sill * height)
+            parts.append(both_sides(box((0.17, 0.03, 0.028), material=bright_material, centre=handle)))
+        outlet = (float(half_sections[2, B3][0]) + 0.02, 0.3 * width, 0.8 * shell.sill * height)
         parts.append(box((0.09, 0.10, 0.07), material=DARK, centre=outlet))
         if chrome:
-            low, high = cut[1, shell.grille[0]], cut[1, shell.grille[1]]
-            z = float(0.5 * (low[2] + high[2]))
+            lower, upper = half_sections[1, shell.grille[0]], half_sections[1, shell.grille[1]]
+            z = float(0.5 * (lower[2] + upper[2]))
             centre = (end_x(shell, size, z, front=True), 0.0, z)
-            parts.append(box((0.02, 0.78 * low[1], 0.025), material=CHROME, centre=centre))
+            parts.append(box((0.02, 0.78 * lower[1], 0.025), material=CHROME, centre=centre))
         if rails:
-            ends = sections(shell, size, np.array([shell.screen + 0.05, 0.90]), detail=2)[:, U2 + 1]
-            middle = tuple(0.5 * (ends[0] + ends[1]) + [0.0, -0.05, 0.05])
-            parts.append(both_sides(box((float(ends[0, 0] - ends[1, 0]), 0.035, 0.04), material=bright, centre=middle)))
+            rail_ends = sections(shell, size, np.array([shell.screen + 0.05, 0.90]), detail=2)[:, U2 + 1]
+            mirror_centre = tuple(0.5 * (rail_ends[0] + rail_ends[1]) + [0.0, -0.05, 0.05])
+            parts.append(
+                both_sides(
+                    box(
+                        (float(rail_ends[0, 0] - rail_ends[1, 0]), 0.035, 0.04),
+                        material=bright_material,
+                        centre=mirror_centre,
+                    )
+                )
+            )
     return parts
 
 
 def _plate_x(centre: Point, size: tuple[float, float], material: Material, sign: float = 0.0) -> Mesh:
-    """A flat rectangle (width, height) across the vehicle: seen from the front (1), the rear (-1) or both (0)."""
+    """Return a flat rectangle (width, height) across the vehicle.
+
+    `sign`: seen from the front (1), the rear (-1) or both (0).
+    """
     x, y, z = centre
-    w, h = 0.5 * size[0], 0.5 * size[1]
-    points = [(x, y - w, z - h), (x, y + w, z - h), (x, y + w, z + h), (x, y - w, z + h)]
+    half_width, half_height = 0.5 * size[0], 0.5 * size[1]
+    points = [
+        (x, y - half_width, z - half_height),
+        (x, y + half_width, z - half_height),
+        (x, y + half_width, z + half_height),
+        (x, y - half_width, z + half_height),
+    ]
     faces = [(0, 1, 2), (0, 2, 3)] if sign >= 0.0 else []
     faces += [(0, 2, 1), (0, 3, 2)] if sign <= 0.0 else []
     return build(points, faces, materials=material, smooth=0.0)

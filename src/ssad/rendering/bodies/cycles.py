@@ -58,7 +58,7 @@ FAIRING = ((0.12, 0.24, 0.38, 0.80), (0.45, 0.22, 0.46, 1.00), (0.72, 0.13, 0.76
 
 
 def _variant(table: Mapping[str, float], share: float) -> str:
-    """The variant in whose part of [0, 1) a number lies."""
+    """Return the variant whose part of [0, 1) contains a share."""
     return list(table)[
         int(np.searchsorted(np.cumsum(list(table.values())), share, side="right").clip(0, len(table) - 1))
     ]
@@ -67,60 +67,80 @@ def _variant(table: Mapping[str, float], share: float) -> str:
 def bicycle(
     style: str, size: Point, *, generator: np.random.Generator, detail: int, phase: float | None = None
 ) -> Mesh:
-    """A bicycle that fills its size (m), with its rider when ridden; `phase` is the angle of the left crank, rad.
+    """Return a bicycle that fills its size (m), with its rider when ridden.
 
-    Its variant (see `BICYCLES`) is drawn.
+    Its variant (see `BICYCLES`) is drawn. `phase` is the angle of the left crank, rad; None draws it.
     """
-    look = draw_look(generator, helmet=bool(generator.random() < 0.5), rider=True)
-    drawn, upright = generator.uniform(0.0, 2.0 * np.pi), float(generator.random())
+    appearance = draw_look(generator, helmet=bool(generator.random() < 0.5), rider=True)
+    random_phase, uprightness = generator.uniform(0.0, 2.0 * np.pi), float(generator.random())
     variant = _variant(BICYCLES, float(generator.random()))
-    upright = {"city": 1.0, "racing": 0.0}.get(variant, upright)
-    crank = float(drawn if phase is None else phase)
-    radius, base = 0.34, 1.04
-    front, rear = np.array([0.5 * base, 0.0, radius]), np.array([-0.5 * base, 0.0, radius])
-    bracket, saddle = np.array([-0.08, 0.0, 0.28]), np.array([-0.24, 0.0, 0.93])
-    seat, head, crown = np.array([-0.20, 0.0, 0.78]), np.array([0.33, 0.0, 0.86]), np.array([0.36, 0.0, 0.72])
-    n = (4, 5, 8)[detail]
+    # Drawn before the variant is known, so that the number of draws is fixed.
+    uprightness = {"city": 1.0, "racing": 0.0}.get(variant, uprightness)
+    crank = float(random_phase if phase is None else phase)
+    wheel_radius, wheelbase = 0.34, 1.04
+    front, rear = np.array([0.5 * wheelbase, 0.0, wheel_radius]), np.array([-0.5 * wheelbase, 0.0, wheel_radius])
+    bottom_bracket, saddle = np.array([-0.08, 0.0, 0.28]), np.array([-0.24, 0.0, 0.93])
+    seat_top, head_tube, fork_crown = (
+        np.array([-0.20, 0.0, 0.78]),
+        np.array([0.33, 0.0, 0.86]),
+        np.array([0.36, 0.0, 0.72]),
+    )
+    segments = (4, 5, 8)[detail]
     parts = [
-        ring(radius, 0.045, material=RUBBER, segments=(10, 16, 28)[detail], around=(3, 4, 6)[detail]).moved(*c)
-        for c in (front, rear)
+        ring(wheel_radius, 0.045, material=RUBBER, segments=(10, 16, 28)[detail], around=(3, 4, 6)[detail]).moved(*hub)
+        for hub in (front, rear)
     ]
     if detail == 2:
-        for c in (front, rear):
+        for hub in (front, rear):
             angles = np.linspace(0.0, np.pi, 6, endpoint=False)
-            ends = [0.93 * radius * np.array([np.cos(a), 0.0, np.sin(a)]) for a in angles]
-            parts += [tube([c - e, c + e], 0.004, material=STEEL, segments=3) for e in ends]
-    bars = [(bracket, seat), (bracket, crown), (0.9 * seat + 0.1 * bracket, head), (crown, head)]
-    painted = [tube(bar, 0.019, material=PAINT, segments=n) for bar in bars]
-    stays = [(bracket, rear), (seat, rear)] if detail else [(bracket, rear)]
-    painted += [tube(bar, 0.013, material=PAINT, segments=n) for bar in stays]
+            spokes = [
+                0.93 * wheel_radius * np.array([np.cos(spoke_angle), 0.0, np.sin(spoke_angle)])
+                for spoke_angle in angles
+            ]
+            parts += [tube([hub - spoke, hub + spoke], 0.004, material=STEEL, segments=3) for spoke in spokes]
+    frame_tubes = [
+        (bottom_bracket, seat_top),
+        (bottom_bracket, fork_crown),
+        (0.9 * seat_top + 0.1 * bottom_bracket, head_tube),
+        (fork_crown, head_tube),
+    ]
+    painted = [tube(bar, 0.019, material=PAINT, segments=segments) for bar in frame_tubes]
+    frame_stays = [(bottom_bracket, rear), (seat_top, rear)] if detail else [(bottom_bracket, rear)]
+    painted += [tube(bar, 0.013, material=PAINT, segments=segments) for bar in frame_stays]
     parts.append(sided(merge(painted), "frame"))
-    parts.append(tube([crown, front], 0.018, material=FRAME, segments=n))
-    parts.append(tube([seat, saddle], 0.014, material=STEEL, segments=n))
-    parts.append(sphere((0.14, 0.07, 0.035), material=TRIM, centre=(-0.26, 0.0, 0.95), segments=max(6, n)))
+    parts.append(tube([fork_crown, front], 0.018, material=FRAME, segments=segments))
+    parts.append(tube([seat_top, saddle], 0.014, material=STEEL, segments=segments))
+    parts.append(sphere((0.14, 0.07, 0.035), material=TRIM, centre=(-0.26, 0.0, 0.95), segments=max(6, segments)))
     stem = np.array([0.36, 0.0, 1.0])
-    parts.append(tube([head, stem], 0.016, material=STEEL, segments=n))
-    if variant == "racing":  # hands on the hoods of a drop bar
+    parts.append(tube([head_tube, stem], 0.016, material=STEEL, segments=segments))
+    if variant == "racing":  # the hands rest on the hoods of a drop bar
         grip = np.array([0.50, 0.21, 0.95])
-        bend = [grip, (0.52, 0.21, 0.90), (0.46, 0.21, 0.83), (0.36, 0.21, 0.83)]
-        parts.append(tubes([stem, stem + np.array([0.0, 0.20, 0.0]), *bend], 0.014, TRIM, n))
+        drop_bend = [grip, (0.52, 0.21, 0.90), (0.46, 0.21, 0.83), (0.36, 0.21, 0.83)]
+        parts.append(tubes([stem, stem + np.array([0.0, 0.20, 0.0]), *drop_bend], 0.014, TRIM, segments))
     else:
-        grip = np.array([0.27 + 0.12 * (1.0 - upright), 0.29, 1.02])
+        grip = np.array([0.27 + 0.12 * (1.0 - uprightness), 0.29, 1.02])
         if variant == "city":
             grip = np.array([0.18, 0.28, 1.05])
-        parts.append(tubes([stem, stem + np.array([0.0, 0.18, 0.02]), grip], 0.014, TRIM, n))
-    parts += _carriers(variant, radius, base, detail)
-    feet: list[Point] = []
+        parts.append(tubes([stem, stem + np.array([0.0, 0.18, 0.02]), grip], 0.014, TRIM, segments))
+    parts += _carriers(variant, wheel_radius, wheelbase, detail)
+    foot_points: list[Point] = []
     for sign, angle in ((1.0, crank), (-1.0, crank + np.pi)):
-        pedal = bracket + 0.17 * np.array([np.sin(angle), 0.0, np.cos(angle)]) + [0.0, sign * 0.11, 0.0]
-        feet.append(as_point(np.add(pedal, [0.0, 0.0, 0.02])))
+        pedal = bottom_bracket + 0.17 * np.array([np.sin(angle), 0.0, np.cos(angle)]) + [0.0, sign * 0.11, 0.0]
+        foot_points.append(as_point(np.add(pedal, [0.0, 0.0, 0.02])))
         if detail:
-            parts.append(tube([bracket + np.array([0.0, sign * 0.06, 0.0]), pedal], 0.012, material=STEEL, segments=n))
+            parts.append(
+                tube(
+                    [bottom_bracket + np.array([0.0, sign * 0.06, 0.0]), pedal],
+                    0.012,
+                    material=STEEL,
+                    segments=segments,
+                )
+            )
             x, y, z = pedal
             parts.append(crate((x - 0.05, y - 0.04, z - 0.012), (x + 0.05, y + 0.04, z + 0.012), TRIM))
     if detail:
-        low = variant in ("city", "delivery")  # what is carried hides the usual places
-        x, z = (0.70, 0.655) if low else (0.44, 0.87)
+        has_load = variant in ("city", "delivery")  # the load hides the usual places
+        x, z = (0.70, 0.655) if has_load else (0.44, 0.87)
         parts.append(crate((x, -0.035, z - 0.035), (x + 0.03, 0.035, z + 0.035), HEAD))
         parts.append(crate((x - 0.03, -0.045, z - 0.045), (x, 0.045, z + 0.045), TRIM))
         x, z = (-0.84, 0.70) if variant == "city" else (-0.36, 0.77)
@@ -128,10 +148,16 @@ def bicycle(
         parts.append(crate((x + 0.03, -0.04, z - 0.045), (x + 0.04, 0.04, z + 0.045), TRIM))
     charts = side_charts("frame", (-0.5 * size[0], -0.1, 0.1 * size[2]), (0.5 * size[0], 0.1, 0.75 * size[2]))
     if style == "ridden":
-        hands = [as_point(grip * [1.0, s, 1.0] + [0.0, 0.0, 0.02]) for s in (1.0, -1.0)]
-        lean = {"city": 0.12, "racing": 0.85}.get(variant, 0.35 + 0.35 * (1.0 - upright))
-        pose = seated(1.75, pelvis=(-0.24, 0.0, 1.03), lean=lean, hands=(hands[0], hands[1]), feet=(feet[0], feet[1]))
-        parts.append(figure(pose, look, height=1.75, detail=detail))
+        hand_points = [as_point(grip * [1.0, side, 1.0] + [0.0, 0.0, 0.02]) for side in (1.0, -1.0)]
+        trunk_lean = {"city": 0.12, "racing": 0.85}.get(variant, 0.35 + 0.35 * (1.0 - uprightness))
+        pose = seated(
+            1.75,
+            pelvis=(-0.24, 0.0, 1.03),
+            lean=trunk_lean,
+            hands=(hand_points[0], hand_points[1]),
+            feet=(foot_points[0], foot_points[1]),
+        )
+        parts.append(figure(pose, appearance, height=1.75, detail=detail))
         charts += torso_charts((-0.3, -0.3, 0.55 * size[2]), (0.5, 0.3, 0.95 * size[2]))
     return finish(parts, charts, size)
 
@@ -145,9 +171,9 @@ def _carriers(variant: str, radius: float, base: float, detail: int) -> list[Mes
         ]
         if detail:
             parts.append(tubes([(-0.5 * base, 0.07, radius), (-0.72, 0.07, 0.74)], 0.008, FRAME, 4))
-            for x, start, end in ((0.5 * base, -0.5, 1.0), (-0.5 * base, -1.5, 0.5)):
-                angle = np.linspace(start, end, 5 if detail == 1 else 9)
-                arc = [(x + 0.375 * np.sin(a), 0.0, radius + 0.375 * np.cos(a)) for a in angle]
+            for x, first_angle, last_angle in ((0.5 * base, -0.5, 1.0), (-0.5 * base, -1.5, 0.5)):
+                angles = np.linspace(first_angle, last_angle, 5 if detail == 1 else 9)
+                arc = [(x + 0.375 * np.sin(arc_angle), 0.0, radius + 0.375 * np.cos(arc_angle)) for arc_angle in angles]
                 parts.append(tube(arc, 0.024, material=TRIM, segments=4))
         return parts
     if variant == "delivery":
@@ -160,17 +186,23 @@ def _carriers(variant: str, radius: float, base: float, detail: int) -> list[Mes
 
 
 def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """A motorcycle that fills its size (m), with its rider when ridden. Its variant (see `MOTORCYCLES`) is drawn."""
-    look = draw_look(generator, helmet=True, rider=True, visor=True)
+    """Return a motorcycle that fills its size (m), with its rider when ridden.
+
+    Its variant (see `MOTORCYCLES`) is drawn.
+    """
+    appearance = draw_look(generator, helmet=True, rider=True, visor=True)
     variant = _variant(MOTORCYCLES, float(generator.random()))
-    boxed = bool(generator.random() < BOXED) and variant != "sports"
+    has_box = bool(generator.random() < BOXED) and variant != "sports"
+    # All random numbers are drawn for every variant, so that their number never depends on it.
     colour = CLOTHS[int(generator.integers(1, len(CLOTHS)))]
-    n = (4, 6, 10)[detail]
-    scooter = variant == "scooter"
-    painted, parts = _scooter(n, detail) if scooter else _motorbike(n, detail, fairing=variant == "sports")
+    segments = (4, 6, 10)[detail]
+    is_scooter = variant == "scooter"
+    painted, parts = (
+        _scooter(segments, detail) if is_scooter else _motorbike(segments, detail, fairing=variant == "sports")
+    )
     parts.append(sided(merge(painted), "body"))
-    grip = np.array([0.32, 0.33, 1.05]) if scooter else np.array([0.26, 0.34, 1.04])
-    if boxed:
+    grip = np.array([0.32, 0.33, 1.05]) if is_scooter else np.array([0.26, 0.34, 1.04])
+    if has_box:
         material = Material("delivery_box", colour, specular=0.03, gloss=0.3)
         parts.append(crate((-1.02, -0.24, 0.90), (-0.60, 0.24, 1.34), material))
         parts.append(crate((-1.02, -0.245, 1.22), (-0.60, 0.245, 1.25), TRIM))
@@ -181,68 +213,79 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
         parts.append(crates((-0.94, 0.12, 0.80), (-0.90, 0.17, 0.84), BLINKER))
     charts = side_charts("body", (-0.5 * size[0], -0.3, 0.15 * size[2]), (0.5 * size[0], 0.3, 0.9 * size[2]))
     if style == "ridden":
-        hands = [as_point(grip * [1.0, s, 1.0] + [-0.03, 0.0, 0.03]) for s in (1.0, -1.0)]
-        feet = ((0.24, 0.13, 0.33), (0.24, -0.13, 0.33)) if scooter else ((0.02, 0.22, 0.33), (0.02, -0.22, 0.33))
-        lean = {"sports": 0.55, "naked": 0.25, "scooter": 0.10}[variant]
-        out = 0.05 if scooter else 0.25
-        pose = seated(1.76, pelvis=(-0.30, 0.0, 0.92), lean=lean, hands=(hands[0], hands[1]), feet=feet, knees_out=out)
-        parts.append(figure(pose, look, height=1.76, detail=detail))
+        hand_points = [as_point(grip * [1.0, side, 1.0] + [-0.03, 0.0, 0.03]) for side in (1.0, -1.0)]
+        foot_points = (
+            ((0.24, 0.13, 0.33), (0.24, -0.13, 0.33)) if is_scooter else ((0.02, 0.22, 0.33), (0.02, -0.22, 0.33))
+        )
+        trunk_lean = {"sports": 0.55, "naked": 0.25, "scooter": 0.10}[variant]
+        knee_spread = 0.05 if is_scooter else 0.25
+        pose = seated(
+            1.76,
+            pelvis=(-0.30, 0.0, 0.92),
+            lean=trunk_lean,
+            hands=(hand_points[0], hand_points[1]),
+            feet=foot_points,
+            knees_out=knee_spread,
+        )
+        parts.append(figure(pose, appearance, height=1.76, detail=detail))
         charts += torso_charts((-0.5, -0.3, 0.5 * size[2]), (0.5, 0.3, 0.95 * size[2]))
     return finish(parts, charts, size)
 
 
 def _tyres(places: Sequence[tuple[float, float]], radius: float, detail: int) -> list[Mesh]:
-    """Wheels of a motorcycle at each (x, width), m."""
+    """Return the wheels of a motorcycle at each (x, width), m."""
     parts = []
     for x, width in places:
-        thick, steps = 0.5 * (width + 0.1), (10, 14, 24)[detail]
-        tyre = ring(radius, thick, material=RUBBER, segments=steps, around=(4, 5, 8)[detail])
+        half_width, segments = 0.5 * (width + 0.1), (10, 14, 24)[detail]
+        tyre = ring(radius, half_width, material=RUBBER, segments=segments, around=(4, 5, 8)[detail])
         parts.append(tyre.moved(x, 0.0, radius))
         if detail:
-            disc = wheel(0.75 * radius, 0.07, detail=detail, rim=0.97, spokes=5)
-            parts.append(both_sides(disc).moved(x, 0.0, radius))
+            rim_disc = wheel(0.75 * radius, 0.07, detail=detail, rim=0.97, spokes=5)
+            parts.append(both_sides(rim_disc).moved(x, 0.0, radius))
     return parts
 
 
 def _mirrors(detail: int) -> list[Mesh]:
-    """Mirrors over the handlebar, with their stalks."""
+    """Return mirrors over the handlebar, with their stalks."""
     if detail == 0:
         return []
-    n = (4, 6, 10)[detail]
-    mirror = sphere((0.02, 0.06, 0.045), material=TRIM, centre=(0.36, 0.30, 1.18), segments=n)
+    segments = (4, 6, 10)[detail]
+    mirror = sphere((0.02, 0.06, 0.045), material=TRIM, centre=(0.36, 0.30, 1.18), segments=segments)
     return [both_sides(mirror), tubes([(0.32, 0.24, 1.04), (0.36, 0.29, 1.17)], 0.008, TRIM, 4)]
 
 
 def _motorbike(n: int, detail: int, *, fairing: bool) -> tuple[list[Mesh], list[Mesh]]:
     """Painted and other parts of a motorcycle with its engine below the tank, with or without a fairing."""
-    radius = 0.32
-    front, rear = np.array([0.72, 0.0, radius]), np.array([-0.70, 0.0, radius])
-    parts = _tyres(((0.72, 0.12), (-0.70, 0.17)), radius, detail)
-    painted = [_pod(rows, n) for rows in (TANK, TAIL_PIECE, MUDGUARD)]
+    wheel_radius = 0.32
+    front_hub, rear_hub = np.array([0.72, 0.0, wheel_radius]), np.array([-0.70, 0.0, wheel_radius])
+    parts = _tyres(((0.72, 0.12), (-0.70, 0.17)), wheel_radius, detail)
+    painted = [_pod(ovals, n) for ovals in (TANK, TAIL_PIECE, MUDGUARD)]
     if fairing:
         painted.append(_pod(FAIRING, n))
         parts.append(_pod([(0.35, 0.13, 0.98, 1.16), (0.62, 0.11, 0.98, 1.08)], n, GLASS))
     parts.append(_pod([(-0.74, 0.13, 0.84, 0.94), (-0.35, 0.16, 0.78, 0.85), (-0.10, 0.12, 0.78, 0.86)], n, TRIM))
     parts.append(_pod([(-0.28, 0.17, 0.26, 0.62), (-0.05, 0.20, 0.22, 0.70), (0.28, 0.17, 0.28, 0.66)], n, DARK))
     parts.append(crate((-0.05, -0.25, 0.30), (0.12, 0.25, 0.42), STEEL))
-    crown = np.array([0.40, 0.0, 0.95])
-    aside = np.array([0.0, 0.09, 0.0])
-    parts.append(tubes([crown + aside, front + aside], 0.028, STEEL, n))
+    fork_crown = np.array([0.40, 0.0, 0.95])
+    side_offset = np.array([0.0, 0.09, 0.0])
+    parts.append(tubes([fork_crown + side_offset, front_hub + side_offset], 0.028, STEEL, n))
     if detail:
-        parts.append(tubes(np.array([(-0.20, 0.11, 0.40), rear + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, n))
+        parts.append(tubes(np.array([(-0.20, 0.11, 0.40), rear_hub + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, n))
         exhaust = [(0.15, -0.16, 0.24), (-0.45, -0.20, 0.24), (-0.82, -0.22, 0.42)]
         parts.append(tube(exhaust, [0.03, 0.045, 0.06], material=CHROME, segments=n))
         blinker = sphere((0.03, 0.03, 0.03), material=BLINKER, centre=(0.46, 0.20, 0.90), segments=6)
         parts.append(both_sides(blinker))
-    parts.append(tubes(np.array([crown, crown + np.array([-0.02, 0.16, 0.08]), (0.26, 0.34, 1.04)]), 0.016, TRIM, n))
-    place = (0.77 if fairing else 0.56, 0.0, 0.90)
-    parts.append(sphere((0.05, 0.095, 0.085), material=HEAD, centre=place, segments=max(6, n)))
+    parts.append(
+        tubes(np.array([fork_crown, fork_crown + np.array([-0.02, 0.16, 0.08]), (0.26, 0.34, 1.04)]), 0.016, TRIM, n)
+    )
+    lamp_position = (0.77 if fairing else 0.56, 0.0, 0.90)
+    parts.append(sphere((0.05, 0.095, 0.085), material=HEAD, centre=lamp_position, segments=max(6, n)))
     return painted, parts + _mirrors(detail)
 
 
 def _scooter(n: int, detail: int) -> tuple[list[Mesh], list[Mesh]]:
     """Painted and other parts of a scooter: small wheels, a shield before the legs, a floor to step through."""
-    painted = [_pod(rows, n) for rows in (SHIELD, UNDER_SEAT, SMALL_MUDGUARD)]
+    painted = [_pod(ovals, n) for ovals in (SHIELD, UNDER_SEAT, SMALL_MUDGUARD)]
     painted.append(_pod([(0.36, 0.12, 0.98, 1.08), (0.46, 0.14, 0.94, 1.12), (0.53, 0.06, 0.97, 1.06)], n))
     parts = _tyres(((0.66, 0.12), (-0.62, 0.14)), 0.24, detail)
     parts.append(crate((-0.14, -0.18, 0.26), (0.42, 0.18, 0.32), TRIM))
@@ -258,8 +301,14 @@ def _scooter(n: int, detail: int) -> tuple[list[Mesh], list[Mesh]]:
 
 def _pod(rows: Sequence[tuple[float, float, float, float]], n: int, material: Material = PAINT) -> Mesh:
     """A rounded body along x through ovals (x, half width, lowest and highest point)."""
-    angle = np.arange(2 * n) * (np.pi / n)
-    c, s = np.cos(angle), np.sin(angle)
-    c, s = np.sign(c) * np.abs(c) ** 0.8, np.sign(s) * np.abs(s) ** 0.8
-    sections = [np.stack([np.full(2 * n, x), w * c, 0.5 * (a + b) + 0.5 * (b - a) * s], 1) for x, w, a, b in rows]
+    angles = np.arange(2 * n) * (np.pi / n)
+    cosine, sine = np.cos(angles), np.sin(angles)
+    # A superellipse: a little fuller than an ellipse.
+    cosine, sine = np.sign(cosine) * np.abs(cosine) ** 0.8, np.sign(sine) * np.abs(sine) ** 0.8
+    sections = [
+        np.stack(
+            [np.full(2 * n, x), half_width * cosine, 0.5 * (lowest + highest) + 0.5 * (highest - lowest) * sine], 1
+        )
+        for x, half_width, lowest, highest in rows
+    ]
     return loft(np.array(sections), material=material, smooth=1.0)

@@ -1,1 +1,1 @@
-"""The camera: meshes, visibility, shading, weather and sensors."""
+"""Camera: meshes, visibility, shading, weather and sensors."""

@@ -1,8 +1,8 @@
-"""Labels of a picture from its tags: tight boxes, visible pixels, and which share of each thing is visible.
+"""Labels of an image from its tags: tight boxes, visible pixels, and the visible share of each object.
 
-Pixel (x, y) spans x..x+1, y..y+1, as in an intrinsic, so that boxes are made of pixel edges. What a thing would cover
-alone is rasterised in a crop of its own, on the samples of the picture where it is small and on a coarser grid where it
-is large.
+Pixel (x, y) spans x..x+1, y..y+1, as in an intrinsic, so that boxes consist of pixel edges. The unoccluded area of
+an object is rasterised in a crop of its own, on the samples of the image where it is small and on a coarser grid
+where it is large.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ssad.rendering.camera.render import FACE_LANES, NEAR, Picture, View
 from ssad.rendering.camera.scene import Scene, Thing
 
 CROP = 64  # pixels a side of a crop
-BEYOND = 2.0  # what lies further outside than this many widths or heights of the picture does not count
+BEYOND = 2.0  # parts further outside than this many widths or heights of the image do not count
 BATCH = 256  # crops at a time
 
 _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
@@ -31,14 +31,14 @@ _bounds: WeakKeyDictionary[Scene, dict[int, tuple[F64, F64]]] = WeakKeyDictionar
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """What is seen of the things of one view: N rows in the order of their tags, one for each with a visible pixel.
+    """Labels of the visible objects of one view: N rows ordered by tag.
 
     Attributes:
         tag: [N].
         box: x0, y0, x1, y1 of the visible pixels, at pixel edges [N, 4].
         pixels: Number of visible pixels [N].
-        share: Visible pixels as a share of those that it would cover if nothing else were there, 0 to 1 [N].
-        inside: Share of its projection that lies in the picture, 0 to 1 [N].
+        share: Visible pixels as a share of those that it would cover without occlusion, 0 to 1 [N].
+        inside: Share of its projection that lies in the image, 0 to 1 [N].
     """
 
     tag: I32
@@ -64,10 +64,10 @@ def label_picture(stage: Scene, view: View, picture: Picture, index: int = 0, *,
     Raises:
         ConfigError: The picture shows another view.
     """
-    tag, box, pixels = extents(_tags(view, picture, index))
-    alone, inside = _amodal(stage, view, tag, scale=scale)
-    share = np.clip(pixels / np.maximum(alone, 1e-9), 0.0, 1.0)
-    return Labels(tag, box, pixels, share, inside)
+    tags, boxes, pixels = extents(_tags(view, picture, index))
+    unoccluded, inside = _amodal(stage, view, tags, scale=scale)
+    shares = np.clip(pixels / np.maximum(unoccluded, 1e-9), 0.0, 1.0)
+    return Labels(tags, boxes, pixels, shares, inside)
 
 
 def visible_share(stage: Scene, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> dict[int, float]:
@@ -84,29 +84,33 @@ def visible_share(stage: Scene, view: View, picture: Picture, index: int = 0, *,
         ConfigError: The picture shows another view.
     """
     labels = label_picture(stage, view, picture, index, scale=scale)
-    shares = dict.fromkeys(sorted({t.tag for t in view.things if t.tag > 0}), 0.0)
+    shares = dict.fromkeys(sorted({entry.tag for entry in view.things if entry.tag > 0}), 0.0)
     return shares | dict(zip(labels.tag.tolist(), labels.share.tolist(), strict=True))
 
 
 def extents(tags: I32) -> tuple[I32, F64, I32]:
-    """Tags above 0 in a picture [H, W] in order [N], their tight boxes [N, 4] at pixel edges, their pixels [N]."""
+    """Return the tags above 0 in an image [H, W] in order [N], their tight boxes [N, 4] and pixel counts [N].
+
+    Boxes lie at pixel edges.
+    """
     width = tags.shape[1]
-    flat = np.ascontiguousarray(tags, np.int32).reshape(-1)
-    fresh = np.empty(flat.size, bool)
-    np.not_equal(flat[1:], flat[:-1], out=fresh[1:])
-    fresh[::width] = True
-    first = np.flatnonzero(fresh)
-    length = np.diff(first, append=flat.size)
-    thing = flat[first] > 0
-    first, length = first[thing], length[thing]
-    tag, row = np.unique(flat[first], return_inverse=True)
-    y, x0 = np.divmod(first, width)
-    box = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (len(tag), 1))
-    np.minimum.at(box[:, 0], row, x0)
-    np.minimum.at(box[:, 1], row, y)
-    np.maximum.at(box[:, 2], row, x0 + length)
-    np.maximum.at(box[:, 3], row, y + 1)
-    return tag.astype(np.int32), box, np.bincount(row, length, len(tag)).astype(np.int32)
+    flat_tags = np.ascontiguousarray(tags, np.int32).reshape(-1)
+    run_starts = np.empty(flat_tags.size, bool)
+    np.not_equal(flat_tags[1:], flat_tags[:-1], out=run_starts[1:])
+    # A run must not continue across the border into the next row.
+    run_starts[::width] = True
+    first_pixels = np.flatnonzero(run_starts)
+    run_lengths = np.diff(first_pixels, append=flat_tags.size)
+    is_object = flat_tags[first_pixels] > 0
+    first_pixels, run_lengths = first_pixels[is_object], run_lengths[is_object]
+    unique_tags, box_index = np.unique(flat_tags[first_pixels], return_inverse=True)
+    y, x0 = np.divmod(first_pixels, width)
+    boxes = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (len(unique_tags), 1))
+    np.minimum.at(boxes[:, 0], box_index, x0)
+    np.minimum.at(boxes[:, 1], box_index, y)
+    np.maximum.at(boxes[:, 2], box_index, x0 + run_lengths)
+    np.maximum.at(boxes[:, 3], box_index, y + 1)
+    return unique_tags.astype(np.int32), boxes, np.bincount(box_index, run_lengths, len(unique_tags)).astype(np.int32)
 
 
 def _tags(view: View, picture: Picture, index: int) -> I32:
@@ -120,88 +124,96 @@ def _tags(view: View, picture: Picture, index: int) -> I32:
 
 
 def bounds(stage: Scene, mesh: int) -> tuple[F64, F64]:
-    """Smallest and largest corner of a mesh of a stage in its own frame, [3] each, m."""
-    known = _bounds.setdefault(stage, {})
-    if mesh not in known:
-        listed = stage.listed.numpy()[stage.first[mesh] : stage.first[mesh] + stage.count[mesh]]
-        corners = stage.vertices.numpy()[np.unique(stage.faces.numpy()[listed])].astype(np.float64)
-        known[mesh] = (corners.min(0), corners.max(0)) if len(corners) else (np.zeros(3), np.zeros(3))
-    return known[mesh]
+    """Return the smallest and largest corner of a mesh of a scene in its own frame, [3] each, m."""
+    cached_bounds = _bounds.setdefault(stage, {})
+    if mesh not in cached_bounds:
+        face_indices = stage.listed.numpy()[stage.first[mesh] : stage.first[mesh] + stage.count[mesh]]
+        corners = stage.vertices.numpy()[np.unique(stage.faces.numpy()[face_indices])].astype(np.float64)
+        cached_bounds[mesh] = (corners.min(0), corners.max(0)) if len(corners) else (np.zeros(3), np.zeros(3))
+    return cached_bounds[mesh]
 
 
 def _projected(stage: Scene, view: View, things: Sequence[Thing], inverse: F64) -> F64:
     """x0, y0, x1, y1 at pixel edges [T, 4] of the boxes around things, cut at the near plane; NaN behind it."""
-    span = np.array([bounds(stage, t.mesh) for t in things])
-    corner = (np.arange(8)[:, None] >> np.arange(3)) & 1
-    points = np.where(corner[None] == 1, span[:, 1, None], span[:, 0, None])
-    matrix = inverse @ np.array([t.pose for t in things])
-    points = np.einsum("tij,tpj->tpi", matrix[:, :3, :3], points) + matrix[:, None, :3, 3]
-    a, b = points[:, _EDGES[:, 0]], points[:, _EDGES[:, 1]]
-    crosses = (a[..., 2] < NEAR) != (b[..., 2] < NEAR)
-    along = (NEAR - a[..., 2]) / np.where(crosses, b[..., 2] - a[..., 2], 1.0)
-    cuts = np.where(crosses[..., None], a + (b - a) * along[..., None], np.nan)
+    box_bounds = np.array([bounds(stage, entry.mesh) for entry in things])
+    corner_bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+    points = np.where(corner_bits[None] == 1, box_bounds[:, 1, None], box_bounds[:, 0, None])
+    to_camera = inverse @ np.array([entry.pose for entry in things])
+    points = np.einsum("tij,tpj->tpi", to_camera[:, :3, :3], points) + to_camera[:, None, :3, 3]
+    starts, ends = points[:, _EDGES[:, 0]], points[:, _EDGES[:, 1]]
+    # Boxes may reach behind the camera: add the points where their edges cut the near plane.
+    crosses_plane = (starts[..., 2] < NEAR) != (ends[..., 2] < NEAR)
+    cut_share = (NEAR - starts[..., 2]) / np.where(crosses_plane, ends[..., 2] - starts[..., 2], 1.0)
+    cut_points = np.where(crosses_plane[..., None], starts + (ends - starts) * cut_share[..., None], np.nan)
     points = np.where(points[..., 2:] >= NEAR, points, np.nan)
-    points = np.concatenate([points, cuts], 1)
-    k = view.camera.intrinsic
-    xy = points[..., :2] / points[..., 2:] * [k[0, 0], k[1, 1]] + [k[0, 2], k[1, 2]]
-    low = np.where(np.isnan(xy), np.inf, xy).min(1)
-    high = np.where(np.isnan(xy), -np.inf, xy).max(1)
-    return np.concatenate([low, high], 1)
+    points = np.concatenate([points, cut_points], 1)
+    intrinsic = view.camera.intrinsic
+    xy = points[..., :2] / points[..., 2:] * [intrinsic[0, 0], intrinsic[1, 1]] + [intrinsic[0, 2], intrinsic[1, 2]]
+    lower = np.where(np.isnan(xy), np.inf, xy).min(1)
+    upper = np.where(np.isnan(xy), -np.inf, xy).max(1)
+    return np.concatenate([lower, upper], 1)
 
 
 def _amodal(stage: Scene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
-    """Pixels that the things of each tag would cover alone in the picture [N], and their share inside it [N]."""
+    """Return the unoccluded pixels of each tag in the image [N], and the share of its area inside the image [N]."""
     if not len(tags):
         return np.zeros(0), np.zeros(0)
-    row = {int(tag): n for n, tag in enumerate(tags)}
-    things = [t for t in view.things if t.tag in row]
-    owner = np.array([row[t.tag] for t in things], np.int64)
-    if len(np.unique(owner)) < len(tags):
-        missing = int(np.setdiff1d(tags, [t.tag for t in things])[0])
+    row_of_tag = {int(tag): tag_index for tag_index, tag in enumerate(tags)}
+    objects = [entry for entry in view.things if entry.tag in row_of_tag]
+    owners = np.array([row_of_tag[entry.tag] for entry in objects], np.int64)
+    if len(np.unique(owners)) < len(tags):
+        missing = int(np.setdiff1d(tags, [entry.tag for entry in objects])[0])
         raise ConfigError(f"label_picture: the picture shows tag {missing}, which its view lacks; give its own view")
     width, height = float(view.camera.width), float(view.camera.height)
     inverse = np.asarray(np.linalg.inv(view.pose), np.float64)
-    each = _projected(stage, view, things, inverse)
-    whole = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (len(tags), 1))
-    np.minimum.at(whole[:, :2], owner, each[:, :2])
-    np.maximum.at(whole[:, 2:], owner, each[:, 2:])
-    whole = np.clip(whole, [-BEYOND * width, -BEYOND * height] * 2, [(BEYOND + 1) * width, (BEYOND + 1) * height] * 2)
-    whole = np.concatenate([np.floor(whole[:, :2]), np.ceil(whole[:, 2:])], 1)
-    shown = np.clip(whole, 0.0, [width, height, width, height])
-    partly = np.flatnonzero((whole != shown).any(1))
-    crops = np.concatenate([shown, whole[partly]])
-    places = np.concatenate([np.arange(len(tags)), partly])
-    pixels, areas = np.zeros(len(crops)), np.zeros(len(crops))
-    of_owner = [np.flatnonzero(owner == n) for n in range(len(tags))]
-    for at in range(0, len(crops), BATCH):
-        part = slice(at, at + BATCH)
-        members = [of_owner[n] for n in places[part]]
-        pixels[part], areas[part] = _alone(stage, view, (things, members), crops[part], scale=scale)
+    object_boxes = _projected(stage, view, objects, inverse)
+    tag_boxes = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (len(tags), 1))
+    np.minimum.at(tag_boxes[:, :2], owners, object_boxes[:, :2])
+    np.maximum.at(tag_boxes[:, 2:], owners, object_boxes[:, 2:])
+    tag_boxes = np.clip(
+        tag_boxes, [-BEYOND * width, -BEYOND * height] * 2, [(BEYOND + 1) * width, (BEYOND + 1) * height] * 2
+    )
+    tag_boxes = np.concatenate([np.floor(tag_boxes[:, :2]), np.ceil(tag_boxes[:, 2:])], 1)
+    clipped_boxes = np.clip(tag_boxes, 0.0, [width, height, width, height])
+    # Truncated objects are rasterised twice: their part in the image, and the whole.
+    truncated = np.flatnonzero((tag_boxes != clipped_boxes).any(1))
+    crops = np.concatenate([clipped_boxes, tag_boxes[truncated]])
+    crop_tags = np.concatenate([np.arange(len(tags)), truncated])
+    crop_pixels, crop_areas = np.zeros(len(crops)), np.zeros(len(crops))
+    objects_of_tag = [np.flatnonzero(owners == tag_index) for tag_index in range(len(tags))]
+    for batch_start in range(0, len(crops), BATCH):
+        batch = slice(batch_start, batch_start + BATCH)
+        batch_objects = [objects_of_tag[tag_index] for tag_index in crop_tags[batch]]
+        crop_pixels[batch], crop_areas[batch] = _alone(stage, view, (objects, batch_objects), crops[batch], scale=scale)
     inside = np.ones(len(tags))
-    inside[partly] = areas[partly] / np.maximum(np.maximum(areas[len(tags) :], areas[partly]), 1e-9)
-    return pixels[: len(tags)], inside
+    inside[truncated] = crop_areas[truncated] / np.maximum(
+        np.maximum(crop_areas[len(tags) :], crop_areas[truncated]), 1e-9
+    )
+    return crop_pixels[: len(tags)], inside
 
 
 def _alone(
     stage: Scene, view: View, group: tuple[Sequence[Thing], Sequence[I32]], crops: F64, *, scale: int
 ) -> tuple[F64, F64]:
-    """Pixels that things cover in crops [M, 4] without others, by the picture's rule and by area [M each]."""
-    things, members = group
+    """Return the pixels that objects cover alone in crops [M, 4], by the image's rule and by area [M each]."""
+    objects, members = group
     size = np.maximum(crops[:, 2:] - crops[:, :2], 1.0)
-    step = np.maximum(size / CROP, 1.0)  # pixels of the picture for one of the crop
-    k = view.camera.intrinsic
-    focal = np.array([k[0, 0], k[1, 1]]) / step
-    centre = (np.array([k[0, 2], k[1, 2]]) - crops[:, :2]) / step - 0.5  # as `kernel_lens` has it
+    pixel_scale = np.maximum(size / CROP, 1.0)  # image pixels per crop pixel
+    intrinsic = view.camera.intrinsic
+    focal = np.array([intrinsic[0, 0], intrinsic[1, 1]]) / pixel_scale
+    centre = (
+        np.array([intrinsic[0, 2], intrinsic[1, 2]]) - crops[:, :2]
+    ) / pixel_scale - 0.5  # as `kernel_lens` has it
     lens = np.concatenate([focal, centre], 1).astype(np.float32)
-    order = np.concatenate(list(members))
-    firsts = np.array([stage.first[things[n].mesh] for n in order], np.int32)
-    counts = np.array([stage.count[things[n].mesh] for n in order], np.int32)
-    matrices = np.linalg.inv(view.pose) @ np.array([things[n].pose for n in order])
-    device, total = stage.device, int(counts.sum())
-    views = np.repeat(np.arange(len(crops)), [len(m) for m in members]).astype(np.int32)
+    object_order = np.concatenate(list(members))
+    firsts = np.array([stage.first[objects[object_index].mesh] for object_index in object_order], np.int32)
+    counts = np.array([stage.count[objects[object_index].mesh] for object_index in object_order], np.int32)
+    matrices = np.linalg.inv(view.pose) @ np.array([objects[object_index].pose for object_index in object_order])
+    device, face_count = stage.device, int(counts.sum())
+    views = np.repeat(np.arange(len(crops)), [len(group_members) for group_members in members]).astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    side = CROP * scale
-    samples = wp.zeros((len(crops), side, side), dtype=wp.uint64, device=device)
+    crop_samples = CROP * scale
+    samples = wp.zeros((len(crops), crop_samples, crop_samples), dtype=wp.uint64, device=device)
     lanes = FACE_LANES if device != "cpu" else 1
     inputs = [
         stage.vertices,
@@ -218,15 +230,15 @@ def _alone(
         lanes,
         1e30,
     ]
-    owners = wp.empty(total, dtype=wp.vec2i, device=device)
+    owners = wp.empty(face_count, dtype=wp.vec2i, device=device)
     large = wp.empty(1, dtype=raster.Triangle, device=device)
-    many = wp.zeros(1, dtype=int, device=device)
-    outputs = [owners, samples, large, many]
+    large_count = wp.zeros(1, dtype=int, device=device)
+    outputs = [owners, samples, large, large_count]
     wp.launch(raster.fill, dim=(len(firsts), lanes), inputs=inputs, outputs=outputs, device=device)
-    shape = np.ceil(np.minimum(size, CROP)).astype(np.int32)[:, ::-1]
+    crop_shapes = np.ceil(np.minimum(size, CROP)).astype(np.int32)[:, ::-1]
     pixels = wp.zeros(len(crops), dtype=int, device=device)
-    hits = wp.zeros(len(crops), dtype=int, device=device)
-    inputs = [samples, wp.array(np.ascontiguousarray(shape), dtype=int, device=device), scale]
-    wp.launch(cover, dim=(len(crops), CROP, CROP), inputs=inputs, outputs=[pixels, hits], device=device)
-    area = hits.numpy() / scale**2 * step.prod(1)
-    return np.where(step.max(1) > 1.0, area, pixels.numpy()), area
+    covered_samples = wp.zeros(len(crops), dtype=int, device=device)
+    inputs = [samples, wp.array(np.ascontiguousarray(crop_shapes), dtype=int, device=device), scale]
+    wp.launch(cover, dim=(len(crops), CROP, CROP), inputs=inputs, outputs=[pixels, covered_samples], device=device)
+    areas = covered_samples.numpy() / scale**2 * pixel_scale.prod(1)
+    return np.where(pixel_scale.max(1) > 1.0, areas, pixels.numpy()), areas

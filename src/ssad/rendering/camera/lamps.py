@@ -1,8 +1,8 @@
-"""Lamps that light a scene, and the bodies that keep light from the ground: what the kernels read of them.
+"""Lamps that light a scene, and bodies that occlude the sky from the ground, as tables for the kernels.
 
-A lamp lights a plane across its axis evenly: an ellipse, or the rectangle of what it projects. So its power spreads
-over the plane that it lights whatever the distance, and head lamps, street lamps, projectors, flashlights and lasers
-are one thing. Irradiance over pi of one lux is about 1/60, on the scale on which the sun at noon is 2.6.
+A lamp lights a plane across its axis evenly: an ellipse, or the rectangle that it projects. So its power spreads
+over the lit plane at any distance, and one model covers head lamps, street lamps, projectors, flashlights and
+lasers. Irradiance over pi of one lux is about 1/60, on the scale on which the sun at noon is 2.6.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ if TYPE_CHECKING:
     from ssad.rendering.camera.scene import Bodies, Scene
 
 LAMP_SHADOWS = 512  # texels a side of a lamp's shadow map
-LAMP_NEAR = 0.05  # m: what is nearer to a lamp casts no shadow (its own housing)
+LAMP_NEAR = 0.05  # m: nearer surfaces cast no shadow (the lamp's own housing)
 HEAD_LAMPS = (7.0, (0.60, 0.06), (1.0, 0.97, 0.90), 60.0, 0.055)  # power, spread, colour, reach (m), tilt (rad)
 TAIL_LAMPS = (0.25, (1.6, 1.0), (1.0, 0.05, 0.03), 8.0, 0.0)
 STREET_LAMP = (26.0, (2.4, 1.7), (1.0, 0.86, 0.66), 28.0)
 LIT_UP_TO = 130.0  # m from the eye up to which lamps of bodies and of the street are on
-SHADED_UP_TO = 60.0  # m: likewise bodies that keep light from the ground
+SHADED_UP_TO = 60.0  # m: the same for bodies that occlude the sky from the ground
 NOSE = 3.7  # m from the rear axle of a car to its front
-FLAT = 0.25  # m: what is lower keeps no light from the ground
+FLAT = 0.25  # m: lower bodies do not occlude the sky from the ground
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # a lamp that looks along x
 
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """A lamp: what it lights, and how strongly.
+    """Lamp with a pose, a power and the area that it lights.
 
     Attributes:
         pose: Lamp to world [4, 4]; x across, y down, z ahead, as of a camera.
-        power: Light that leaves it, in units of (irradiance / pi) m^2: over any plane that catches the whole of it, the
-            integral of irradiance / pi is the power, for each of the colours 1.
+        power: Emitted light, in units of (irradiance / pi) m^2: over any plane that catches all of it, the
+            integral of irradiance / pi is the power, for each colour with value 1.
         spread: Tangents of the half angles across and down.
         colour: Linear RGB that the power is multiplied by.
         soft: Share of the spread's radius over which an ellipse fades at its edge, 0 to 1.
         square: Whether it lights a rectangle; else an ellipse.
-        reach: m; in the last third it fades, beyond it is dark.
-        shadows: Whether bodies and street stand in its way.
-        texture: Which texture it projects onto what it lights, -1 for none. Its image is then a linear function of that
-            texture (see `ssad.rendering.camera.texture`): u across, v down its spread. A projector lights a rectangle.
+        reach: m; light fades in the last third and ends here.
+        shadows: Whether bodies and street block its light.
+        texture: Index of the texture that it projects, -1 for none. The image is then a linear function of that
+            texture (see `ssad.camera.texture`): u across, v down its spread. A projector lights a rectangle.
     """
 
     pose: F64
@@ -72,7 +72,7 @@ class Lamp:
 
     @property
     def is_square(self) -> bool:
-        """Whether it lights a rectangle, as what projects a texture always does."""
+        """True if the lamp lights a rectangle, as projectors always do."""
         return self.square or self.texture >= 0
 
     def area(self) -> float:
@@ -84,43 +84,43 @@ class Lamp:
 
 
 def own_lamps(vehicle: F64, weather: Weather) -> tuple[Lamp, ...]:
-    """The low beam of a vehicle that carries the camera and is not seen: none by day.
+    """Return the low beam of the vehicle that carries the camera, which is not drawn itself; none by day.
 
     Args:
         vehicle: Vehicle to world [4, 4]: x forward, z up, on the ground, `NOSE` m behind its front.
-        weather: Says how far lamps are on.
+        weather: Weather that decides how bright lamps are.
     """
     strength = lamp_strength(weather.sun_height)
     return (_beam(vehicle @ upright_pose(NOSE, 0.0, 0.0, 0.65), HEAD_LAMPS, strength),) if strength > 0.0 else ()
 
 
 def lamp_strength(sun_height: float) -> float:
-    """How far lamps are on: 0 by day, 1 by night."""
+    """Return how bright lamps are: 0 by day, 1 at night."""
     return float(np.clip((0.08 - sun_height) / 0.15, 0, 1))
 
 
 def near_of(scene: Scene, views: Sequence[View], bodies: Bodies, *, lamps: bool = True, contact: bool = True) -> Any:
-    """Lamps and occluders of B views with their grids, as the kernels read them, without shadow maps.
+    """Build lamps and occluders of B views with their grids for the kernels, without shadow maps.
 
     Args:
         scene: Street and bodies.
-        views: What is seen; their own lamps come first, in the order in which their shadow maps are numbered.
-        bodies: The things of the views.
-        lamps: Whether by dusk and night those of the street and of bodies are lit, too.
-        contact: Whether bodies keep light from the ground.
+        views: The views; their own lamps come first, in the order in which their shadow maps are numbered.
+        bodies: The objects of the views.
+        lamps: Whether lamps of the street and of bodies are lit at dusk and night, too.
+        contact: Whether bodies occlude the sky from the ground.
     """
-    near = kernels.Near()
+    light_tables = kernels.Near()
     tables = {
         "lamp": (kernels.Lamp, _lamps(scene, views, bodies) if lamps else _own_lamps(views)),
         "occluder": (kernels.Occluder, _occluders(scene, views, bodies) if contact else _nothing(kernels.Occluder)),
     }
-    for name, (struct, (rows, places)) in tables.items():
-        start, listed = _grid(places, len(views))
+    for name, (kernel_struct, (rows, circles)) in tables.items():
+        starts, indices = _grid(circles, len(views))
         table = rows if len(rows) else np.zeros(1, rows.dtype)
-        setattr(near, f"{name}s", wp.array(table, dtype=struct, device=scene.device))
-        setattr(near, f"{name}_start", wp.array(start, dtype=int, device=scene.device))
-        setattr(near, f"{name}_list", wp.array(listed, dtype=int, device=scene.device))
-    return near
+        setattr(light_tables, f"{name}s", wp.array(table, dtype=kernel_struct, device=scene.device))
+        setattr(light_tables, f"{name}_start", wp.array(starts, dtype=int, device=scene.device))
+        setattr(light_tables, f"{name}_list", wp.array(indices, dtype=int, device=scene.device))
+    return light_tables
 
 
 Rows = tuple[Any, F64]
@@ -132,46 +132,51 @@ def _nothing(struct: Any) -> Rows:
 
 
 def _own_lamps(views: Sequence[View]) -> Rows:
-    """The lamps that views bring with them."""
+    """Return the lamps of the views themselves."""
     rows: list[tuple[Any, ...]] = []
     places = []
-    layers = 0
-    for number, view in enumerate(views):
+    layer_count = 0
+    for view_index, view in enumerate(views):
         for lamp in view.lamps:
-            rows.append(_lamp_row(lamp, layers if lamp.shadows else -1))
-            layers += lamp.shadows
-            middle, radius = lit_circle(lamp)
-            places.append((number, *(middle - view.pose[:2, 3]), radius))
+            rows.append(_lamp_row(lamp, layer_count if lamp.shadows else -1))
+            layer_count += lamp.shadows
+            centre, radius = lit_circle(lamp)
+            places.append((view_index, *(centre - view.pose[:2, 3]), radius))
     return np.array(rows, kernels.Lamp.numpy_dtype()), np.array(places, np.float64).reshape(-1, 4)  # type: ignore[attr-defined]
 
 
 def _lamps(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
-    """The lamps of views, and by dusk and night those of the street and of bodies that have them lit."""
-    found = [_own_lamps(views)]
-    strength = np.array([lamp_strength(view.weather.sun_height) for view in views])
-    eyes = np.array([view.pose[:2, 3] for view in views])
-    dark = np.flatnonzero(strength > 0.0)
-    if len(dark):
-        street, circles = scene.kept("street lamps", lambda: _fixed(_street_lamps(scene)))
-        away = circles[None, :, :2] - eyes[dark, None]
-        at, lamp = np.nonzero(np.hypot(*np.moveaxis(away, -1, 0)) < LIT_UP_TO)
-        rows = street[lamp]
-        rows["light"] *= strength[dark[at], None]
-        found.append((rows, np.column_stack([dark[at], away[at, lamp], circles[lamp, 2]])))
-    shining = bodies.lit & (strength[bodies.view] > 0.0)
-    shining &= np.hypot(*(bodies.pose[:, :2, 3] - eyes[bodies.view]).T) < LIT_UP_TO
-    view, pose = bodies.view[shining], bodies.pose[shining]
-    beams, beam, owner = _of_meshes(bodies.mesh[shining], lambda mesh: _kept_beams(scene, mesh))
-    if len(beam):
-        rows, circles = (np.concatenate([part[k] for part in beams])[beam] for k in (0, 1))
-        view, pose = view[owner], pose[owner]
+    """Return the lamps of views, and at dusk and night the lit lamps of the street and of bodies."""
+    tables = [_own_lamps(views)]
+    strength = np.array([lamp_strength(view_index.weather.sun_height) for view_index in views])
+    eye_positions = np.array([view_index.pose[:2, 3] for view_index in views])
+    dark_views = np.flatnonzero(strength > 0.0)
+    if len(dark_views):
+        street_rows, circles = scene.kept("street lamps", lambda: _fixed(_street_lamps(scene)))
+        offsets = circles[None, :, :2] - eye_positions[dark_views, None]
+        dark_index, lamp_index = np.nonzero(np.hypot(*np.moveaxis(offsets, -1, 0)) < LIT_UP_TO)
+        rows = street_rows[lamp_index]
+        rows["light"] *= strength[dark_views[dark_index], None]
+        tables.append(
+            (rows, np.column_stack([dark_views[dark_index], offsets[dark_index, lamp_index], circles[lamp_index, 2]]))
+        )
+    is_shining = bodies.lit & (strength[bodies.view] > 0.0)
+    is_shining &= np.hypot(*(bodies.pose[:, :2, 3] - eye_positions[bodies.view]).T) < LIT_UP_TO
+    view_index, pose = bodies.view[is_shining], bodies.pose[is_shining]
+    mesh_tables, row_index, owner = _of_meshes(bodies.mesh[is_shining], lambda mesh: _kept_beams(scene, mesh))
+    if len(row_index):
+        rows, circles = (
+            np.concatenate([mesh_table[column] for mesh_table in mesh_tables])[row_index] for column in (0, 1)
+        )
+        view_index, pose = view_index[owner], pose[owner]
+        # Cached rows are in the body's frame: rotate them, then shift the position.
         for name in ("across", "down", "ahead", "place"):
             rows[name] = np.einsum("nij,nj->ni", pose[:, :3, :3], rows[name])
         rows["place"] += pose[:, :3, 3]
-        rows["light"] *= strength[view, None]
-        middle = np.einsum("nij,nj->ni", pose[:, :2, :2], circles[:, :2]) + pose[:, :2, 3] - eyes[view]
-        found.append((rows, np.column_stack([view, middle, circles[:, 2]])))
-    return np.concatenate([rows for rows, _ in found]), np.concatenate([places for _, places in found])
+        rows["light"] *= strength[view_index, None]
+        centre = np.einsum("nij,nj->ni", pose[:, :2, :2], circles[:, :2]) + pose[:, :2, 3] - eye_positions[view_index]
+        tables.append((rows, np.column_stack([view_index, centre, circles[:, 2]])))
+    return np.concatenate([rows for rows, _ in tables]), np.concatenate([places for _, places in tables])
 
 
 def _of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows], Any, Any]:
@@ -181,67 +186,72 @@ def _of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows], Any,
         Rows of each mesh that occurs, one after the other; for each row of each body, its place among them; and the
         body it belongs to.
     """
-    kinds, kind = np.unique(mesh, return_inverse=True)
-    found = [find(int(number)) for number in kinds]
-    counts = np.array([len(rows) for rows, _ in found], np.int64)
-    count = counts[kind] if len(kinds) else counts
-    owner = np.repeat(np.arange(len(mesh)), count)
-    first = (np.cumsum(counts) - counts)[kind[owner]]
-    return found, first + np.arange(len(owner)) - (np.cumsum(count) - count)[owner], owner
+    mesh_indices, mesh_of_body = np.unique(mesh, return_inverse=True)
+    tables = [find(int(mesh_index)) for mesh_index in mesh_indices]
+    mesh_counts = np.array([len(rows) for rows, _ in tables], np.int64)
+    row_counts = mesh_counts[mesh_of_body] if len(mesh_indices) else mesh_counts
+    owners = np.repeat(np.arange(len(mesh)), row_counts)
+    first_rows = (np.cumsum(mesh_counts) - mesh_counts)[mesh_of_body[owners]]
+    return tables, first_rows + np.arange(len(owners)) - (np.cumsum(row_counts) - row_counts)[owners], owners
 
 
 def _kept_beams(scene: Scene, mesh: int) -> Rows:
-    """The lamps of a body in its own frame, with their circles."""
+    """Return the lamps of a body in its own frame, with their circles; cached."""
     return scene.kept(("lamps", mesh), lambda: _fixed(_beams(scene, mesh)))  # type: ignore[no-any-return]
 
 
 def _fixed(lamps: Sequence[Lamp]) -> Rows:
-    """Rows of lamps without shadow maps, and the circles [N, 3] (x, y, radius) that hold what they light."""
-    circles = [(*middle, radius) for middle, radius in map(lit_circle, lamps)]
+    """Return rows of lamps without shadow maps, and the circles [N, 3] (x, y, radius) that contain their light."""
+    circles = [(*centre, radius) for centre, radius in map(lit_circle, lamps)]
     rows = np.array([_lamp_row(lamp, -1) for lamp in lamps], kernels.Lamp.numpy_dtype())  # type: ignore[attr-defined]
     return rows, np.array(circles, np.float64).reshape(-1, 3)
 
 
 def _street_lamps(scene: Scene) -> list[Lamp]:
-    """The lamps of the street."""
+    """Return the lamps of the street."""
     power, spread, colour, reach = STREET_LAMP
-    found = []
+    street_lamps = []
     for x, y, z, heading in [] if scene.street is None else scene.street.lamps.astype(np.float64).tolist():
         pose = upright_pose(x, y, heading, z - 0.05) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        found.append(Lamp(pose, power, spread, colour, 0.5, False, reach, False))
-    return found
+        street_lamps.append(Lamp(pose, power, spread, colour, 0.5, False, reach, False))
+    return street_lamps
 
 
 def _beams(scene: Scene, mesh: int) -> list[Lamp]:
-    """The head and tail lamps of a body, in its own frame."""
-    found = []
-    for name, (place, area) in scene.lights(mesh).items():
+    """Return the head and tail lamps of a body, in its own frame."""
+    body_lamps = []
+    for name, (position, area) in scene.lights(mesh).items():
         if area > 0.0:
-            head = name == "head_lamp"
-            pose = upright_pose(float(place[0]), float(place[1]), 0.0 if head else np.pi, float(place[2]))
-            found.append(_beam(pose, HEAD_LAMPS if head else TAIL_LAMPS, 1.0))
-    return found
+            is_head_lamp = name == "head_lamp"
+            pose = upright_pose(
+                float(position[0]), float(position[1]), 0.0 if is_head_lamp else np.pi, float(position[2])
+            )
+            body_lamps.append(_beam(pose, HEAD_LAMPS if is_head_lamp else TAIL_LAMPS, 1.0))
+    return body_lamps
 
 
 def _occluders(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
-    """The bodies of views that keep light from the ground."""
+    """Return the bodies of views that occlude the sky from the ground."""
     rows, places = _nothing(kernels.Occluder)
-    eyes = np.array([v.pose[:2, 3] for v in views])[bodies.view]
-    keep = (np.hypot(*(bodies.pose[:, :2, 3] - eyes).T) < SHADED_UP_TO) & (bodies.pose[:, 2, 2] > 0.9)
-    kinds, kind = np.unique(bodies.mesh[keep], return_inverse=True)
-    if not len(kinds):
+    eye_positions = np.array([entry.pose[:2, 3] for entry in views])[bodies.view]
+    # The model of an occluder is a level rectangle: tilted bodies are left out.
+    is_near = (np.hypot(*(bodies.pose[:, :2, 3] - eye_positions).T) < SHADED_UP_TO) & (bodies.pose[:, 2, 2] > 0.9)
+    mesh_indices, mesh_of_body = np.unique(bodies.mesh[is_near], return_inverse=True)
+    if not len(mesh_indices):
         return rows, places
-    standing = zip(*(scene.standing(int(mesh)) for mesh in kinds), strict=True)
-    middle, half, under, height = (np.array(column)[kind] for column in standing)
-    high = height > FLAT
-    middle, half, under, height = (a[high] for a in (middle, half, under, height))
-    view, pose, eyes = (a[keep][high] for a in (bodies.view, bodies.pose, eyes))
-    rows = np.zeros(len(view), rows.dtype)
-    rows["place"] = np.einsum("nij,nj->ni", pose[:, :3, :2], middle) + pose[:, :3, 3]
-    rows["heading"] = pose[:, :2, 0] / np.maximum(np.hypot(*pose[:, :2, 0].T), 1e-9)[:, None]
-    rows["half"], rows["under"], rows["middle"] = half, under, 0.5 * height
-    rows["reach"] = np.hypot(*half.T) + 2.0 * height
-    return rows, np.column_stack([view, rows["place"][:, :2] - eyes, rows["reach"]])
+    ground_covers = zip(*(scene.standing(int(mesh)) for mesh in mesh_indices), strict=True)
+    centres, half_sizes, underside_heights, heights = (np.array(values)[mesh_of_body] for values in ground_covers)
+    is_high = heights > FLAT
+    centres, half_sizes, underside_heights, heights = (
+        array[is_high] for array in (centres, half_sizes, underside_heights, heights)
+    )
+    view_index, poses, eye_positions = (array[is_near][is_high] for array in (bodies.view, bodies.pose, eye_positions))
+    rows = np.zeros(len(view_index), rows.dtype)
+    rows["place"] = np.einsum("nij,nj->ni", poses[:, :3, :2], centres) + poses[:, :3, 3]
+    rows["heading"] = poses[:, :2, 0] / np.maximum(np.hypot(*poses[:, :2, 0].T), 1e-9)[:, None]
+    rows["half"], rows["under"], rows["middle"] = half_sizes, underside_heights, 0.5 * heights
+    rows["reach"] = np.hypot(*half_sizes.T) + 2.0 * heights
+    return rows, np.column_stack([view_index, rows["place"][:, :2] - eye_positions, rows["reach"]])
 
 
 def struct_array(struct: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
@@ -251,33 +261,51 @@ def struct_array(struct: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
 
 
 def _grid(places: F64, views: int) -> tuple[I32, I32]:
-    """Which squares of the grid of each view circles (view, x, y, radius; m from the eye) touch."""
-    cells, cell = int(kernels.CELLS), float(kernels.CELL)
-    low = np.clip(np.floor((places[:, 1:3] - places[:, 3:]) / cell) + cells // 2, 0, cells).astype(int)
-    high = np.clip(np.floor((places[:, 1:3] + places[:, 3:]) / cell) + cells // 2, -1, cells - 1).astype(int)
-    wide, tall = np.maximum(high - low + 1, 0).T
-    number = np.repeat(np.arange(len(places)), wide * tall)
-    order = np.arange(len(number)) - np.repeat(np.cumsum(wide * tall) - wide * tall, wide * tall)
-    column, row = low[number, 0] + order % wide[number], low[number, 1] + order // wide[number]
-    square = places[number, 0].astype(int) * cells * cells + row * cells + column
-    sort = np.argsort(square, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(square, minlength=views * cells * cells))])
-    return start.astype(np.int32), number[sort].astype(np.int32) if len(number) else np.zeros(1, np.int32)
+    """List the circles (view, x, y, radius; m from the eye) that touch each cell of the grid of each view.
+
+    Returns:
+        First entry of each cell, and the list of circle indices.
+    """
+    cells_per_side, cell_size = int(kernels.CELLS), float(kernels.CELL)
+    first_cell = np.clip(
+        np.floor((places[:, 1:3] - places[:, 3:]) / cell_size) + cells_per_side // 2, 0, cells_per_side
+    ).astype(int)
+    last_cell = np.clip(
+        np.floor((places[:, 1:3] + places[:, 3:]) / cell_size) + cells_per_side // 2, -1, cells_per_side - 1
+    ).astype(int)
+    column_counts, row_counts = np.maximum(last_cell - first_cell + 1, 0).T
+    circle_index = np.repeat(np.arange(len(places)), column_counts * row_counts)
+    cell_order = np.arange(len(circle_index)) - np.repeat(
+        np.cumsum(column_counts * row_counts) - column_counts * row_counts, column_counts * row_counts
+    )
+    column, row = (
+        first_cell[circle_index, 0] + cell_order % column_counts[circle_index],
+        first_cell[circle_index, 1] + cell_order // column_counts[circle_index],
+    )
+    cell_index = places[circle_index, 0].astype(int) * cells_per_side * cells_per_side + row * cells_per_side + column
+    # A stable sort keeps the entries of a cell in their given order.
+    by_cell = np.argsort(cell_index, kind="stable")
+    starts = np.concatenate(
+        [[0], np.cumsum(np.bincount(cell_index, minlength=views * cells_per_side * cells_per_side))]
+    )
+    return starts.astype(np.int32), circle_index[by_cell].astype(np.int32) if len(circle_index) else np.zeros(
+        1, np.int32
+    )
 
 
 def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
-    """A lamp as the kernels want it."""
+    """Return the row of a lamp for the kernels."""
     across, down = lamp.spread
-    turn, place = lamp.pose[:3, :3], lamp.pose[:3, 3]
+    rotation, position = lamp.pose[:3, :3], lamp.pose[:3, 3]
     light = np.asarray(lamp.colour) * lamp.power / lamp.area()
-    inner = (1.0 - lamp.soft) ** 2 - 1e-6  # its fade is as wide as this, also where it has none
+    inner_squared = (1.0 - lamp.soft) ** 2 - 1e-6  # the width of the fade is never 0
     return (
-        tuple(place),
-        tuple(turn[:, 0] / across),
-        tuple(turn[:, 1] / down),
-        tuple(turn[:, 2]),
+        tuple(position),
+        tuple(rotation[:, 0] / across),
+        tuple(rotation[:, 1] / down),
+        tuple(rotation[:, 2]),
         tuple(light),
-        inner,
+        inner_squared,
         int(lamp.is_square),
         lamp.reach,
         layer,
@@ -287,7 +315,7 @@ def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
 
 
 def lit_circle(lamp: Lamp) -> tuple[F64, float]:
-    """A circle on the map that contains everything a lamp lights.
+    """Return a circle on the map that contains everything a lamp lights.
 
     It is the circle of the smallest ball around the sector that the lamp's spread and reach bound.
 
@@ -297,25 +325,26 @@ def lit_circle(lamp: Lamp) -> tuple[F64, float]:
     across, down = lamp.spread
     cosine = 1.0 / float(np.hypot(1.0, np.hypot(across, down) if lamp.is_square else max(across, down)))
     sine = float(np.sqrt(1.0 - cosine**2))
-    ahead, radius = (cosine, sine) if sine > cosine else (0.5 / cosine, 0.5 / cosine)
-    return lamp.pose[:2, 3] + lamp.pose[:2, 2] * (lamp.reach * ahead), lamp.reach * radius
+    # Wide sectors: the ball around the base circle; narrow ones: that through apex and rim.
+    centre_share, radius_share = (cosine, sine) if sine > cosine else (0.5 / cosine, 0.5 / cosine)
+    return lamp.pose[:2, 3] + lamp.pose[:2, 2] * (lamp.reach * centre_share), lamp.reach * radius_share
 
 
 def _beam(pose: F64, kind: tuple[Any, ...], strength: float) -> Lamp:
     """A lamp of a vehicle, at the origin of a frame that looks along x."""
     power, spread, colour, reach, tilt = kind
-    ahead = pose @ AHEAD
-    ahead[:3, :3] = ahead[:3, :3] @ _tilted(tilt)
-    return Lamp(ahead, power * strength, spread, colour, 0.6, False, reach, False)
+    lamp_pose = pose @ AHEAD
+    lamp_pose[:3, :3] = lamp_pose[:3, :3] @ _tilted(tilt)
+    return Lamp(lamp_pose, power * strength, spread, colour, 0.6, False, reach, False)
 
 
 def lamp_lens(lamp: Lamp) -> tuple[float, float, float, float]:
-    """Focal lengths and middle of the camera that a lamp's shadow map is taken with, texels."""
+    """Return the intrinsics of the camera that takes the shadow map of a lamp, texels: fx, fy, cx, cy."""
     half = LAMP_SHADOWS / 2
     return half / lamp.spread[0], half / lamp.spread[1], half - 0.5, half - 0.5
 
 
 def _tilted(angle: float) -> F64:
-    """A turn of the axis downwards (camera frame)."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, cos, sin], [0.0, -sin, cos]])
+    """Return a rotation of the axis downwards (camera frame)."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])

@@ -1,4 +1,4 @@
-"""From a stage, cameras and light to pictures: visibility once, then shading, then the camera's response."""
+"""Renderer: visibility, then shading, then the response of the camera, for a batch of views."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Weather:
     Attributes:
         sun_height: Elevation of the sun, rad.
         sun_heading: Azimuth of the sun, rad, counter-clockwise from east.
-        clouds: 0 to 1.
+        clouds: Cloud cover, 0 to 1.
         fog: Extinction, 1/m.
         wet: Wetness of the ground, 0 to 1.
         exposure: Stops relative to the exposure that suits the light.
@@ -53,18 +53,18 @@ class Weather:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A camera at a place, and what it sees.
+    """Camera at a pose, and the objects and light in front of it.
 
     Attributes:
         camera: Size and intrinsics.
         pose: Camera to world [4, 4].
-        things: What stands there.
+        objects: Objects in the scene besides the street.
         weather: Time of day and weather.
         sensor: Lens, mosaic, noise and full photosites.
         seed: Seed of the noise; equal seeds give equal noise.
-        lamps: Lamps besides those of the street and of things.
+        lamps: Lamps besides those of the street and of objects.
         focus: x, y (m) of the place around which shadows are finest; None: just in front of the camera.
-        decals: Textures above what things wear, the lowest first.
+        decals: Textures above the layers of objects, the lowest first.
     """
 
     camera: Camera
@@ -80,13 +80,13 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """Which effects of light are rendered.
+    """Effects of light that are rendered.
 
     Attributes:
         shadows: Shadows of the sun.
         fine: A fine shadow map around the focus.
-        contact: Bodies keep the light of the sky from the ground.
-        lamps: Lamps of the street and of things, and their shadows.
+        contact: Bodies occlude the light of the sky on the ground.
+        lamps: Lamps of the street and of objects, and their shadows.
     """
 
     shadows: bool = True
@@ -100,14 +100,14 @@ PLAIN = Quality(shadows=False, fine=False, contact=False, lamps=False)
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """What covers most of each pixel, [B, H, W, 3] each; zero for sky.
+    """Surface that covers most of each pixel, [B, H, W, 3] each; zero for sky.
 
     Attributes:
         albedo: Linear.
         normal: Unit vectors, world.
         position: World, m.
         irradiance: Irradiance of all light, over pi.
-        gain: What the pixel's radiance gains per unit of albedo (light, share of the pixel, mirror, wet, fog).
+        gain: Gain of the pixel's radiance per unit of albedo (light, share of the pixel, mirror, wet, fog).
     """
 
     albedo: F32
@@ -119,17 +119,17 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """B rendered pictures.
+    """Result of rendering B views.
 
     Attributes:
         image: uint8 sRGB [B, H, W, 3].
         radiance: Linear [B, H, W, 3].
-        tag: Tag of the thing that a pixel shows [B, H, W]; -1: sky, 0: street.
+        tag: Tag of the object that a pixel shows [B, H, W]; -1: sky, 0: street.
         depth: Depth along the optical axis [B, H, W], m; inf for sky.
         exposure: [B]; `image` is the camera's curve of radiance times exposure.
-        fragments: Pieces of textured surfaces, which are black in the picture, by pixel and triangle (see
-            `ssad.rendering.camera.texture`).
-        surface: What the pixels show, where it was asked for.
+        fragments: Pieces of textured surfaces, which are black in `image`, by pixel and triangle (see
+            `ssad.camera.texture`).
+        surface: Surfaces that the pixels show; None unless requested.
     """
 
     image: U8
@@ -143,28 +143,35 @@ class Picture:
 
 @lru_cache(maxsize=256)
 def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
-    """The kernels' light, and the exposure that suits it. Day, dusk and night follow from the height of the sun."""
+    """Return the light of a view for the kernels, and the exposure that suits it.
+
+    Day, dusk and night follow from the elevation of the sun.
+    """
     height = weather.sun_height
     sun = (
         float(np.cos(height) * np.cos(weather.sun_heading)),
         float(np.cos(height) * np.sin(weather.sun_heading)),
         float(np.sin(height)),
     )
-    day = float(np.clip((height + 0.1) / 0.3, 0, 1))
-    warm = float(np.clip(height / 0.5, 0, 1))
-    direct = (1 - 0.95 * weather.clouds**2) * float(np.clip(height / 0.12, 0, 1)) * (0.35 + 0.65 * warm)
+    # Daylight rises from 0.1 rad below the horizon (dusk) to 0.2 rad above it.
+    daylight = float(np.clip((height + 0.1) / 0.3, 0, 1))
+    warmth = float(np.clip(height / 0.5, 0, 1))
+    sun_share = (1 - 0.95 * weather.clouds**2) * float(np.clip(height / 0.12, 0, 1)) * (0.35 + 0.65 * warmth)
     if weather.fog > 0:
-        direct *= float(np.exp(-weather.fog * 60))
-    sun_colour = np.array([1.0, 0.72 + 0.25 * warm, 0.42 + 0.48 * warm]) * 2.6 * direct
-    grey = np.array([0.88, 0.92, 0.98])
-    veil = weather.clouds**2
-    zenith = (np.array([0.24, 0.46, 0.98]) * (1 - veil) + grey * veil) * (0.010 + 0.9 * day)
-    glow = np.array([1.0, 0.55, 0.30]) * (1 - warm) * 0.5 * day
-    horizon = (np.array([0.95, 1.12, 1.30]) * (1 - veil) + 1.15 * grey * veil) * (0.016 + 0.9 * day)
-    horizon = horizon + glow * (1 - weather.clouds)
+        sun_share *= float(np.exp(-weather.fog * 60))
+    sun_colour = np.array([1.0, 0.72 + 0.25 * warmth, 0.42 + 0.48 * warmth]) * 2.6 * sun_share
+    cloud_colour = np.array([0.88, 0.92, 0.98])
+    cloud_share = weather.clouds**2
+    zenith = (np.array([0.24, 0.46, 0.98]) * (1 - cloud_share) + cloud_colour * cloud_share) * (0.010 + 0.9 * daylight)
+    horizon_glow = np.array([1.0, 0.55, 0.30]) * (1 - warmth) * 0.5 * daylight
+    horizon = (np.array([0.95, 1.12, 1.30]) * (1 - cloud_share) + 1.15 * cloud_colour * cloud_share) * (
+        0.016 + 0.9 * daylight
+    )
+    horizon = horizon + horizon_glow * (1 - weather.clouds)
+    # Light that the ground reflects upwards.
     ground = 0.16 * (horizon + 0.5 * sun_colour * max(sun[2], 0))
     lamps = lamp_strength(height)
-    bright = float(
+    brightness = float(
         0.30 * (0.9 * sun_colour.mean() * max(sun[2], 0.1) + zenith.mean() + 0.6 * horizon.mean()) + 0.05 * lamps
     )
     light = (
@@ -179,11 +186,11 @@ def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
         lamps,
         weather.turn,
     )
-    return light, 0.40 / max(bright, 0.004) * 2.0**weather.exposure
+    return light, 0.40 / max(brightness, 0.004) * 2.0**weather.exposure
 
 
 def kernel_lens(intrinsic: F64) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point as the kernels take them, pixels.
+    """Return focal lengths and principal point for the kernels, pixels.
 
     The kernels count from the centre of the first pixel, which is at (0.5, 0.5) in an intrinsic matrix.
 
@@ -193,21 +200,21 @@ def kernel_lens(intrinsic: F64) -> tuple[float, float, float, float]:
     Returns:
         fx, fy, cx, cy.
     """
-    k = intrinsic
-    return float(k[0, 0]), float(k[1, 1]), float(k[0, 2] - 0.5), float(k[1, 2] - 0.5)
+    matrix = intrinsic
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2] - 0.5), float(matrix[1, 2] - 0.5)
 
 
 @lru_cache(maxsize=1)
 def response() -> U8:
-    """The camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB."""
+    """Return the camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB."""
     light = BRIGHTEST * ((np.arange(4096) + 0.5) / 4096) ** 2
-    soft = np.where(light > KNEE, KNEE + (1 - KNEE) * (1 - np.exp(-(light - KNEE) / SHOULDER)), light)
-    srgb = np.where(soft <= 0.0031308, soft * 12.92, 1.055 * soft ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(srgb * 255), np.uint8)
+    compressed = np.where(light > KNEE, KNEE + (1 - KNEE) * (1 - np.exp(-(light - KNEE) / SHOULDER)), light)
+    encoded = np.where(compressed <= 0.0031308, compressed * 12.92, 1.055 * compressed ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(encoded * 255), np.uint8)
 
 
 class _Pass:
-    """One visibility pass over all views: draws, slots, samples."""
+    """Visibility pass over all views: draws, slots and samples."""
 
     def __init__(
         self,
@@ -221,28 +228,29 @@ class _Pass:
         near: float = NEAR,
     ) -> None:
         device = stage.device
-        total = int(draws.counts.sum())
-        drawn = shade.Drawn()
+        face_count = int(draws.counts.sum())
+        draw_table = shade.Drawn()
         starts = wp.array(np.concatenate([[0], np.cumsum(draws.counts)]).astype(np.int32), dtype=int, device=device)
         firsts = wp.array(draws.firsts, dtype=int, device=device)
-        drawn.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
-        drawn.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
-        drawn.tags = wp.array(draws.tags, dtype=int, device=device)
-        drawn.lit = wp.array(draws.lit, dtype=int, device=device)
+        draw_table.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
+        draw_table.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
+        draw_table.tags = wp.array(draws.tags, dtype=int, device=device)
+        draw_table.lit = wp.array(draws.lit, dtype=int, device=device)
         self.lens = wp.array(lens, dtype=wp.vec4, device=device)
         views = wp.array(draws.views, dtype=int, device=device)
         height, width = size[0] * scale, size[1] * scale
-        self.samples = drawn.samples = wp.zeros((len(lens), height, width), dtype=wp.uint64, device=device)
-        self.drawn = drawn
-        drawn.owners = wp.empty(max(total, 1), dtype=wp.vec2i, device=device)
-        if not total:
+        self.samples = draw_table.samples = wp.zeros((len(lens), height, width), dtype=wp.uint64, device=device)
+        self.drawn = draw_table
+        draw_table.owners = wp.empty(max(face_count, 1), dtype=wp.vec2i, device=device)
+        if not face_count:
             return
-        gpu = device != "cpu"
-        # on a GPU the faces of a draw are shared out over threads, and so are the rows of large triangles
-        room = LARGE * len(lens) if gpu else 1
-        large = wp.empty(room, dtype=raster.Triangle, device=device)
-        many = wp.zeros(1, dtype=int, device=device)
-        lanes = FACE_LANES if gpu else 1
+        on_gpu = device != "cpu"
+        # On a GPU, threads share the faces of a draw, and the rows of large triangles.
+        large_capacity = LARGE * len(lens) if on_gpu else 1
+        # If the list is full, the kernel fills large triangles itself: only speed is lost.
+        large_triangles = wp.empty(large_capacity, dtype=raster.Triangle, device=device)
+        large_count = wp.zeros(1, dtype=int, device=device)
+        lanes = FACE_LANES if on_gpu else 1
         inputs = [
             stage.vertices,
             stage.faces,
@@ -250,19 +258,21 @@ class _Pass:
             starts,
             firsts,
             views,
-            drawn.matrices,
+            draw_table.matrices,
             self.lens,
             near,
             float(scale),
             int(ortho),
             lanes,
-            256.0 if gpu else 1e30,
+            256.0 if on_gpu else 1e30,
         ]
-        outputs = [drawn.owners, self.samples, large, many]
+        outputs = [draw_table.owners, self.samples, large_triangles, large_count]
         wp.launch(raster.fill, dim=(len(draws.counts), lanes), inputs=inputs, outputs=outputs, device=device)
-        if gpu:
-            inputs = [large, many, ROW_LANES]
-            wp.launch(raster.fill_large, dim=(room, ROW_LANES), inputs=inputs, outputs=[self.samples], device=device)
+        if on_gpu:
+            inputs = [large_triangles, large_count, ROW_LANES]
+            wp.launch(
+                raster.fill_large, dim=(large_capacity, ROW_LANES), inputs=inputs, outputs=[self.samples], device=device
+            )
 
 
 def render(
@@ -293,72 +303,82 @@ def render(
     if not views:
         raise ConfigError("no view to render")
     size = (views[0].camera.height, views[0].camera.width)
-    if any((v.camera.height, v.camera.width) != size for v in views):
+    if any((entry.camera.height, entry.camera.width) != size for entry in views):
         raise ConfigError("views of one call must have one size")
     lens, lights, exposures = [], [], []
-    for number, view in enumerate(views):
-        k = view.camera.intrinsic
-        if not np.isfinite(view.pose).all() or not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) <= 0:
-            raise ConfigError(f"view {number}: a camera needs a finite pose and a positive focal length")
-        lens.append(kernel_lens(k))
-        light, exposure = light_of(view.weather)
-        lights.append(light)
+    for view_index, view in enumerate(views):
+        intrinsic = view.camera.intrinsic
+        if (
+            not np.isfinite(view.pose).all()
+            or not np.isfinite(intrinsic).all()
+            or min(intrinsic[0, 0], intrinsic[1, 1]) <= 0
+        ):
+            raise ConfigError(f"view {view_index}: a camera needs a finite pose and a positive focal length")
+        lens.append(kernel_lens(intrinsic))
+        view_light, exposure = light_of(view.weather)
+        lights.append(view_light)
         exposures.append(exposure)
-    poses = np.array([v.pose for v in views], np.float64)
-    bodies = collect([v.things for v in views])
-    far = np.array([min(FAR, 6.0 / v.weather.fog) if v.weather.fog > 0 else FAR for v in views])
+    poses = np.array([entry.pose for entry in views], np.float64)
+    bodies = collect([entry.things for entry in views])
+    # Beyond six extinction lengths fog hides everything.
+    far_limits = np.array([min(FAR, 6.0 / entry.weather.fog) if entry.weather.fog > 0 else FAR for entry in views])
     draws = stage.gather(
         np.asarray(np.linalg.inv(poses), np.float64),
         bodies,
         eyes=poses[:, :3, 3],
         axes=poses[:, :3, 2],
         reach=(70.0, 180.0),
-        far=far,
+        far=far_limits,
     )
-    seen = _Pass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
-    shadows = _sun_shadows(stage, views, bodies, [light[0] for light in lights], quality)
-    near = _near(stage, views, bodies, quality)
+    visible = _Pass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
+    shadows = _sun_shadows(stage, views, bodies, [view_light[0] for view_light in lights], quality)
+    nearby_light = _near(stage, views, bodies, quality)
     device, shape = stage.device, (len(views), *size)
-    layers = _layers(draws, views, stage.device)
-    projecting = any(lamp.texture >= 0 for v in views for lamp in v.lamps)
-    out = shade.Output()
-    out.radiance = wp.empty(shape, dtype=wp.vec3, device=device)
-    out.tag = wp.empty(shape, dtype=int, device=device)
-    out.depth = wp.empty(shape, dtype=float, device=device)
-    room = out.radiance.size * 2 if layers.any or projecting else 1
-    out.fragments = wp.empty(room, dtype=layer_kernels.Fragment, device=device)
-    out.found = wp.zeros(1, dtype=int, device=device)
-    out.surface = int(surface)
+    layer_tables = _layers(draws, views, stage.device)
+    projecting = any(lamp.texture >= 0 for entry in views for lamp in entry.lamps)
+    output = shade.Output()
+    output.radiance = wp.empty(shape, dtype=wp.vec3, device=device)
+    output.tag = wp.empty(shape, dtype=int, device=device)
+    output.depth = wp.empty(shape, dtype=float, device=device)
+    # Room for two fragments a pixel; more are an error below.
+    fragment_capacity = output.radiance.size * 2 if layer_tables.any or projecting else 1
+    output.fragments = wp.empty(fragment_capacity, dtype=layer_kernels.Fragment, device=device)
+    output.found = wp.zeros(1, dtype=int, device=device)
+    output.surface = int(surface)
     for name in SURFACE:
-        setattr(out, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
+        setattr(output, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
+    # On the CPU every thread copies the arguments anew, so few threads are faster.
     lanes = 1 if device == "cpu" else shape[2]
     inputs = [
         stage.geometry,
-        seen.drawn,
-        layers,
-        seen.lens,
+        visible.drawn,
+        layer_tables,
+        visible.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
         wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device),
         shadows,
-        near,
+        nearby_light,
         int(projecting),
         scale,
         lanes,
-        out,
+        output,
     ]
     wp.launch(shade.shade, dim=(*shape[:2], lanes), inputs=inputs, device=device)
     fragments: Any = np.zeros(0, layer_kernels.Fragment.numpy_dtype())  # type: ignore[attr-defined]
-    if layers.any or projecting:
-        count = int(out.found.numpy()[0])
-        if count > room:
-            raise ConfigError(f"{count} pieces of textured surfaces, more than {room}; render fewer views at once")
-        fragments = out.fragments[:count].numpy() if count else fragments
+    if layer_tables.any or projecting:
+        count = int(output.found.numpy()[0])
+        if count > fragment_capacity:
+            raise ConfigError(
+                f"{count} pieces of textured surfaces, more than {fragment_capacity}; render fewer views at once"
+            )
+        fragments = output.fragments[:count].numpy() if count else fragments
+        # Threads list fragments in any order; sorting makes the result deterministic.
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
-    image = develop_radiance(out.radiance, views, exposures)
-    arrays = (image, out.radiance, out.tag, out.depth)
+    image = develop_radiance(output.radiance, views, exposures)
+    arrays = (image, output.radiance, output.tag, output.depth)
     if download:
-        arrays = tuple(a.numpy() if linear or a is not out.radiance else a for a in arrays)
-    exported = _surface(out, np.array(lens), poses) if surface else None
+        arrays = tuple(array.numpy() if linear or array is not output.radiance else array for array in arrays)
+    exported = _surface(output, np.array(lens), poses) if surface else None
     return Picture(*arrays, np.array(exposures), fragments, exported)
 
 
@@ -367,10 +387,10 @@ SURFACE = ("albedo", "normal", "irradiance", "gain")
 
 def _surface(out: Any, lens: F64, poses: F64) -> Surface:
     """The exported surfaces, with positions from depth."""
-    found = {name: getattr(out, name).numpy() for name in SURFACE}
+    exported = {name: getattr(out, name).numpy() for name in SURFACE}
     depth = out.depth.numpy()
     y, x = np.mgrid[0 : depth.shape[1], 0 : depth.shape[2]]
-    ray = np.stack(
+    rays = np.stack(
         [
             (x - lens[:, 2, None, None]) / lens[:, 0, None, None],
             (y - lens[:, 3, None, None]) / lens[:, 1, None, None],
@@ -378,30 +398,31 @@ def _surface(out: Any, lens: F64, poses: F64) -> Surface:
         ],
         -1,
     )
-    solid = np.isfinite(depth)
-    local = ray * np.where(solid, depth, 0.0)[..., None]
-    position = np.einsum("bij,bhwj->bhwi", poses[:, :3, :3], local) + poses[:, None, None, :3, 3]
-    return Surface(position=(position * solid[..., None]).astype(np.float32), **found)
+    is_solid = np.isfinite(depth)
+    camera_points = rays * np.where(is_solid, depth, 0.0)[..., None]
+    position = np.einsum("bij,bhwj->bhwi", poses[:, :3, :3], camera_points) + poses[:, None, None, :3, 3]
+    return Surface(position=(position * is_solid[..., None]).astype(np.float32), **exported)
 
 
 def _sun_shadows(
     stage: Scene, views: Sequence[View], bodies: Bodies, suns: Sequence[tuple[float, ...]], quality: Quality
 ) -> Any:
-    """The shadow maps of the sun: a wide one, and a fine one around each view's focus."""
-    poses = np.array([v.pose for v in views], np.float64)
-    flat = poses[:, :3, 2] * [1.0, 1.0, 0.0]
-    wide = poses[:, :3, 3] + flat * 0.7 * SHADOW_REACH
-    fine = poses[:, :3, 3] + flat * FINE_AHEAD
-    for number, view in enumerate(views):
+    """Render the shadow maps of the sun: a wide one, and a fine one around each view's focus."""
+    poses = np.array([entry.pose for entry in views], np.float64)
+    level_axes = poses[:, :3, 2] * [1.0, 1.0, 0.0]
+    # The maps lie ahead of the camera, where their texels are visible.
+    wide_middles = poses[:, :3, 3] + level_axes * 0.7 * SHADOW_REACH
+    fine_middles = poses[:, :3, 3] + level_axes * FINE_AHEAD
+    for view_index, view in enumerate(views):
         if view.focus is not None:
-            fine[number, :2] = view.focus
-    high = any(sun[2] > 0.02 for sun in suns)
+            fine_middles[view_index, :2] = view.focus
+    is_up = any(sun[2] > 0.02 for sun in suns)
     shadows = shade.SunShadows()
     shadows.wide, shadows.to_wide, shadows.wide_texel = _sun_map(
-        stage, bodies, suns, wide, SHADOW_REACH, SHADOW_SIZE if quality.shadows and high else 0
+        stage, bodies, suns, wide_middles, SHADOW_REACH, SHADOW_SIZE if quality.shadows and is_up else 0
     )
     shadows.fine, shadows.to_fine, shadows.fine_texel = _sun_map(
-        stage, bodies, suns, fine, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and high else 0
+        stage, bodies, suns, fine_middles, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and is_up else 0
     )
     return shadows
 
@@ -409,54 +430,62 @@ def _sun_shadows(
 def _sun_map(  # noqa: PLR0917
     stage: Scene, bodies: Bodies, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
 ) -> tuple[Any, Any, float]:
-    """A shadow map [B, size, size] around each middle, the matrices from the world to its texels, m a texel."""
+    """Render a shadow map [B, size, size] around each middle.
+
+    Returns:
+        The maps, the matrices from the world to their texels, and the size of a texel, m.
+    """
     middles = middles * [1.0, 1.0, 0.0]
     texel = 2 * reach / max(size, 1)
     to_light = _light_cameras(np.array(suns), middles)
-    texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
-    texels[:2, 3] = size / 2
-    matrices = wp.array((texels @ to_light).astype(np.float32), dtype=wp.mat44, device=stage.device)
+    to_texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
+    to_texels[:2, 3] = size / 2
+    matrices = wp.array((to_texels @ to_light).astype(np.float32), dtype=wp.mat44, device=stage.device)
     if not size:
         return wp.zeros((len(middles), 1, 1), dtype=wp.uint64, device=stage.device), matrices, texel
-    half = size / 2 - 0.5
-    around = np.tile(np.array([1 / texel, 1 / texel, half, half], np.float32), (len(middles), 1))
-    # as far as what casts a shadow into the map can be away; small things of the street near its middle alone
-    far = 1.4 * reach + 11.0
-    casting = stage.gather(
+    image_centre = size / 2 - 0.5
+    intrinsics = np.tile(np.array([1 / texel, 1 / texel, image_centre, image_centre], np.float32), (len(middles), 1))
+    # Far enough for everything that can cast a shadow into the map; small street objects only near its middle.
+    far_limit = 1.4 * reach + 11.0
+    draws = stage.gather(
         to_light,
         bodies,
         eyes=middles,
         axes=None,
-        reach=(0.4 * reach, far),
-        far=np.full(len(middles), far),
+        reach=(0.4 * reach, far_limit),
+        far=np.full(len(middles), far_limit),
         horizon=False,
         casting=True,
     )
-    return _Pass(stage, casting, around, ortho=True, size=(size, size), scale=1).samples, matrices, texel
+    return _Pass(stage, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples, matrices, texel
 
 
 def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
-    """Layers of draws and decals of views as the kernels read them."""
+    """Build the layer and decal tables of the kernels."""
     masks: list[F32] = []
 
     def mask_of(wanted: Layer | Decal) -> tuple[int, int, int]:
         if wanted.mask is None:
             return -1, 0, 0
-        start = sum(m.size for m in masks)
+        start = sum(mask.size for mask in masks)
         masks.append(np.asarray(wanted.mask, np.float32))
         return start, masks[-1].shape[1], masks[-1].shape[0]
 
-    layers = [(layer.texture, layer.rectangle, layer.opacity, *mask_of(layer)) for row in draws.layers for layer in row]
+    layers = [
+        (layer.texture, layer.rectangle, layer.opacity, *mask_of(layer))
+        for draw_layers in draws.layers
+        for layer in draw_layers
+    ]
     decals = []
-    for decal in (d for view in views for d in view.decals):
-        (width, height), turn = decal.size, decal.pose[:3, :3]
+    for decal in (view_decal for view in views for view_decal in view.decals):
+        (width, height), rotation = decal.size, decal.pose[:3, :3]
         decals.append(
             (
                 decal.texture,
                 tuple(decal.pose[:3, 3]),
-                tuple(turn[:, 0] * 2 / width),
-                tuple(turn[:, 1] * 2 / height),
-                tuple(turn[:, 2]),
+                tuple(rotation[:, 0] * 2 / width),
+                tuple(rotation[:, 1] * 2 / height),
+                tuple(rotation[:, 2]),
                 decal.depth,
                 width * height,
                 decal.tag,
@@ -466,43 +495,46 @@ def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
         )
     table = layer_kernels.Layers()
     tables: Any = (("layers", layer_kernels.Layer, layers), ("decals", layer_kernels.Decal, decals))
-    for name, struct, rows in tables:
-        setattr(table, name, wp.array(struct_array(struct, rows), dtype=struct, device=device))
-    for name, counts in (("start", [len(r) for r in draws.layers]), ("decal_start", [len(v.decals) for v in views])):
+    for name, kernel_struct, rows in tables:
+        setattr(table, name, wp.array(struct_array(kernel_struct, rows), dtype=kernel_struct, device=device))
+    for name, counts in (
+        ("start", [len(layer_row) for layer_row in draws.layers]),
+        ("decal_start", [len(view_entry.decals) for view_entry in views]),
+    ):
         setattr(table, name, wp.array(np.cumsum([0, *counts]).astype(np.int32), dtype=int, device=device))
-    flat = np.concatenate([m.ravel() for m in masks]) if masks else np.zeros(1, np.float32)
-    table.masks = wp.array(flat, dtype=float, device=device)
+    mask_values = np.concatenate([mask.ravel() for mask in masks]) if masks else np.zeros(1, np.float32)
+    table.masks = wp.array(mask_values, dtype=float, device=device)
     table.any = int(bool(layers or decals))
     return table
 
 
 def _near(stage: Scene, views: Sequence[View], bodies: Bodies, quality: Quality) -> Any:
-    """Lamps with their shadow maps, and bodies that keep light from the ground."""
-    near = near_of(stage, views, bodies, lamps=quality.lamps, contact=quality.contact)
-    casting = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
-    if not casting:
-        near.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
-        return near
-    poses = np.array([lamp.pose for _, lamp in casting], np.float64)
-    around = collect([view.things for view, _ in casting])
+    """Build lamps with their shadow maps, and the bodies that occlude the sky from the ground."""
+    near_light = near_of(stage, views, bodies, lamps=quality.lamps, contact=quality.contact)
+    shadow_lamps = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
+    if not shadow_lamps:
+        near_light.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
+        return near_light
+    poses = np.array([lamp.pose for _, lamp in shadow_lamps], np.float64)
+    bodies_of_lamps = collect([view.things for view, _ in shadow_lamps])
     draws = stage.gather(
         np.asarray(np.linalg.inv(poses), np.float64),
-        around,
+        bodies_of_lamps,
         eyes=poses[:, :3, 3],
         axes=poses[:, :3, 2],
         reach=(70.0, 180.0),
-        far=np.array([lamp.reach for _, lamp in casting]),
+        far=np.array([lamp.reach for _, lamp in shadow_lamps]),
         horizon=False,
         casting=True,
     )
-    lens = np.array([lamp_lens(lamp) for _, lamp in casting], np.float32)
+    lens = np.array([lamp_lens(lamp) for _, lamp in shadow_lamps], np.float32)
     size = (LAMP_SHADOWS, LAMP_SHADOWS)
-    near.shadows = _Pass(stage, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
-    return near
+    near_light.shadows = _Pass(stage, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
+    return near_light
 
 
 def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -> Any:
-    """What the sensors of views make of radiance.
+    """Develop radiance with the sensors of the views.
 
     Args:
         radiance: Linear [B, H, W], a Warp array of vec3.
@@ -510,25 +542,28 @@ def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[f
         exposures: Of each view.
 
     Returns:
-        Pictures uint8 [B, H, W, 3], a Warp array on the device of the radiance.
+        Images uint8 [B, H, W, 3], a Warp array on the device of the radiance.
     """
     device, (count, height, width) = radiance.device, radiance.shape
     rows: Any = []
     for view, exposure in zip(views, exposures, strict=True):
         sensor = view.sensor
         sensor.check_size(height, width)
-        photons, dark = noise_levels(sensor.noise, exposure)
-        centre, side = point_spread(sensor.blur)
-        rows.append((exposure, centre, side, sensor.full, photons, dark, view.seed, int(sensor.mosaic)))
-    table: Any = np.array(rows, dtype=sensing.Response.numpy_dtype())  # type: ignore[attr-defined]
-    responses = wp.array(table, dtype=sensing.Response, device=device)
+        photons, dark_noise = noise_levels(sensor.noise, exposure)
+        centre_weight, side_weight = point_spread(sensor.blur)
+        rows.append(
+            (exposure, centre_weight, side_weight, sensor.full, photons, dark_noise, view.seed, int(sensor.mosaic))
+        )
+    response_rows: Any = np.array(rows, dtype=sensing.Response.numpy_dtype())  # type: ignore[attr-defined]
+    responses = wp.array(response_rows, dtype=sensing.Response, device=device)
     curve = wp.array(response(), dtype=wp.uint8, device=device)
     image = wp.empty((count, height, width, 3), dtype=wp.uint8, device=device)
     if any(view.sensor.mosaic for view in views):
-        raw = wp.empty(radiance.shape, dtype=float, device=device)
-        squares = (count, (height + 1) // 2, (width + 1) // 2)
-        wp.launch(sensing.expose, dim=squares, inputs=[radiance, responses], outputs=[raw], device=device)
-        wp.launch(sensing.develop, dim=squares, inputs=[raw, responses, curve], outputs=[image], device=device)
+        mosaic = wp.empty(radiance.shape, dtype=float, device=device)
+        # A thread develops a 2 x 2 square of the mosaic.
+        launch_shape = (count, (height + 1) // 2, (width + 1) // 2)
+        wp.launch(sensing.expose, dim=launch_shape, inputs=[radiance, responses], outputs=[mosaic], device=device)
+        wp.launch(sensing.develop, dim=launch_shape, inputs=[mosaic, responses, curve], outputs=[image], device=device)
     if not all(view.sensor.mosaic for view in views):
         inputs = [radiance, responses, curve]
         wp.launch(sensing.develop_plain, dim=radiance.shape, inputs=inputs, outputs=[image], device=device)
@@ -536,18 +571,19 @@ def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[f
 
 
 def _light_cameras(suns: F64, middles: F64) -> F64:
-    """World to light [B, 4, 4], for directions to the sun and middles [B, 3].
+    """Return the matrices world to light [B, 4, 4], for directions to the sun and middles [B, 3].
 
     z runs with the light, x and y across it; the origin is the middle, rounded to half a metre.
     """
-    z = -suns / np.linalg.norm(suns, axis=1, keepdims=True)
-    flat = np.hypot(z[:, 0], z[:, 1])
-    level = np.maximum(flat, 1e-6)
-    x = np.stack([-z[:, 1] / level, z[:, 0] / level, np.zeros(len(z))], 1)
-    x[flat <= 1e-6] = 1.0, 0.0, 0.0
-    turn = np.stack([x, np.cross(z, x), z], 1)
-    matrices = np.zeros((len(z), 4, 4))
-    matrices[:, :3, :3] = turn
-    matrices[:, :3, 3] = -np.round((turn @ middles[..., None])[..., 0] * 2) / 2
+    z_axes = -suns / np.linalg.norm(suns, axis=1, keepdims=True)
+    level_length = np.hypot(z_axes[:, 0], z_axes[:, 1])
+    safe_length = np.maximum(level_length, 1e-6)
+    x_axes = np.stack([-z_axes[:, 1] / safe_length, z_axes[:, 0] / safe_length, np.zeros(len(z_axes))], 1)
+    # A sun straight overhead has no azimuth.
+    x_axes[level_length <= 1e-6] = 1.0, 0.0, 0.0
+    rotations = np.stack([x_axes, np.cross(z_axes, x_axes), z_axes], 1)
+    matrices = np.zeros((len(z_axes), 4, 4))
+    matrices[:, :3, :3] = rotations
+    matrices[:, :3, 3] = -np.round((rotations @ middles[..., None])[..., 0] * 2) / 2
     matrices[:, 3, 3] = 1.0
     return matrices

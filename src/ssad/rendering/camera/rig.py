@@ -1,4 +1,4 @@
-"""The camera rig of nuScenes."""
+"""Camera rig of nuScenes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ RIG = {
 
 
 def rig_camera(channel: str, width: int) -> Camera:
-    """A camera of the nuScenes rig, its picture scaled to `width` pixels (16:9)."""
-    at, heading, focal = RIG[channel]
-    to_ego = upright_pose(at[0], at[1], np.radians(heading), at[2])
+    """Return a camera of the nuScenes rig with its image scaled to `width` pixels (16:9)."""
+    position, heading, focal = RIG[channel]
+    to_ego = upright_pose(position[0], position[1], np.radians(heading), position[2])
     to_ego[:3, :3] = to_ego[:3, :3] @ FORWARD[:3, :3]
-    f = focal * width / 1600
+    focal_length = focal * width / 1600
     height = width * 9 // 16
-    matrix = np.array([[f, 0, 816.8 * width / 1600], [0, f, 492.0 * width / 1600], [0, 0, 1]])
+    matrix = np.array([[focal_length, 0, 816.8 * width / 1600], [0, focal_length, 492.0 * width / 1600], [0, 0, 1]])
     return Camera(width, height, matrix, to_ego, channel)

@@ -1,4 +1,4 @@
-"""What can be seen: the triangles of a street and of bodies on a device, and what stands where in a view."""
+"""Scenes: the triangles of a street and of bodies on a device, and the objects of a view."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ PATTERNS = {
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """A texture that a thing wears.
+    """Texture on an object.
 
     Attributes:
-        texture: Which texture; several layers may show the same.
-        rectangle: What it covers of the body's atlas: u0, v0, u1, v1.
+        texture: Index of the texture; several layers may show the same.
+        rectangle: Part of the body's atlas that it covers: u0, v0, u1, v1.
         opacity: From 0 to 1.
         mask: Opacity of each texel [h, w] over the rectangle, 0 to 1, of any size; None where it is even.
     """
@@ -75,14 +75,15 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class Decal:
-    """A texture on whatever lies in a box in the world and faces it: a road, a wall, a sign, a jacket.
+    """Texture on all surfaces in a box in the world that face it: a road, a wall, a sign, a jacket.
 
     Attributes:
-        texture: Which texture.
-        pose: Decal to world [4, 4]: x right and y down on the texture, z into the surface; the origin is its middle.
+        texture: Index of the texture.
+        pose: Decal to world [4, 4]: x right and y down on the texture, z into the surface; the origin is its
+            middle.
         size: Width and height, m.
-        depth: How far before and behind its middle it reaches, m.
-        tag: Of the only thing that wears it; -1 for all, 0 for the street.
+        depth: Reach in front of and behind its middle, m.
+        tag: Tag of the only object that wears it; -1 for all, 0 for the street.
         opacity: From 0 to 1.
         mask: As of a layer.
     """
@@ -102,7 +103,11 @@ class Decal:
 
 
 def check_opacity(texture: int, opacity: float, mask: F32 | None) -> None:
-    """ConfigError unless a texture has a number from 0 and opacities lie in 0 to 1."""
+    """Check that a texture index is at least 0 and opacities lie in 0 to 1.
+
+    Raises:
+        ConfigError: A value is outside its range.
+    """
     if texture < 0 or not 0.0 <= opacity <= 1.0:
         raise ConfigError(f"texture {texture} with opacity {opacity}: numbers start at 0, opacity is 0 to 1")
     if mask is not None and not (np.ndim(mask) == 2 and np.size(mask) and np.min(mask) >= 0 and np.max(mask) <= 1):
@@ -111,16 +116,16 @@ def check_opacity(texture: int, opacity: float, mask: F32 | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """A body in a view.
+    """Body in a view.
 
     Attributes:
-        mesh: Index of its mesh in the stage.
+        mesh: Index of its mesh in the scene.
         pose: Object to world [4, 4].
         paint: Linear RGB.
         tag: Number that identifies it in masks and boxes.
-        layers: Textures that it wears, the lowest first; faces outside all panels (windows, lamps, tyres) never wear
-            any.
-        lit: Whether its lamps are on; by night they light what is in front of them.
+        layers: Textures that it wears, the lowest first; faces outside all panels (windows, lamps, tyres) never
+            wear any.
+        lit: Whether its lamps are on; at night they light the scene.
         hidden: Whether it is invisible; it still casts its shadow.
     """
 
@@ -149,12 +154,12 @@ class Draws:
 
 @dataclass(frozen=True, slots=True)
 class Bodies:
-    """The N things of B views, view by view.
+    """The N objects of B views as arrays, view by view.
 
     Attributes:
-        things: The things themselves.
+        objects: The objects themselves.
         view: View of each [N].
-        mesh: Index of its mesh in the stage [N].
+        mesh: Index of its mesh in the scene [N].
         pose: Object to world [N, 4, 4].
         paint: Linear RGB [N, 3].
         tag: [N].
@@ -178,21 +183,21 @@ def collect(things: Sequence[Sequence[Thing]]) -> Bodies:
     Args:
         things: Those of each view.
     """
-    flat = tuple(thing for row in things for thing in row)
+    flat_objects = tuple(scene_object for view_objects in things for scene_object in view_objects)
     return Bodies(
-        flat,
-        np.repeat(np.arange(len(things), dtype=np.int32), [len(row) for row in things]),
-        np.array([t.mesh for t in flat], np.int32),
-        np.array([t.pose for t in flat], np.float64).reshape(-1, 4, 4),
-        np.array([t.paint for t in flat], np.float32).reshape(-1, 3),
-        np.array([t.tag for t in flat], np.int32),
-        np.array([t.lit for t in flat], bool),
-        np.array([t.hidden for t in flat], bool),
+        flat_objects,
+        np.repeat(np.arange(len(things), dtype=np.int32), [len(view_objects) for view_objects in things]),
+        np.array([entry.mesh for entry in flat_objects], np.int32),
+        np.array([entry.pose for entry in flat_objects], np.float64).reshape(-1, 4, 4),
+        np.array([entry.paint for entry in flat_objects], np.float32).reshape(-1, 3),
+        np.array([entry.tag for entry in flat_objects], np.int32),
+        np.array([entry.lit for entry in flat_objects], bool),
+        np.array([entry.hidden for entry in flat_objects], bool),
     )
 
 
 LAMPS = ("head_lamp", "tail_lamp")
-NIGHT = {  # what the night adds to the emission of a material while lamps are on
+NIGHT = {  # added to the emission of a material at night, while lamps are on
     "head_lamp": 2.0,
     "tail_lamp": 0.8,
     "lamp_light": 4.0,
@@ -219,92 +224,107 @@ class Scene:
             raise ConfigError("a stage needs a street or a mesh")
         vertices, faces, normals, uvs, material, surfaces = [], [], [], [], [], []
         listed = [street.order.astype(np.int32)] if street is not None else []
-        first, count, centre, radius = [], [], [], []
-        base_v = base_f = base_m = 0
-        place = len(listed[0]) if listed else 0
-        for number, part in enumerate(parts):
+        firsts, counts, centres, radii = [], [], [], []
+        vertex_base = face_base = material_base = 0
+        list_position = len(listed[0]) if listed else 0
+        for part_index, part in enumerate(parts):
+            # Parts share one buffer: indices are shifted by the entries before them.
             vertices.append(part.vertices)
-            faces.append(part.faces + base_v)
+            faces.append(part.faces + vertex_base)
             normals.append(part.normals)
             uvs.append(part.uv)
-            material.append(part.material + base_m)
-            surfaces += [surface(m) for m in part.materials]
-            if street is None or number > 0:
-                listed.append(np.arange(base_f, base_f + len(part.faces), dtype=np.int32))
-                first.append(place)
-                count.append(len(part.faces))
-                low, high = part.bounds()
-                centre.append((low + high) / 2)
-                radius.append(float(np.linalg.norm(high - low) / 2))
-                place += len(part.faces)
-            base_v, base_f, base_m = base_v + len(part.vertices), base_f + len(part.faces), base_m + len(part.materials)
+            material.append(part.material + material_base)
+            surfaces += [surface(entry) for entry in part.materials]
+            if street is None or part_index > 0:
+                listed.append(np.arange(face_base, face_base + len(part.faces), dtype=np.int32))
+                firsts.append(list_position)
+                counts.append(len(part.faces))
+                lower, upper = part.bounds()
+                centres.append((lower + upper) / 2)
+                radii.append(float(np.linalg.norm(upper - lower) / 2))
+                list_position += len(part.faces)
+            vertex_base, face_base, material_base = (
+                vertex_base + len(part.vertices),
+                face_base + len(part.faces),
+                material_base + len(part.materials),
+            )
 
-        # of each mesh: where its faces begin in the list, how many there are, and the ball around it
-        self.first, self.count = np.array(first, np.int32), np.array(count, np.int32)
-        self.centre, self.radius = np.array(centre, np.float64).reshape(-1, 3), np.array(radius, np.float64)
+        # Per mesh: first face in the list, number of faces, and bounding sphere.
+        self.first, self.count = np.array(firsts, np.int32), np.array(counts, np.int32)
+        self.centre, self.radius = np.array(centres, np.float64).reshape(-1, 3), np.array(radii, np.float64)
 
-        def on(values: Any, dtype: Any) -> Any:
+        def to_device(values: Any, dtype: Any) -> Any:
             return wp.array(values, dtype=dtype, device=device)
 
-        self.vertices = on(np.concatenate(vertices), wp.vec3)
-        self.faces = on(np.concatenate(faces).astype(np.int32), wp.int32)
-        self.normals = on(np.concatenate(normals), wp.vec3)
-        self.uvs = on(np.concatenate(uvs), wp.vec2)
-        self.material = on(np.concatenate(material).astype(np.int32), wp.int32)
-        worn = [p.panel >= 0 if isinstance(p, Mesh) else np.zeros(len(p.faces), bool) for p in parts]
-        self.wearable = on(np.concatenate(worn).astype(np.int32), wp.int32)
+        self.vertices = to_device(np.concatenate(vertices), wp.vec3)
+        self.faces = to_device(np.concatenate(faces).astype(np.int32), wp.int32)
+        self.normals = to_device(np.concatenate(normals), wp.vec3)
+        self.uvs = to_device(np.concatenate(uvs), wp.vec2)
+        self.material = to_device(np.concatenate(material).astype(np.int32), wp.int32)
+        has_panel = [
+            each_part.panel >= 0 if isinstance(each_part, Mesh) else np.zeros(len(each_part.faces), bool)
+            for each_part in parts
+        ]
+        self.wearable = to_device(np.concatenate(has_panel).astype(np.int32), wp.int32)
         self.meshes = tuple(meshes)
         self._kept: dict[Any, Any] = {}
-        rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
-        self.surfaces = on(rows, matter.Surface)
-        self.listed = on(np.concatenate(listed), wp.int32)
+        surface_rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
+        self.surfaces = to_device(surface_rows, matter.Surface)
+        self.listed = to_device(np.concatenate(listed), wp.int32)
         self.geometry = kernels.Geometry()
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
             setattr(self.geometry, name, getattr(self, name))
 
     def kept(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What was made once for this scene."""
+        """Return a value that is computed once for this scene, under a key."""
         if key not in self._kept:
             self._kept[key] = make()
         return self._kept[key]
 
     def lights(self, mesh: int) -> dict[str, tuple[F64, float]]:
-        """Middle [3] (object frame, m) and area (m^2) of the head lamps and of the tail lamps of a mesh."""
+        """Return middle [3] (object frame, m) and area (m^2) of the head lamps and tail lamps of a mesh."""
         body = self.meshes[mesh]
-        names, areas, middles = [m.name for m in body.materials], body.areas(), body.corners().mean(1)
+        names, areas, middles = (
+            [body_material.name for body_material in body.materials],
+            body.areas(),
+            body.corners().mean(1),
+        )
         found = {}
         for name in LAMPS:
-            weight = areas * np.isin(body.material, [k for k, other in enumerate(names) if other == name])
+            weight = areas * np.isin(
+                body.material,
+                [material_index for material_index, material_name in enumerate(names) if material_name == name],
+            )
             total = float(weight.sum())
             found[name] = (weight @ middles / max(total, 1e-12), total)
         return found
 
     def standing(self, mesh: int) -> tuple[F64, F64, float, float]:
-        """What a mesh covers of the ground.
+        """Return the ground that a mesh covers.
 
-        The faces that look down from at most half its height decide how much of the bounding rectangle is covered, and
-        from which height.
+        The faces that look down from at most half its height determine the covered share of the bounding rectangle,
+        and the height of the underside.
 
         Args:
             mesh: Index of the mesh.
 
         Returns:
-            Middle [2]; half length and half width of what is covered [2]; height of its underside; and height of its
-            top, all in the object frame, m.
+            Middle [2]; half length and half width of the covered area [2]; height of its underside; and height of
+            its top, all in the object frame, m.
         """
         return self.kept(("standing", mesh), lambda: _standing(self.meshes[mesh]))  # type: ignore[no-any-return]
 
     def tiles(
         self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
     ) -> tuple[I32, I32, I32]:
-        """The street's tiles that B views need.
+        """Return the tiles of the street that B views need.
 
         Args:
             eyes: Positions [B, 3].
-            axes: Viewing directions [B, 3]: what lies wholly behind is left out. None: all around.
-            reach: Distances up to which tiles are drawn in full, and without small things, m.
+            axes: Viewing directions [B, 3]; tiles completely behind the view are left out. None: all around.
+            reach: Distances up to which tiles are drawn in full, and without small objects, m.
             far: Distance beyond which tiles are not drawn at all [B], m.
-            horizon: Whether the far ground belongs to them.
+            horizon: Whether the far ground is included.
 
         Returns:
             First and count in the list of faces, and the view, of each tile.
@@ -312,24 +332,31 @@ class Scene:
         street = self.street
         if street is None:
             return (np.zeros(0, np.int32),) * 3
-        gap = np.maximum(np.maximum(self.low - eyes[:, None, :2], eyes[:, None, :2] - self.low - street.tile), 0.0)
-        away = np.hypot(gap[..., 0], gap[..., 1])
-        keep = away <= far[:, None]
+        axis_gaps = np.maximum(
+            np.maximum(self.low - eyes[:, None, :2], eyes[:, None, :2] - self.low - street.tile), 0.0
+        )
+        distances = np.hypot(axis_gaps[..., 0], axis_gaps[..., 1])
+        is_near = distances <= far[:, None]
         if axes is not None:
-            middle = self.low + street.tile / 2 - eyes[:, None, :2]
-            ahead = np.einsum("btk,bk->bt", middle, axes[:, :2]) > -0.75 * street.tile
-            keep &= ahead | (np.abs(axes[:, 2:3]) > 0.7)
-        level = (away > reach[0]).astype(int) + (away > reach[1])
-        view, tile = np.nonzero(keep)
-        levels = level[keep]
+            tile_centres = self.low + street.tile / 2 - eyes[:, None, :2]
+            is_ahead = np.einsum("btk,bk->bt", tile_centres, axes[:, :2]) > -0.75 * street.tile
+            # A steep view direction says little about the tiles that it reaches.
+            is_near &= is_ahead | (np.abs(axes[:, 2:3]) > 0.7)
+        tile_levels = (distances > reach[0]).astype(int) + (distances > reach[1])
+        view_index, tile_index = np.nonzero(is_near)
+        kept_levels = tile_levels[is_near]
         if horizon:
-            view = np.concatenate([view, np.arange(len(eyes))])
-            tile = np.concatenate([tile, np.full(len(eyes), street.nx * street.ny)])
-            levels = np.concatenate([levels, np.zeros(len(eyes), int)])
-        start = street.offset[levels, tile]
-        count = street.offset[levels, tile + 1] - start
-        some = count > 0
-        return start[some].astype(np.int32), count[some].astype(np.int32), view[some].astype(np.int32)
+            view_index = np.concatenate([view_index, np.arange(len(eyes))])
+            tile_index = np.concatenate([tile_index, np.full(len(eyes), street.nx * street.ny)])
+            kept_levels = np.concatenate([kept_levels, np.zeros(len(eyes), int)])
+        first_faces = street.offset[kept_levels, tile_index]
+        face_counts = street.offset[kept_levels, tile_index + 1] - first_faces
+        has_faces = face_counts > 0
+        return (
+            first_faces[has_faces].astype(np.int32),
+            face_counts[has_faces].astype(np.int32),
+            view_index[has_faces].astype(np.int32),
+        )
 
     def gather(
         self,
@@ -355,37 +382,45 @@ class Scene:
             horizon: See `tiles`.
             casting: Whether hidden things are needed too.
         """
-        first, count, view = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
-        tiles = len(first)
-        matrices = inverses[view]
-        seen = np.arange(len(bodies.things)) if casting else np.flatnonzero(~bodies.hidden)
-        if len(seen):
-            mesh, owner = bodies.mesh[seen], bodies.view[seen]
-            moved = inverses[owner] @ bodies.pose[seen]
-            middle, radius = self.centre[mesh], self.radius[mesh]
-            local = np.einsum("nij,nj->ni", moved[:, :3, :3], middle) + moved[:, :3, 3]
-            limit = far[owner]
+        firsts, counts, views = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
+        tile_count = len(firsts)
+        matrices = inverses[views]
+        visible = np.arange(len(bodies.things)) if casting else np.flatnonzero(~bodies.hidden)
+        if len(visible):
+            meshes, owners = bodies.mesh[visible], bodies.view[visible]
+            to_camera = inverses[owners] @ bodies.pose[visible]
+            centres, radii = self.centre[meshes], self.radius[meshes]
+            camera_centres = np.einsum("nij,nj->ni", to_camera[:, :3, :3], centres) + to_camera[:, :3, 3]
+            far_limits = far[owners]
             if axes is not None:
-                keep = (local[:, 2] > -radius) & (local[:, 2] < limit)
+                is_in_range = (camera_centres[:, 2] > -radii) & (camera_centres[:, 2] < far_limits)
             else:
-                keep = np.abs(local[:, :2]).max(1) < limit
-            seen, mesh, owner = seen[keep], mesh[keep], owner[keep]
-            first = np.concatenate([first, self.first[mesh]])
-            count = np.concatenate([count, self.count[mesh]])
-            view = np.concatenate([view, owner])
-            matrices = np.concatenate([matrices, moved[keep]])
-        if not len(first):  # nothing but sky: one range without faces
-            first, count, view, matrices = *(np.zeros(1, np.int32) for _ in range(3)), np.eye(4)[None]
-            tiles = 1
-        n = len(first)
-        paints, tags, lit = np.zeros((n, 3), np.float32), np.zeros(n, np.int32), np.ones(n, np.int32)
-        paints[tiles:], tags[tiles:], lit[tiles:] = bodies.paint[seen], bodies.tag[seen], bodies.lit[seen]
-        layers = ((),) * tiles + tuple(bodies.things[k].layers for k in seen.tolist())
-        return Draws(first, count, view, matrices.astype(np.float32), paints, tags, lit, layers)
+                is_in_range = np.abs(camera_centres[:, :2]).max(1) < far_limits
+            visible, meshes, owners = visible[is_in_range], meshes[is_in_range], owners[is_in_range]
+            firsts = np.concatenate([firsts, self.first[meshes]])
+            counts = np.concatenate([counts, self.count[meshes]])
+            views = np.concatenate([views, owners])
+            matrices = np.concatenate([matrices, to_camera[is_in_range]])
+        if not len(firsts):  # nothing but sky: one range without faces
+            firsts, counts, views, matrices = *(np.zeros(1, np.int32) for _ in range(3)), np.eye(4)[None]
+            tile_count = 1
+        draw_count = len(firsts)
+        paints, tags, lit = (
+            np.zeros((draw_count, 3), np.float32),
+            np.zeros(draw_count, np.int32),
+            np.ones(draw_count, np.int32),
+        )
+        paints[tile_count:], tags[tile_count:], lit[tile_count:] = (
+            bodies.paint[visible],
+            bodies.tag[visible],
+            bodies.lit[visible],
+        )
+        layers = ((),) * tile_count + tuple(bodies.things[object_index].layers for object_index in visible.tolist())
+        return Draws(firsts, counts, views, matrices.astype(np.float32), paints, tags, lit, layers)
 
 
 def surface(material: Material) -> tuple[Any, ...]:
-    """A material as the kernels want it."""
+    """Return the row of a material for the kernels."""
     pattern = PATTERNS.get(material.name, matter.PLAIN)
     night, lamp = NIGHT.get(material.name, 0.0), int(material.name in LAMPS)
     return (
@@ -402,12 +437,17 @@ def surface(material: Material) -> tuple[Any, ...]:
 
 def _standing(body: Mesh) -> tuple[F64, F64, float, float]:
     """See `Scene.standing`."""
-    low, high = body.bounds()
+    lower, upper = body.bounds()
     corners = body.corners()
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat, heights = np.maximum(-0.5 * cross[:, 2], 0.0), corners[..., 2].mean(1)
-    flat = flat * (heights <= 0.5 * high[2])
-    sides = np.maximum(high[:2] - low[:2], 1e-3)
-    fill = float(np.clip(flat.sum() / sides.prod(), 0.1, 1.0))
-    under = float((flat * heights).sum() / max(float(flat.sum()), 1e-9)) if flat.any() else 0.0
-    return low[:2] + 0.5 * sides, 0.5 * sides * np.sqrt(fill), max(under, 0.03), float(high[2])
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    downward_areas, face_heights = np.maximum(-0.5 * face_normals[:, 2], 0.0), corners[..., 2].mean(1)
+    downward_areas = downward_areas * (face_heights <= 0.5 * upper[2])
+    sides = np.maximum(upper[:2] - lower[:2], 1e-3)
+    covered_share = float(np.clip(downward_areas.sum() / sides.prod(), 0.1, 1.0))
+    underside = (
+        float((downward_areas * face_heights).sum() / max(float(downward_areas.sum()), 1e-9))
+        if downward_areas.any()
+        else 0.0
+    )
+    # The square root shrinks both sides so that the area is the covered share.
+    return lower[:2] + 0.5 * sides, 0.5 * sides * np.sqrt(covered_share), max(underside, 0.03), float(upper[2])

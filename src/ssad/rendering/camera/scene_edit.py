@@ -1,4 +1,4 @@
-"""What a physical attack changes in a scene before a camera sees it: the same in recorded pictures and in the loop."""
+"""Edits that a physical attack makes to a scene before rendering, both in recorded images and in the loop."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 CARD = Material("card", (0.05, 0.05, 0.05))
-LIFT = 1.0  # m: a card lies this high in its own frame, for what is low there casts no shadow
+LIFT = 1.0  # m: height of a card in its own frame, because the shadow pass skips low geometry
 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """A flat thing that is not seen and keeps the sun off: it hangs between the sun and where its shadow lies.
+    """Invisible flat object that blocks the sun; it hangs between the sun and its shadow.
 
     Attributes:
-        outline: The outline of its shadow where that falls on the card's own plane [P, 3], in the target's frame, m.
-            The card is parallel to that, so it has the size of its shadow.
-        away: How far towards the sun it hangs, m.
+        outline: Outline of its shadow on the card's own plane [P, 3], in the target's frame, m. The card is
+            parallel to that plane, so it has the size of its shadow.
+        away: Distance towards the sun, m.
     """
 
     outline: F64
@@ -44,24 +44,25 @@ class Card:
             raise ConfigError("a card's outline is finite, and it hangs 0.5 to 20 m towards the sun")
 
     def mesh(self) -> Mesh:
-        """Its body: convex, with a face to either side."""
+        """Return the body of the card: convex, with faces on both sides."""
         points = self.outline + np.array([0.0, 0.0, LIFT])
-        fan = np.array([[0, k, k + 1] for k in range(1, len(points) - 1)])
-        return merge([build(points, faces, materials=CARD) for faces in (fan, fan[:, ::-1])])
+        triangles = np.array([[0, index, index + 1] for index in range(1, len(points) - 1)])
+        return merge([build(points, faces, materials=CARD) for faces in (triangles, triangles[:, ::-1])])
 
 
 @dataclass(frozen=True, slots=True)
 class SceneEdit:
-    """What stands, hangs and shines around a target, and what it wears. Everything goes with the target.
+    """Objects, lamps and textures around a target, and textures on it. All of them move with the target.
 
     Attributes:
-        layers: What the target wears.
+        layers: Layers on the target.
         lamps: Lamps that light it: pose in the target's frame, power in lumen. The lamp itself is not drawn.
-        decals: Textures on what lies around it: pose in the target's frame; a tag of 1 or more becomes the target's.
-        cards: What keeps the sun off it.
-        textures: What layers, decals and lamps show, by number: linear albedo [3, H, W] in 0 to 1; of a lamp, the share
-            of its light.
-        masks: Which texels of a texture [H, W] are somewhere on the target; all where it is not named.
+        decals: Textures on surfaces around it: pose in the target's frame; a tag of 1 or more becomes the
+            target's.
+        cards: Cards that block the sun.
+        textures: Textures of layers, decals and lamps, by index: linear albedo [3, H, W] in 0 to 1; of a lamp,
+            the share of its light.
+        masks: Texels of a texture [H, W] that are somewhere on the target; all where no mask is given.
     """
 
     layers: tuple[Layer, ...] = ()
@@ -72,44 +73,48 @@ class SceneEdit:
     masks: Mapping[int, Bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        shown = {one.texture for one in self.layers} | {one.texture for one in self.decals}
-        shown |= {lamp.texture for lamp in self.lamps if lamp.texture >= 0}
-        if not shown <= set(self.textures):
-            raise ConfigError(f"no texture {min(shown - set(self.textures))}, which the edit of a scene shows")
+        used_textures = {entry.texture for entry in self.layers} | {entry.texture for entry in self.decals}
+        used_textures |= {lamp.texture for lamp in self.lamps if lamp.texture >= 0}
+        if not used_textures <= set(self.textures):
+            raise ConfigError(f"no texture {min(used_textures - set(self.textures))}, which the edit of a scene shows")
 
     def meshes(self) -> tuple[Mesh, ...]:
-        """Bodies that the scene must have, for its cards."""
+        """Return the bodies that the scene must contain for the cards."""
         return tuple(card.mesh() for card in self.cards)
 
     def on(self, view: View, tag: int, *, cards: Sequence[int] = ()) -> View:
-        """A view with the edit in it; the view itself where the target is not there.
+        """Return the view with the edit in it, or the view itself if the target is not in it.
 
         Args:
-            view: What a camera sees.
-            tag: Of the target; its first thing wears the layers.
+            view: The view.
+            tag: Of the target; its first object wears the layers.
             cards: Indices of `meshes` in the scene.
 
         Raises:
-            ConfigError: There are cards, and the scene does not have them.
+            ConfigError: The scene lacks cards of the edit.
         """
-        at = next((k for k, thing in enumerate(view.things) if thing.tag == tag), None)
-        if at is None:
+        target_index = next((index for index, scene_object in enumerate(view.things) if scene_object.tag == tag), None)
+        if target_index is None:
             return view
         if len(cards) != len(self.cards):
             raise ConfigError(f"the scene has {len(cards)} of the {len(self.cards)} cards of the edit")
-        target = view.things[at]
+        target = view.things[target_index]
         sun = np.array(light_of(view.weather)[0][0])
-        hung = []
+        hung_cards = []
+        # Below the horizon there is no sun to block.
         for card, mesh in zip(self.cards, cards, strict=True) if sun[2] > 0.0 else ():
             pose = target.pose.copy()
             pose[:3, 3] += card.away * sun - LIFT * target.pose[:3, 2]
-            hung.append(Thing(mesh, pose, tag=0, hidden=True))
+            hung_cards.append(Thing(mesh, pose, tag=0, hidden=True))
         scale = per_lux(view.weather)
-        lamps = (replace(one, pose=target.pose @ one.pose, power=one.power * scale) for one in self.lamps)
-        decals = (replace(one, pose=target.pose @ one.pose, tag=tag if one.tag > 0 else one.tag) for one in self.decals)
-        things = [*view.things, *hung]
-        things[at] = replace(target, layers=(*target.layers, *self.layers))
-        return replace(view, things=tuple(things), lamps=(*view.lamps, *lamps), decals=(*view.decals, *decals))
+        lamps = (replace(entry, pose=target.pose @ entry.pose, power=entry.power * scale) for entry in self.lamps)
+        decals = (
+            replace(entry, pose=target.pose @ entry.pose, tag=tag if entry.tag > 0 else entry.tag)
+            for entry in self.decals
+        )
+        objects = [*view.things, *hung_cards]
+        objects[target_index] = replace(target, layers=(*target.layers, *self.layers))
+        return replace(view, things=tuple(objects), lamps=(*view.lamps, *lamps), decals=(*view.decals, *decals))
 
 
 NO_EDIT = SceneEdit()
@@ -122,33 +127,44 @@ def render_with(
     masks: Mapping[int, Bool] | None = None,
     **options: Any,
 ) -> Picture:
-    """Render views with textures on what shows them. Where none is seen, nothing differs from `render`.
+    """Render views with textures on the surfaces that show them; without such surfaces the result equals `render`.
 
     Args:
         scene: The scene.
         views: The views.
-        textures: Number -> linear albedo [3, H, W] in 0 to 1.
+        textures: Index -> linear albedo [3, H, W] in 0 to 1.
         masks: See `SceneEdit`.
         **options: As for `render`.
 
+    Returns:
+        The rendering.
+
     Raises:
-        ConfigError: A texture is missing, or of a wrong shape or range.
+        ConfigError: A texture is missing, or has a wrong shape or range.
     """
-    picture = render(scene, views, **options)
-    seen = np.unique(picture.fragments["texture"]).tolist()
-    if not seen:
-        return picture
-    if not set(seen) <= set(textures):
-        raise ConfigError(f"no texture {min(set(seen) - set(textures))}, which a view shows")
-    import torch  # for scenes with textures alone
+    rendering = render(scene, views, **options)
+    # torch is only imported if a texture is visible.
+    texture_indices = np.unique(rendering.fragments["texture"]).tolist()
+    if not texture_indices:
+        return rendering
+    if not set(texture_indices) <= set(textures):
+        raise ConfigError(f"no texture {min(set(texture_indices) - set(textures))}, which a view shows")
+    import torch  # only needed for scenes with textures
 
     from ssad.rendering.camera.texture import retexture, taps_of
 
-    radiance = torch.from_numpy(np.array(picture.radiance))
-    for number in seen:
-        texture = textures[number].detach().cpu().float()
-        taps = taps_of(picture, (texture.shape[1], texture.shape[2]), texture=number, mask=(masks or {}).get(number))
+    radiance = torch.from_numpy(np.array(rendering.radiance))
+    for texture_index in texture_indices:
+        texture = textures[texture_index].detach().cpu().float()
+        taps = taps_of(
+            rendering,
+            (texture.shape[1], texture.shape[2]),
+            texture=texture_index,
+            mask=(masks or {}).get(texture_index),
+        )
         radiance = retexture(taps, texture, radiance)
-    whole = radiance.numpy()
-    image = develop_radiance(wp.array(whole, dtype=wp.vec3, device=scene.device), views, picture.exposure.tolist())
-    return replace(picture, image=image.numpy(), radiance=whole)
+    developed_radiance = radiance.numpy()
+    image = develop_radiance(
+        wp.array(developed_radiance, dtype=wp.vec3, device=scene.device), views, rendering.exposure.tolist()
+    )
+    return replace(rendering, image=image.numpy(), radiance=developed_radiance)

@@ -1,11 +1,11 @@
-"""What stands between light and picture: lens, colour mosaic, noise, full photosites.
+"""Sensor model from light to codes: lens, colour mosaic, noise, full photosites.
 
-Two engines share its numbers: `ssad.rendering.camera.kernels.sensor` (Warp, for `render`) and
-`ssad.rendering.camera.torch_sensor` (torch, with gradients). The chain is
+Constants shared by both engines: `ssad.camera.kernels.sensor` (Warp, for `render`) and `ssad.camera.torch_sensor`
+(torch, with gradients). The chain is
 
 1. light = radiance * exposure, spread by the lens over 3 x 3 pixels;
 2. one colour for each photosite (Bayer's RGGB, red at row 0 and column 0), or all three without a mosaic;
-3. noise of photons and of reading; then a photosite that is full holds no more;
+3. photon noise and read noise; then a full photosite holds no more;
 4. the missing colours from the neighbours (Malvar, He and Cutler, ICASSP 2004);
 5. linear light to codes: linear to 0.8, a soft shoulder above, then sRGB.
 
@@ -27,21 +27,21 @@ BRIGHTEST: Final = 4.0  # light at which the curve ends
 DAY_EXPOSURE: Final = 0.5  # exposure on a clear day
 READ_NOISE: Final = 0.2  # deviation without light, in parts of that at full light
 WIDEST_BLUR: Final = 0.7  # px; three taps hold no wider spread without a ringing response
-SMALLEST: Final = 4  # px along a side, so that what is beyond the border can be mirrored
+SMALLEST: Final = 4  # px along a side, so that borders can be mirrored
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """How a camera turns light into codes.
+    """Conversion of light into codes by a camera.
 
     Attributes:
         blur: Standard deviation of the lens's point spread along an axis in px, 0 to 0.7.
         mosaic: Whether each photosite has one colour (RGGB), so that the others come from its neighbours.
-        noise: Deviation at full light (1.0) by day; 0.01 is a good camera's. Its variance grows with the light
-            (photons); a fifth of the deviation is there without light (reading). It grows where the exposure must,
-            by night.
-        full: Exposed light at which a photosite is full, above 0 and at most 4; 1.0 without the soft shoulder would
-            be white.
+        noise: Deviation at full light (1.0) by day; 0.01 is typical of a good camera. Its variance grows with
+            the light (photons); a fifth of the deviation remains without light (reading). It grows where the
+            exposure must, at night.
+        full: Exposed light at which a photosite is full, above 0 and at most 4; 1.0 without the soft shoulder
+            would be white.
 
     Raises:
         ConfigError: A value is outside its range.
@@ -62,18 +62,18 @@ class Sensor:
 
     @property
     def reach(self) -> int:
-        """How many px away a pixel's light can change a code."""
+        """Distance in px at which the light of a pixel can change a code."""
         return (1 if self.blur > 0 else 0) + (2 if self.mosaic else 0)
 
     def check_size(self, height: int, width: int) -> None:
-        """Refuses pictures in which no photosite has the neighbours that its missing colours come from.
+        """Reject images in which a photosite lacks the neighbours of its missing colours.
 
         Args:
             height: Pixels.
             width: Pixels.
 
         Raises:
-            ConfigError: The picture is too small.
+            ConfigError: The image is too small.
         """
         if self.reach and min(height, width) < SMALLEST:
             raise ConfigError(
@@ -82,11 +82,11 @@ class Sensor:
 
 
 DEFAULT_SENSOR: Final = Sensor()
-PINHOLE: Final = Sensor(blur=0.0, mosaic=False)  # its picture is the curve of the light
+PINHOLE: Final = Sensor(blur=0.0, mosaic=False)  # its image is the curve of the light
 
 
 def point_spread(blur: float) -> tuple[float, float]:
-    """Weights of the lens along an axis. Their variance is exactly that of the point spread.
+    """Return the weights of the lens along an axis. Their variance is exactly that of the point spread.
 
     Args:
         blur: Standard deviation, px.
@@ -98,14 +98,14 @@ def point_spread(blur: float) -> tuple[float, float]:
 
 
 def noise_levels(noise: float, exposure: float) -> tuple[float, float]:
-    """How noise depends on light: variance = photons * light + dark**2.
+    """Return the parameters of the noise: variance = photons * light + dark**2.
 
-    Beyond the exposure of a clear day half of the rest (in stops) is a longer shutter, which costs no noise, and half
-    is gain.
+    Beyond the exposure of a clear day, half of the additional exposure (in stops) is a longer shutter, which
+    adds no noise, and half is gain.
 
     Args:
         noise: Deviation at full light by day.
-        exposure: What radiance is multiplied by.
+        exposure: Factor of the radiance.
 
     Returns:
         Variance for a unit of exposed light, and the deviation without light.
@@ -116,7 +116,7 @@ def noise_levels(noise: float, exposure: float) -> tuple[float, float]:
 
 Taps = tuple[tuple[float, ...], ...]
 
-# Malvar, He and Cutler: a missing colour is the mean of its neighbours, corrected by how the colour that is there
+# Malvar, He and Cutler: a missing colour is the mean of its neighbours, corrected by how the colour of the site
 # differs from its own neighbours; eighths, rows from above
 GREEN: Final[Taps] = (
     (0, 0, -1, 0, 0),

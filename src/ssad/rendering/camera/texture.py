@@ -1,9 +1,9 @@
-"""Pictures as a linear function of the textures in them: see once, re-texture for the cost of a gather.
+"""Images as a linear function of the textures in them: render once, then change a texture at the cost of a gather.
 
-radiance = base + sum over pieces of light * texture(piece), whether a body wears the texture, a decal shows it or a
-lamp projects it. A texture is looked up bilinearly in two levels of its mip pyramid (Williams 1983), so that each texel
-gets its share of the gradient however small it is in the picture. Texels that are nowhere on the surface (the gutter
-between the panels of an atlas) take no part, at any level: what is printed there changes no pixel.
+radiance = base + sum over pieces of light * texture(piece), for textures on bodies, in decals and from lamps. A
+texture is looked up bilinearly in two levels of its mip pyramid (Williams 1983), so that each texel gets its share of
+the gradient however small it is in the image. Texels that are not on the surface (the gutter between the panels of an
+atlas) are excluded at all levels: their values change no pixel.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ PRINTABLE = (0.02, 0.90)  # linear albedo: the blackest ink and the whitest pape
 
 @dataclass(frozen=True, slots=True)
 class Taps:
-    """What pixels see of one texture.
+    """Lookups of one texture by the pixels of a rendering.
 
     Attributes:
         size: Height and width of the texture, texels.
-        mask: Which texels [H, W] take part, None for all.
+        mask: Texels [H, W] that count, None for all.
         pixel: Index of each of F pieces into B * H * W pixels [F].
-        light: What a pixel gains for a unit of the texture's colour [F, 3].
-        index: Into the rows of all levels of the pyramid, one after the other, the finest first [F, 8].
+        light: Gain of a pixel for a unit of the texture's colour [F, 3].
+        index: Into the rows of all levels of the pyramid, concatenated, the finest first [F, 8].
         weight: Of each of these [F, 8]; they add up to one.
     """
 
@@ -46,14 +46,14 @@ class Taps:
     weight: Tensor
 
     def to(self, device: str | torch.device, dtype: torch.dtype | None = None) -> Taps:
-        """The same on a device, with another floating type."""
-        light, weight = (v.to(device, dtype or v.dtype) for v in (self.light, self.weight))
+        """Return the taps on a device, with another floating type."""
+        light, weight = (values.to(device, dtype or values.dtype) for values in (self.light, self.weight))
         mask = None if self.mask is None else self.mask.to(device)
         return Taps(self.size, mask, self.pixel.to(device), light, self.index.to(device), weight)
 
 
 def levels_of(size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Heights and widths of the pyramid: each half of the one before, rounded up, down to 1 x 1.
+    """Return heights and widths of the pyramid: each half of the previous, rounded up, down to 1 x 1.
 
     Raises:
         ConfigError: A side is not from 1 to 2^14 texels.
@@ -61,19 +61,19 @@ def levels_of(size: tuple[int, int]) -> list[tuple[int, int]]:
     height, width = size
     if min(height, width) < 1 or max(height, width) > 1 << 14:
         raise ConfigError(f"a texture of {height} x {width} texels: from 1 to {1 << 14} a side")
-    found = [(height, width)]
-    while found[-1] != (1, 1):
-        found.append(((found[-1][0] + 1) // 2, (found[-1][1] + 1) // 2))
-    return found
+    sizes = [(height, width)]
+    while sizes[-1] != (1, 1):
+        sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
+    return sizes
 
 
 def paint_mask(mesh: Mesh, size: tuple[int, int], rectangle: Rectangle = (0.0, 0.0, 1.0, 1.0)) -> Bool:
-    """Texels that lie, if only in part, on a face that can wear a texture.
+    """Return the texels that lie at least partly on a face that can wear a texture.
 
     Args:
         mesh: The body.
         size: Height and width of the texture, texels.
-        rectangle: What the texture covers of the atlas: u0, v0, u1, v1.
+        rectangle: Part of the atlas that the texture covers: u0, v0, u1, v1.
 
     Returns:
         True for each texel [H, W] that is somewhere on the body.
@@ -82,16 +82,17 @@ def paint_mask(mesh: Mesh, size: tuple[int, int], rectangle: Rectangle = (0.0, 0
 
     height, width = size
     u0, v0, u1, v1 = rectangle
-    uv = mesh.uv[mesh.panel >= 0].astype(np.float64)
-    corners = (uv - [u0, v0]) / [u1 - u0, v1 - v0] * [width, height]
-    fine = np.zeros((4 * height, 4 * width), np.uint8)  # in quarters of a texel, drawn with their edges
+    panel_uv = mesh.uv[mesh.panel >= 0].astype(np.float64)
+    corners = (panel_uv - [u0, v0]) / [u1 - u0, v1 - v0] * [width, height]
+    quarter_texels = np.zeros((4 * height, 4 * width), np.uint8)  # in quarters of a texel, drawn with their edges
     for face in corners:
-        cv2.fillConvexPoly(fine, np.rint(face * 4 * 16 - 8).astype(np.int32), 1, cv2.LINE_8, 4)
-    return np.asarray(fine.reshape(height, 4, width, 4).max((1, 3)) > 0)
+        # Coordinates with 4 fractional bits; the centre of the first quarter texel is at 0 in OpenCV.
+        cv2.fillConvexPoly(quarter_texels, np.rint(face * 4 * 16 - 8).astype(np.int32), 1, cv2.LINE_8, 4)
+    return np.asarray(quarter_texels.reshape(height, 4, width, 4).max((1, 3)) > 0)
 
 
 class Seen(Protocol):
-    """What has been seen of textures."""
+    """Result with fragments of textured surfaces."""
 
     @property
     def fragments(self) -> Any:
@@ -122,27 +123,30 @@ def taps_of(
     levels = levels_of(shape)
     if mask is not None and (mask.shape != shape or not mask.any()):
         raise ConfigError(f"a mask of {list(mask.shape)} texels, some of them set, for a texture of {list(shape)}")
-    pieces = picture.fragments[picture.fragments["texture"] == texture]
-    u, v = pieces["u"].astype(np.float64), pieces["v"].astype(np.float64)
-    area = pieces["area"].astype(np.float64) * shape[0] * shape[1]
+    fragments = picture.fragments[picture.fragments["texture"] == texture]
+    u, v = fragments["u"].astype(np.float64), fragments["v"].astype(np.float64)
+    area = fragments["area"].astype(np.float64) * shape[0] * shape[1]
+    # The level at which a texel is about as large as the pixel's footprint.
     level = np.clip(0.5 * np.log2(np.maximum(area, 1.0)), 0, len(levels) - 1)
-    low = np.minimum(np.floor(level).astype(int), len(levels) - 1)
-    high = np.minimum(low + 1, len(levels) - 1)
-    covered = _covered(mask, levels)
-    index, weight = np.zeros((len(pieces), 8), np.int64), np.zeros((len(pieces), 8))
-    for half, (chosen, share) in enumerate(((low, 1 - (level - low)), (high, level - low))):
-        columns = slice(4 * half, 4 * half + 4)
-        index[:, columns], part = _corners(u, v, chosen, levels)
-        if covered is not None:
-            part *= covered[index[:, columns]]
-            none = part.sum(1) == 0  # nothing of the surface near: its mean
-            index[none, 4 * half], part[none, 0] = len(covered) - 1, 1.0
-            part /= part.sum(1, keepdims=True)
-        weight[:, columns] = part * share[:, None]
-    kept = None if mask is None else torch.as_tensor(np.ascontiguousarray(mask))
-    light = torch.as_tensor(np.ascontiguousarray(pieces["light"]), dtype=dtype)
-    places = torch.as_tensor(pieces["place"].astype(np.int64))
-    return Taps(shape, kept, places, light, torch.as_tensor(index), torch.as_tensor(weight, dtype=dtype))
+    lower_level = np.minimum(np.floor(level).astype(int), len(levels) - 1)
+    upper_level = np.minimum(lower_level + 1, len(levels) - 1)
+    coverage = _covered(mask, levels)
+    index, weight = np.zeros((len(fragments), 8), np.int64), np.zeros((len(fragments), 8))
+    for level_slot, (level_index, share) in enumerate(
+        ((lower_level, 1 - (level - lower_level)), (upper_level, level - lower_level))
+    ):
+        columns = slice(4 * level_slot, 4 * level_slot + 4)
+        index[:, columns], part_weights = _corners(u, v, level_index, levels)
+        if coverage is not None:
+            part_weights *= coverage[index[:, columns]]
+            is_uncovered = part_weights.sum(1) == 0  # no texel of the surface is near: use the mean of the texture
+            index[is_uncovered, 4 * level_slot], part_weights[is_uncovered, 0] = len(coverage) - 1, 1.0
+            part_weights /= part_weights.sum(1, keepdims=True)
+        weight[:, columns] = part_weights * share[:, None]
+    mask_tensor = None if mask is None else torch.as_tensor(np.ascontiguousarray(mask))
+    light = torch.as_tensor(np.ascontiguousarray(fragments["light"]), dtype=dtype)
+    pixels = torch.as_tensor(fragments["place"].astype(np.int64))
+    return Taps(shape, mask_tensor, pixels, light, torch.as_tensor(index), torch.as_tensor(weight, dtype=dtype))
 
 
 def _corners(u: F64, v: F64, chosen: F64, levels: list[tuple[int, int]]) -> tuple[F64, F64]:
@@ -160,7 +164,7 @@ def _corners(u: F64, v: F64, chosen: F64, levels: list[tuple[int, int]]) -> tupl
 
 
 def _covered(mask: Bool | None, levels: list[tuple[int, int]]) -> F64 | None:
-    """1 for each row of the pyramid [N] with a texel of the mask in it, else 0; None without a mask."""
+    """Return 1 for each row of the pyramid [N] that contains a texel of the mask, else 0; None without a mask."""
     if mask is None:
         return None
     level = torch.as_tensor(np.ascontiguousarray(mask), dtype=torch.float64)[None]
@@ -172,52 +176,58 @@ def _covered(mask: Bool | None, levels: list[tuple[int, int]]) -> F64 | None:
 
 
 def pyramid(texture: Tensor, mask: Tensor | None = None) -> Tensor:
-    """All levels of a texture as rows, the finest first: means over the texels of the mask.
+    """Return all levels of a texture as rows, the finest first: means over the texels of the mask.
 
     Args:
         texture: [3, H, W], or [B, 3, H, W].
         mask: Texels [H, W] that count; None for all.
 
     Returns:
-        [N, 3], or those of B textures one after the other [B * N, 3].
+        [N, 3], or those of B textures concatenated [B * N, 3].
+
+    Raises:
+        ConfigError: The texture has another shape.
     """
     if texture.ndim not in (3, 4) or texture.shape[-3] != 3:
         raise ConfigError(f"a texture must be [3, H, W], not {list(texture.shape)}")
     sizes = levels_of((texture.shape[-2], texture.shape[-1]))
-    weight = torch.ones_like(texture[..., :1, :, :]) if mask is None else mask.to(texture.dtype)[None]
-    total, totals, weights = texture * weight, [], []  # of the texels of the mask below, over four to the level
+    # Weights are averaged like colours, so that masked texels do not darken coarse levels.
+    level_weight = torch.ones_like(texture[..., :1, :, :]) if mask is None else mask.to(texture.dtype)[None]
+    level_sum, sums, weights = texture * level_weight, [], []  # of the texels of the mask below, over four to the level
     for _ in sizes[1:]:
-        total, weight = (avg_pool2d(one, 2, ceil_mode=True, divisor_override=4) for one in (total, weight))
-        totals.append(total.flatten(-2))
-        weights.append(weight.flatten(-2))
+        level_sum, level_weight = (
+            avg_pool2d(plane, 2, ceil_mode=True, divisor_override=4) for plane in (level_sum, level_weight)
+        )
+        sums.append(level_sum.flatten(-2))
+        weights.append(level_weight.flatten(-2))
     rows = [texture.flatten(-2)]
-    if totals:
-        rows.append(torch.cat(totals, -1) / torch.cat(weights, -1).clamp_min(1e-30))
+    if sums:
+        rows.append(torch.cat(sums, -1) / torch.cat(weights, -1).clamp_min(1e-30))
     return torch.cat(rows, -1).mT.reshape(-1, 3)
 
 
 def joined(taps: Sequence[Taps], corners: Sequence[tuple[int, int]], width: int, part: tuple[int, int]) -> Taps:
-    """The taps of several pictures as those of a batch of parts of them, each with a texture of its own.
+    """Combine the taps of several images into those of a batch of crops, each with a texture of its own.
 
     Args:
-        taps: Of one texture in each picture, all of one size and mask.
-        corners: Row and column at which the part of each picture begins.
-        width: Of the pictures, px.
-        part: Height and width of the parts, which hold all pixels of the taps.
+        taps: Of one texture in each image, all of one size and mask.
+        corners: Row and column at which the crop of each image begins.
+        width: Of the images, px.
+        part: Height and width of the crops, which contain all pixels of the taps.
     """
-    rows = sum(height * width for height, width in levels_of(taps[0].size))
-    (high, wide), counts = part, [len(one.pixel) for one in taps]
-    starts = [
-        ((number * high - y) * wide - x, number * rows, count)
-        for number, ((y, x), count) in enumerate(zip(corners, counts, strict=True))
+    row_count = sum(height * width for height, width in levels_of(taps[0].size))
+    (part_height, part_width), piece_counts = part, [len(entry.pixel) for entry in taps]
+    shifts = [
+        ((image_index * part_height - y) * part_width - x, image_index * row_count, count)
+        for image_index, ((y, x), count) in enumerate(zip(corners, piece_counts, strict=True))
     ]
-    table = torch.tensor(starts).to(taps[0].pixel.device)
-    moved = table[:, :2].repeat_interleave(table[:, 2], 0, output_size=sum(counts))
+    shift_table = torch.tensor(shifts).to(taps[0].pixel.device)
+    shift = shift_table[:, :2].repeat_interleave(shift_table[:, 2], 0, output_size=sum(piece_counts))
     pixel, index, weight, light = (
-        torch.cat([getattr(one, name) for one in taps]) for name in ("pixel", "index", "weight", "light")
+        torch.cat([getattr(entry, name) for entry in taps]) for name in ("pixel", "index", "weight", "light")
     )
-    pixel = pixel + pixel.div(width, rounding_mode="floor") * (wide - width) + moved[:, 0]
-    return Taps(taps[0].size, taps[0].mask, pixel, light, index + moved[:, 1:], weight)
+    pixel = pixel + pixel.div(width, rounding_mode="floor") * (part_width - width) + shift[:, 0]
+    return Taps(taps[0].size, taps[0].mask, pixel, light, index + shift[:, 1:], weight)
 
 
 def retexture(taps: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
@@ -234,20 +244,21 @@ def retexture(taps: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
     """
     if tuple(texture.shape[-2:]) != taps.size:
         raise ConfigError(f"these taps are of a texture of {list(taps.size)} texels, not {list(texture.shape[-2:])}")
-    low, high = torch.stack(texture.detach().aminmax()).tolist()
-    if not (low >= 0.0 and high <= 1.0):
-        raise ConfigError(f"an albedo of {low:.3g} to {high:.3g}: it lies in 0 to 1")
-    rows = pyramid(texture, taps.mask)
-    looked_up = rows.index_select(0, taps.index.flatten()).reshape(*taps.index.shape, 3)
-    colour = (looked_up * taps.weight[..., None]).sum(1) * taps.light
-    flat = radiance.reshape(-1, 3)
-    return flat.index_add(0, taps.pixel, colour.to(flat.dtype)).reshape(radiance.shape)
+    # One transfer from the GPU for both numbers.
+    lowest, highest = torch.stack(texture.detach().aminmax()).tolist()
+    if not (lowest >= 0.0 and highest <= 1.0):
+        raise ConfigError(f"an albedo of {lowest:.3g} to {highest:.3g}: it lies in 0 to 1")
+    pyramid_rows = pyramid(texture, taps.mask)
+    samples = pyramid_rows.index_select(0, taps.index.flatten()).reshape(*taps.index.shape, 3)
+    colour = (samples * taps.weight[..., None]).sum(1) * taps.light
+    base_pixels = radiance.reshape(-1, 3)
+    return base_pixels.index_add(0, taps.pixel, colour.to(base_pixels.dtype)).reshape(radiance.shape)
 
 
 def printable(colour: Tensor) -> Tensor:
-    """Albedo that ink and paper can have: a colour in 0..1, scaled into `PRINTABLE`."""
-    low, high = PRINTABLE
-    return low + (high - low) * colour.clamp(0.0, 1.0)
+    """Map a colour in 0..1 to the albedo that ink and paper can have, `PRINTABLE`."""
+    darkest, brightest = PRINTABLE
+    return darkest + (brightest - darkest) * colour.clamp(0.0, 1.0)
 
 
 def to_linear(colour: Tensor) -> Tensor:

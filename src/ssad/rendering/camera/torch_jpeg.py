@@ -1,9 +1,9 @@
 """JPEG in torch, with gradients: libjpeg's encoder and decoder.
 
-Coefficients are those of libjpeg to the last bit, decoded values are within a few codes of its own (they differ by the
-decoder's rounding). Rounding is done for real and has slope one (straight-through): the mean slope of a staircase, so
-that what an optimiser sees is the picture that is recorded and how it changes over steps larger than a stair. Colours
-cut off at black or white have slope zero.
+Coefficients equal those of libjpeg to the last bit, decoded values are within a few codes of it (they differ by the
+decoder's rounding). Rounding is exact in the forward pass and has slope one (straight-through): the mean slope of a
+staircase. So an optimiser sees the recorded image, and how it changes over steps larger than a stair. Colours cut off
+at black or white have slope zero.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ CHROMINANCE = (
 # libjpeg's 16-bit fixed-point weights of R, G, B in Y, Cb, Cr, and back
 TO_YCBCR = ((19595, 38470, 7471), (-11059, -21709, 32768), (32768, -27439, -5329))
 FROM_YCBCR = ((1.0, 0.0, 1.402), (1.0, -0.344136286, -0.714136286), (1.0, 1.772, 0.0))
-ACCURATE = 96  # quality from which libjpeg-turbo takes the accurate DCT unless told
-TIE = 2.0**-12  # so that halves go up in whatever order sums were made
+ACCURATE = 96  # quality from which libjpeg-turbo uses the accurate DCT by default
+TIE = 2.0**-12  # makes halves round up whatever the order of the sums
 
 
 def _straight(value: Tensor, rounded: Tensor) -> Tensor:
-    """Exactly what is rounded, with the slope of the value (straight-through)."""
+    """Return the rounded value with the slope of the value (straight-through)."""
     return rounded.detach() + (value - value.detach())
 
 
 def _nearest(value: Tensor) -> Tensor:
-    """The nearest whole number, halves up, with slope one."""
+    """Round to the nearest whole number, halves up, with slope one."""
     return _straight(value, torch.floor(value + (0.5 + TIE)))
 
 
 def to_8_bits(image: Tensor) -> Tensor:
-    """Rounds to the 256 codes of a file, with slope one inside 0..1 and zero outside.
+    """Round to the 256 codes of a file, with slope one inside 0..1 and zero outside.
 
     Args:
         image: Any shape, used in 0..1.
@@ -67,7 +67,7 @@ def to_8_bits(image: Tensor) -> Tensor:
 
 
 def quantisation(quality: int) -> tuple[np.ndarray, np.ndarray]:
-    """Steps of the coefficients of luminance and chrominance: Annex K's tables, scaled as libjpeg does.
+    """Return the quantisation steps of luminance and chrominance: Annex K's tables, scaled as in libjpeg.
 
     Args:
         quality: 1 to 100.
@@ -80,19 +80,22 @@ def quantisation(quality: int) -> tuple[np.ndarray, np.ndarray]:
     """
     if not 1 <= quality <= 100:
         raise ConfigError(f"a JPEG quality of {quality}: it must be in 1..100")
+    # libjpeg's scale in percent: 100 at quality 50.
     scale = 5000 // quality if quality < 50 else 200 - 2 * quality
-    luminance, chrominance = (np.clip((np.array(t) * scale + 50) // 100, 1, 255) for t in (LUMINANCE, CHROMINANCE))
+    luminance, chrominance = (
+        np.clip((np.array(table) * scale + 50) // 100, 1, 255) for table in (LUMINANCE, CHROMINANCE)
+    )
     return luminance, chrominance
 
 
 @dataclass(frozen=True, slots=True)
 class _Pass:
-    """A one-dimensional integer DCT of libjpeg, applied to columns [8, N] of whole numbers exactly.
+    """One-dimensional integer DCT of libjpeg, applied exactly to columns [8, N] of whole numbers.
 
     Attributes:
-        inner: [K, 8]; what of the input is rounded down before it is used.
-        direct: [8, 8]; and of what is not, which each output takes.
-        taken: [8, K]; what of the rounded values each output takes.
+        inner: [K, 8]; weights of the input in terms that are rounded down before use.
+        direct: [8, 8]; weights of the input in each output.
+        taken: [8, K]; weights of the rounded terms in each output.
         bias: [8, 1]; added before outputs are rounded down.
     """
 
@@ -102,7 +105,7 @@ class _Pass:
     bias: Tensor
 
     def __call__(self, columns: Tensor) -> Tensor:
-        """The frequencies [8, N]."""
+        """Return the frequencies [8, N]."""
         if not len(self.inner):
             return torch.floor(torch.addmm(self.bias, self.direct, columns))
         return torch.addmm(self.direct @ columns, self.taken, torch.floor(self.inner @ columns))
@@ -131,19 +134,19 @@ def _fast_pass() -> list[np.ndarray]:
     By Arai, Agui and Nakajama. Each frequency comes out scaled by `_fast_divisors`.
     """
     unit = np.eye(13)
-    a, (turned, shared, t0, t2, f1) = unit[:8], unit[8:]
-    s, d = a[:4] + a[7:3:-1], a[:4] - a[7:3:-1]
-    even, odd, low = s[0] + s[3], s[1] + s[2], s[0] - s[3]
-    e0, e1, e2 = d[3] + d[2], d[2] + d[1], d[1] + d[0]
-    inner = [(s[1] - s[2] + low) * 181, (e0 - e2) * 98, e0 * 139, e2 * 334, e1 * 181]
-    f0, f2, g0, g1 = t0 + shared, t2 + shared, d[0] + f1, d[0] - f1
+    samples, (turned, shared, t0, t2, f1) = unit[:8], unit[8:]
+    sums, differences = samples[:4] + samples[7:3:-1], samples[:4] - samples[7:3:-1]
+    even, odd, low = sums[0] + sums[3], sums[1] + sums[2], sums[0] - sums[3]
+    e0, e1, e2 = differences[3] + differences[2], differences[2] + differences[1], differences[1] + differences[0]
+    inner = [(sums[1] - sums[2] + low) * 181, (e0 - e2) * 98, e0 * 139, e2 * 334, e1 * 181]
+    f0, f2, g0, g1 = t0 + shared, t2 + shared, differences[0] + f1, differences[0] - f1
     rows = np.stack([even + odd, g0 + f2, low + turned, g1 - f0, even - odd, g1 + f0, low - turned, g0 - f2])
     return [np.stack(inner)[:, :8] / 256, rows[:, :8], rows[:, 8:], np.zeros((8, 1))]
 
 
 def _fast_divisors(table: np.ndarray) -> np.ndarray:
-    """Steps [8, 8] in the scale of `_fast_pass`, rounded as libjpeg does."""
-    scales = np.array([np.sqrt(2) * np.cos(k * np.pi / 16) if k else 1.0 for k in range(8)])
+    """Return the steps [8, 8] in the scale of `_fast_pass`, rounded as in libjpeg."""
+    scales = np.array([np.sqrt(2) * np.cos(frequency * np.pi / 16) if frequency else 1.0 for frequency in range(8)])
     return np.asarray(np.floor(table * np.rint(np.outer(scales, scales) * 2**14) / 2**11 + 0.5))
 
 
@@ -153,23 +156,23 @@ def _accurate_pass(*, first: bool) -> list[np.ndarray]:
     By Loeffler, Ligtenberg and Moschytz. The first pass keeps two extra bits and the second removes them: the result is
     in eighths.
     """
-    a = np.eye(8)
-    s, d = a[:4] + a[7:3:-1], a[:4] - a[7:3:-1]
-    even, odd, low, high = s[0] + s[3], s[1] + s[2], s[0] - s[3], s[1] - s[2]
+    samples = np.eye(8)
+    sums, differences = samples[:4] + samples[7:3:-1], samples[:4] - samples[7:3:-1]
+    even, odd, low, high = sums[0] + sums[3], sums[1] + sums[2], sums[0] - sums[3], sums[1] - sums[2]
     turned = (high + low) * 4433
-    shared = (d[3] + d[1] + d[2] + d[0]) * 9633
-    z1, z2 = (d[3] + d[0]) * -7373, (d[2] + d[1]) * -20995
-    z3, z4 = (d[3] + d[1]) * -16069 + shared, (d[2] + d[0]) * -3196 + shared
+    shared = (differences[3] + differences[1] + differences[2] + differences[0]) * 9633
+    z1, z2 = (differences[3] + differences[0]) * -7373, (differences[2] + differences[1]) * -20995
+    z3, z4 = (differences[3] + differences[1]) * -16069 + shared, (differences[2] + differences[0]) * -3196 + shared
     rows = np.stack(
         [
             even + odd,
-            d[0] * 12299 + z1 + z4,
+            differences[0] * 12299 + z1 + z4,
             turned + low * 6270,
-            d[1] * 25172 + z2 + z3,
+            differences[1] * 25172 + z2 + z3,
             even - odd,
-            d[2] * 16819 + z2 + z4,
+            differences[2] * 16819 + z2 + z4,
             turned - high * 15137,
-            d[3] * 2446 + z1 + z3,
+            differences[3] * 2446 + z1 + z3,
         ]
     )
     bits = np.array([-2 if first else 2, *[11 if first else 15] * 3] * 2, float)[:, None]
@@ -178,33 +181,38 @@ def _accurate_pass(*, first: bool) -> list[np.ndarray]:
 
 
 def _exact(device: torch.device, *, fast: bool) -> torch.dtype:
-    """In what all whole numbers of an encoder are exact: those of the fast DCT and of colours stay below 2^24.
+    """Return the type in which all whole numbers of an encoder are exact.
 
-    A GPU may be told to take products of float32 with fewer bits.
+    Those of the fast DCT and of colours stay below 2^24, which float32 holds. A GPU may compute float32
+    products with fewer bits, so it always gets float64.
     """
     return torch.float32 if fast and device.type == "cpu" else torch.float64
 
 
 @lru_cache(maxsize=16)
 def _code(quality: int, device: torch.device, *, fast: bool) -> _Code:
-    """Made once for a quality where it is needed: small copies to a GPU cost more than what they are for."""
+    """Return the coder of a quality, cached per device: small copies to a GPU cost more than the coding itself."""
 
-    def there(values: np.ndarray) -> Tensor:
+    def to_device(values: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=_exact(device, fast=fast), device=device)
 
     tables = np.stack(quantisation(quality), -1).astype(np.float64)  # vertical and horizontal frequency, plane
     if fast:
         passes = [_fast_pass()] * 2
-        divisors = np.stack([_fast_divisors(tables[..., k]) for k in range(2)], -1)
+        divisors = np.stack([_fast_divisors(tables[..., index]) for index in range(2)], -1)
     else:
         passes, divisors = [_accurate_pass(first=True), _accurate_pass(first=False)], 8 * tables
-    k = np.arange(8)
-    cosines = np.cos(np.pi * (2 * k + 1) * k[:, None] / 16) / 2  # the orthonormal DCT-II, a row for each frequency
+    index = np.arange(8)
+    cosines = (
+        np.cos(np.pi * (2 * index + 1) * index[:, None] / 16) / 2
+    )  # the orthonormal DCT-II, a row for each frequency
     cosines[0] /= np.sqrt(2)
     with torch.inference_mode(mode=False):
-        along, down = (_Pass(*map(there, one)) for one in passes)
-        pixels = there(np.kron(cosines.T, cosines.T))
-        return _Code((along, down), there(divisors.reshape(64, 2)), there(tables.reshape(64, 2)), pixels)
+        row_pass, column_pass = (_Pass(*map(to_device, matrices)) for matrices in passes)
+        inverse = to_device(np.kron(cosines.T, cosines.T))
+        return _Code(
+            (row_pass, column_pass), to_device(divisors.reshape(64, 2)), to_device(tables.reshape(64, 2)), inverse
+        )
 
 
 def _coded(bright: Tensor, colours: Tensor, quality: int, *, fast: bool) -> tuple[Tensor, Tensor]:
@@ -216,61 +224,73 @@ def _coded(bright: Tensor, colours: Tensor, quality: int, *, fast: bool) -> tupl
         quality: Of JPEG.
         fast: Whether the encoder takes the fast DCT.
     """
-    code, planes = _code(quality, bright.device, fast=fast), (bright, colours)
-    folded = [
+    coder, planes = _code(quality, bright.device, fast=fast), (bright, colours)
+    block_planes = [
         plane.reshape(*plane.shape[:2], plane.shape[2] // 8, 8, -1, 8).permute(5, 3, 0, 1, 2, 4) for plane in planes
     ]
-    count = [plane.numel() // 64 for plane in planes]
-    columns = torch.cat([one.reshape(8, 8, -1) for one in folded], 2).to(code.steps.dtype) - 128.0
-    along, down = code.passes
-    rows = along(columns.flatten(1)).reshape(8, 8, -1).transpose(0, 1)  # horizontal frequency, now second
-    found = down(rows.reshape(8, -1)).reshape(64, -1)  # vertical, then horizontal frequency
+    block_counts = [plane.numel() // 64 for plane in planes]
+    columns = (
+        torch.cat([block_plane.reshape(8, 8, -1) for block_plane in block_planes], 2).to(coder.steps.dtype) - 128.0
+    )
+    row_pass, column_pass = coder.passes
+    row_frequencies = row_pass(columns.flatten(1)).reshape(8, 8, -1).transpose(0, 1)  # horizontal frequency, now second
+    coefficients = column_pass(row_frequencies.reshape(8, -1)).reshape(64, -1)  # vertical, then horizontal frequency
 
-    def spread(table: Tensor) -> Tensor:
-        return torch.cat([table[:, k : k + 1].expand(64, n) for k, n in enumerate(count)], 1)
+    def per_column(table: Tensor) -> Tensor:
+        return torch.cat(
+            [
+                table[:, plane_index : plane_index + 1].expand(64, block_count)
+                for plane_index, block_count in enumerate(block_counts)
+            ],
+            1,
+        )
 
-    divisors = spread(code.divisors)
-    steps = torch.floor((found.abs() + torch.floor(divisors / 2)) / divisors).copysign(found)
-    pixels = torch.floor(code.pixels @ (steps * spread(code.steps)) + (128.5 + TIE)).to(bright.dtype)
-    back = []
-    for plane, part in zip(planes, torch.split(pixels, count, 1), strict=True):
-        size, channels, height, width = plane.shape
-        blocks = part.reshape(8, 8, size, channels, height // 8, width // 8)
-        back.append(blocks.permute(2, 3, 4, 0, 5, 1).reshape(plane.shape))
-    return back[0], back[1]
+    divisors = per_column(coder.divisors)
+    steps = torch.floor((coefficients.abs() + torch.floor(divisors / 2)) / divisors).copysign(coefficients)
+    pixels = torch.floor(coder.pixels @ (steps * per_column(coder.steps)) + (128.5 + TIE)).to(bright.dtype)
+    decoded = []
+    for plane, plane_pixels in zip(planes, torch.split(pixels, block_counts, 1), strict=True):
+        batch_size, channels, height, width = plane.shape
+        blocks = plane_pixels.reshape(8, 8, batch_size, channels, height // 8, width // 8)
+        decoded.append(blocks.permute(2, 3, 4, 0, 5, 1).reshape(plane.shape))
+    return decoded[0], decoded[1]
 
 
 @lru_cache(maxsize=8)
 def _colour_weights(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """R, G, B to Y, Cb, Cr [3, 3], what is added before they are rounded down [3, 1, 1], and back [3, 3]."""
+    """Return the weights of colour conversion.
+
+    R, G, B to Y, Cb, Cr [3, 3]; the terms added before rounding down [3, 1, 1]; and the way back [3, 3].
+    """
     halves = torch.tensor([32768, (128 << 16) + 32767, (128 << 16) + 32767], dtype=torch.float64) / 65536
     with torch.inference_mode(mode=False):
-        there = torch.tensor(TO_YCBCR, dtype=dtype, device=device) / 65536
-        return there, halves.to(device, dtype).reshape(3, 1, 1), torch.tensor(FROM_YCBCR, dtype=dtype, device=device)
+        to_ycbcr = torch.tensor(TO_YCBCR, dtype=dtype, device=device) / 65536
+        return to_ycbcr, halves.to(device, dtype).reshape(3, 1, 1), torch.tensor(FROM_YCBCR, dtype=dtype, device=device)
 
 
 def _mixed(weights: Tensor, planes: Tensor) -> Tensor:
-    """Planes [B, 3, H, W] as sums of them."""
+    """Mix planes [B, 3, H, W] linearly."""
     return torch.einsum("ij,bjhw->bihw", weights, planes)
 
 
 @lru_cache(maxsize=32)
 def _by_turns(first: float, second: float, count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """What is added along a row before it is rounded down [W]."""
+    """Return two alternating numbers along a row [W]."""
     with torch.inference_mode(mode=False):
         return torch.tensor([first, second], dtype=dtype, device=device).repeat(-(-count // 2))[:count]
 
 
 def _halved(plane: Tensor) -> Tensor:
-    """The mean of each 2 x 2 whole codes; halves go down and up by turns along a row, as in libjpeg."""
+    """Average each 2 x 2 whole codes; halves go down and up alternately along a row, as in libjpeg."""
     mean = avg_pool2d(plane, 2)
     return torch.floor(mean + _by_turns(0.25, 0.5, mean.shape[-1], plane.device, plane.dtype))
 
 
 def _doubled(plane: Tensor) -> Tensor:
-    """Twice the size by weights 3 : 1 along each side ("fancy upsampling"), with libjpeg's rounding."""
-    wide = _widened(plane)
-    return torch.floor(wide + _by_turns(8 / 16, 7 / 16, wide.shape[-1], plane.device, plane.dtype))
+    """Double the size by weights 3 : 1 along each side ("fancy upsampling"), with libjpeg's rounding."""
+    # Bilinear interpolation has exactly these weights.
+    interpolated = _widened(plane)
+    return torch.floor(interpolated + _by_turns(8 / 16, 7 / 16, interpolated.shape[-1], plane.device, plane.dtype))
 
 
 def _widened(plane: Tensor) -> Tensor:
@@ -278,7 +298,7 @@ def _widened(plane: Tensor) -> Tensor:
 
 
 def block_of(subsampling: str) -> int:
-    """How large the unit is that is coded on its own.
+    """Return the side of the unit that is coded independently.
 
     Args:
         subsampling: "420" or "444".
@@ -310,11 +330,13 @@ def extended(picture: Tensor, height: int, width: int) -> Tensor:
 
 
 def _repeated(planes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
-    """Planes [B, C, H, W] with what lies beyond sizes [B] replaced by the last row and column before."""
-    whole = (int(planes.shape[2]), int(planes.shape[3]))
-    if all(size == whole for size in sizes):
+    """Replace everything in planes [B, C, H, W] beyond sizes [B] by the last row and column inside."""
+    full_size = (int(planes.shape[2]), int(planes.shape[3]))
+    if all(size == full_size for size in sizes):
         return planes
-    return torch.stack([extended(one[:, :h, :w], *whole) for one, (h, w) in zip(planes, sizes, strict=True)])
+    return torch.stack(
+        [extended(plane[:, :height, :width], *full_size) for plane, (height, width) in zip(planes, sizes, strict=True)]
+    )
 
 
 def compressed(
@@ -336,60 +358,65 @@ def compressed(
         ConfigError: There is no such quality.
     """
     quantisation(quality)
-    halves = [((height + 1) // 2, (width + 1) // 2) for height, width in sizes]
-    halved = subsampling == "420"
+    half_sizes = [((height + 1) // 2, (width + 1) // 2) for height, width in sizes]
+    is_subsampled = subsampling == "420"
     image = image.clamp(0.0, 1.0)
     with torch.no_grad():
-        exact = _exact(image.device, fast=True)
-        there, half, _ = _colour_weights(image.device, exact)
-        codes = torch.floor(image * 255 + (0.5 + TIE)).to(exact)
-        planes = torch.floor(_mixed(there, codes) + half).to(image.dtype)
-        bright, colours = planes[:, :1], planes[:, 1:]
-        if halved:
+        exact_type = _exact(image.device, fast=True)
+        to_ycbcr, rounding, _ = _colour_weights(image.device, exact_type)
+        codes = torch.floor(image * 255 + (0.5 + TIE)).to(exact_type)
+        planes = torch.floor(_mixed(to_ycbcr, codes) + rounding).to(image.dtype)
+        luminance, chrominance = planes[:, :1], planes[:, 1:]
+        if is_subsampled:
             # what is not there repeats the last mean of two rows, and the last column; back from it, both repeat the
-            # last
-            colours = _halved(colours)
-            colours = _repeated(colours, [(height, colours.shape[3]) for height, _ in halves])
-        bright, colours = _coded(bright, colours, quality, fast=fast)
-        inside = (bright > 0) & (bright < 255), (colours > 0) & (colours < 255)
-        bright, colours = bright.clamp(0, 255), colours.clamp(0, 255)
-        if halved:
-            colours = _doubled(_repeated(colours, halves))
-        there, _, back = _colour_weights(image.device, image.dtype)
-        codes = torch.floor(_mixed(back, torch.cat([bright, colours - 128], 1)) + (0.5 + TIE))
-        shown = (codes > 0) & (codes < 255)
+            # after decoding.
+            chrominance = _halved(chrominance)
+            chrominance = _repeated(chrominance, [(height, chrominance.shape[3]) for height, _ in half_sizes])
+        luminance, chrominance = _coded(luminance, chrominance, quality, fast=fast)
+        unclipped = (luminance > 0) & (luminance < 255), (chrominance > 0) & (chrominance < 255)
+        luminance, chrominance = luminance.clamp(0, 255), chrominance.clamp(0, 255)
+        if is_subsampled:
+            chrominance = _doubled(_repeated(chrominance, half_sizes))
+        to_ycbcr, _, from_ycbcr = _colour_weights(image.device, image.dtype)
+        codes = torch.floor(_mixed(from_ycbcr, torch.cat([luminance, chrominance - 128], 1)) + (0.5 + TIE))
+        is_unclipped = (codes > 0) & (codes < 255)
         codes = codes.clamp(0, 255) / 255
     if not image.requires_grad:
         return codes
-    # without rounding, blocks are what they were: what is left are the colours' means, and what is cut off
-    planes = _mixed(there, image)
-    bright, colours = planes[:, :1] * inside[0], planes[:, 1:]
-    colours = _widened(_repeated(avg_pool2d(colours, 2) * inside[1], halves)) if halved else colours * inside[1]
-    return _straight(_mixed(back, torch.cat([bright, colours], 1)) * shown, codes)
+    # Without rounding, coding is the identity: the means of the colours and the clipping remain.
+    planes = _mixed(to_ycbcr, image)
+    luminance, chrominance = planes[:, :1] * unclipped[0], planes[:, 1:]
+    chrominance = (
+        _widened(_repeated(avg_pool2d(chrominance, 2) * unclipped[1], half_sizes))
+        if is_subsampled
+        else chrominance * unclipped[1]
+    )
+    return _straight(_mixed(from_ycbcr, torch.cat([luminance, chrominance], 1)) * is_unclipped, codes)
 
 
 def jpeg(image: Tensor, quality: int = 92, subsampling: str = "420", *, fast: bool | None = None) -> Tensor:
-    """A picture after it was written as JPEG and read again, as libjpeg does both.
+    """Encode an image as JPEG and decode it, both as libjpeg does.
 
-    Rounds to 8 bits, YCbCr, means of 2 x 2 of the colours where they are subsampled, DCT of 8 x 8, quantisation, and
-    all of it back. Borders are repeated to whole blocks.
+    Rounds to 8 bits, converts to YCbCr, averages 2 x 2 colours where they are subsampled, applies the 8 x 8 DCT
+    and quantises, and reverses all of it. Borders are repeated to whole blocks.
 
     Args:
         image: sRGB in [0, 1], [B, 3, H, W].
         quality: 1 to 100, as libjpeg scales it.
         subsampling: "420" or "444".
-        fast: Whether the encoder takes libjpeg's fast DCT, which hits other steps where steps are small; None for what
-            `ssad.core.images.encode_jpeg` (libjpeg-turbo's own choice) does: below 96. OpenCV and Pillow do not.
+        fast: Whether the encoder uses libjpeg's fast DCT, which gives other steps where steps are small; None
+            for the choice of `ssad.core.images.encode_jpeg` (libjpeg-turbo's default): below 96. OpenCV and
+            Pillow do not use it.
 
     Returns:
-        Multiples of 1/255, shaped as image. Slope one through every rounding, zero where a value is cut off at black or
-        white.
+        Multiples of 1/255, shaped as image. Slope one through every rounding, zero where a value is cut off at
+        black or white.
 
     Raises:
-        ConfigError: A quality or subsampling that there is not.
+        ConfigError: Quality or subsampling is invalid.
     """
-    block, (height, width) = block_of(subsampling), image.shape[2:]
-    size = (-(-height // block) * block, -(-width // block) * block)
-    whole = torch.stack([extended(one, *size) for one in image])
+    block_pixels, (height, width) = block_of(subsampling), image.shape[2:]
+    padded_size = (-(-height // block_pixels) * block_pixels, -(-width // block_pixels) * block_pixels)
+    padded = torch.stack([extended(entry, *padded_size) for entry in image])
     fast = quality < ACCURATE if fast is None else fast
-    return compressed(whole, [(height, width)] * len(image), quality, subsampling, fast=fast)[:, :, :height, :width]
+    return compressed(padded, [(height, width)] * len(image), quality, subsampling, fast=fast)[:, :, :height, :width]

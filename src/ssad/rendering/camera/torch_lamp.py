@@ -1,7 +1,7 @@
-"""The light of a lamp in torch, differentiable with respect to where it is and how it shines.
+"""Light of a lamp in torch, differentiable with respect to the lamp's pose, power and spread.
 
-`render(..., surface=True)` says what each pixel shows. From that, what a lamp would add follows without rendering
-again, as the kernels compute it, but for the shadows that it casts and for what of it is mirrored.
+`render(..., surface=True)` exports the surface of each pixel. From it, the light that a lamp would add is computed
+as in the kernels, without rendering again; shadows and mirror images of the lamp are not included.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def lamp_light(
     spread: Tensor | None = None,
     fog: float = 0.0,
 ) -> Tensor:
-    """Irradiance over pi that a lamp gives to points, without shadows.
+    """Return the irradiance over pi that a lamp gives to points, without shadows.
 
     Args:
-        lamp: The lamp; its fields stand for what is not given as a tensor. It projects no texture.
+        lamp: The lamp; its fields apply where no tensor is given. It projects no texture.
         position: Points in the world [..., 3], m.
         normal: Their normals [..., 3], unit.
         pose: Lamp to world [4, 4] (x across, y down, z ahead), in place of the lamp's.
@@ -36,10 +36,11 @@ def lamp_light(
         fog: Extinction, 1/m (`Weather.fog`).
 
     Returns:
-        Linear RGB [..., 3], differentiable with respect to all tensors; at the edge of a rectangle it jumps.
+        Linear RGB [..., 3], differentiable with respect to all tensors; it is discontinuous at the edge of a
+        rectangle.
 
     Raises:
-        ConfigError: The lamp projects a texture (see `ssad.rendering.camera.texture`).
+        ConfigError: The lamp projects a texture (see `ssad.camera.texture`).
     """
     if lamp.texture >= 0:
         raise ConfigError(
@@ -48,27 +49,33 @@ def lamp_light(
     pose = position.new_tensor(lamp.pose) if pose is None else pose.to(position)
     power = position.new_tensor(lamp.power) if power is None else power.to(position)
     spread = position.new_tensor(lamp.spread) if spread is None else spread.to(position)
-    to = position - pose[:3, 3]
-    local = to @ pose[:3, :3]
-    ahead = local[..., 2]
-    facing = -(normal * to).sum(-1)
-    lit = (facing > 0.0) & (ahead > 0.02)
-    ahead = torch.where(lit, ahead, 1.0)
-    square = (to * to).sum(-1).clamp_min(1e-4)
-    distance = square.sqrt()
-    across = local[..., :2] / ahead[..., None] / spread
+    offset = position - pose[:3, 3]
+    local_position = offset @ pose[:3, :3]
+    axial_distance = local_position[..., 2]
+    facing_distance = -(normal * offset).sum(-1)
+    is_lit = (facing_distance > 0.0) & (axial_distance > 0.02)
+    # A safe value on dark points keeps NaN out of the gradient.
+    axial_distance = torch.where(is_lit, axial_distance, 1.0)
+    squared_distance = (offset * offset).sum(-1).clamp_min(1e-4)
+    distance = squared_distance.sqrt()
+    plane_position = local_position[..., :2] / axial_distance[..., None] / spread
     if lamp.is_square:
-        weight = (across.abs() <= 1.0).all(-1).to(position)
+        weight = (plane_position.abs() <= 1.0).all(-1).to(position)
         area = 4.0 * spread.prod()
     else:
-        inner = (1.0 - lamp.soft) ** 2
-        radius = (across * across).sum(-1)
-        weight = ((1.0 - radius) / (1.0 - inner)).clamp(0.0, 1.0) if inner < 1.0 else (radius <= 1.0).to(position)
-        area = torch.pi * spread.prod() * (1.0 + inner) / 2.0
+        inner_squared = (1.0 - lamp.soft) ** 2
+        squared_radius = (plane_position * plane_position).sum(-1)
+        weight = (
+            ((1.0 - squared_radius) / (1.0 - inner_squared)).clamp(0.0, 1.0)
+            if inner_squared < 1.0
+            else (squared_radius <= 1.0).to(position)
+        )
+        area = torch.pi * spread.prod() * (1.0 + inner_squared) / 2.0
     weight = weight * (3.0 * (1.0 - distance / lamp.reach)).clamp(0.0, 1.0) * torch.exp(-fog * distance)
-    given = weight * (distance / ahead) ** 3 * facing / distance / square
+    # Even light on a plane across the axis: the intensity grows with the cube of the secant.
+    irradiance = weight * (distance / axial_distance) ** 3 * facing_distance / distance / squared_distance
     colour = position.new_tensor(lamp.colour)
-    return torch.where(lit, given, 0.0)[..., None] * colour * power / area
+    return torch.where(is_lit, irradiance, 0.0)[..., None] * colour * power / area
 
 
 def shine(picture: Picture, light: Tensor) -> Tensor:
@@ -87,5 +94,7 @@ def shine(picture: Picture, light: Tensor) -> Tensor:
     surface = picture.surface
     if surface is None:
         raise ConfigError("this picture does not say what it shows: render it with surface=True")
-    albedo, gain, irradiance = (light.new_tensor(v) for v in (surface.albedo, surface.gain, surface.irradiance))
+    albedo, gain, irradiance = (
+        light.new_tensor(values) for values in (surface.albedo, surface.gain, surface.irradiance)
+    )
     return light * albedo * torch.where(irradiance > 0.0, gain / irradiance.clamp_min(1e-12), 0.0)

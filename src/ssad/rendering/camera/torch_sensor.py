@@ -1,8 +1,8 @@
-"""The camera's sensor in torch: what `ssad.rendering.camera.render` does from light to JPEG, with gradients.
+"""Sensor of the camera in torch: the chain of `ssad.camera.render` from light to JPEG, with gradients.
 
-`develop` is the chain of `ssad.rendering.camera.sensor` and equals the renderer's pictures to the rounding to 8 bits;
-`ssad.rendering.camera.torch_jpeg.jpeg` follows it. An attack changes few pixels: `Window` develops those and what
-depends on them alone. Light above a full photosite or outside the curve has slope zero, as in the camera.
+`develop` is the chain of `ssad.camera.sensor` and equals the renderer's images up to the rounding to 8 bits;
+`ssad.camera.torch_jpeg.jpeg` follows it. An attack changes few pixels: `Window` develops only those and the pixels
+that depend on them. Light above a full photosite or outside the curve has slope zero, as in the camera.
 """
 
 from __future__ import annotations
@@ -44,38 +44,43 @@ TOE = 0.0031308  # light below which sRGB is linear
 
 @lru_cache(maxsize=16)
 def _lens_weights(blur: float, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Weights of the lens [3, 3], and of lens and mosaic [4, 3, 4, 4]; kept, since each copy to a GPU takes long.
+    """Return the weights of the lens [3, 3], and of lens and mosaic [4, 3, 4, 4].
 
-    The latter lead from a square of four pixels with a border of one pixel to the photosites of the square.
+    The latter map a square of four pixels with a border of one pixel to the photosites of the square. Cached,
+    because each copy to a GPU takes long.
     """
     centre, side = point_spread(blur)
-    line = np.array([side, centre, side])
-    spread = line[:, None] * line
-    square = np.zeros((4, 3, 4, 4))
+    row_weights = np.array([side, centre, side])
+    spread = row_weights[:, None] * row_weights
+    square_weights = np.zeros((4, 3, 4, 4))
     for site, colour in enumerate((0, 1, 1, 2)):
         y, x = divmod(site, 2)
-        square[site, colour, y : y + 3, x : x + 3] = spread
-    return _kept(spread, device, dtype), _kept(square, device, dtype)
+        square_weights[site, colour, y : y + 3, x : x + 3] = spread
+    return _kept(spread, device, dtype), _kept(square_weights, device, dtype)
 
 
 def _kept(values: np.ndarray, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Values for any later call, whatever the mode of this one."""
+    """Return a constant tensor that is valid in later calls, whatever the mode of this one."""
+    # A tensor made in inference mode could not take part in autograd later.
     with torch.inference_mode(mode=False):
         return torch.as_tensor(values, dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=8)
 def _demosaic_weights(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """[12, 1, 6, 6]: from a square of four with a border of two px to its colours, those of one colour together."""
-    itself = np.zeros((5, 5))
-    itself[2, 2] = 8.0
-    taps = (
-        (itself, ALONG, ACROSS, OPPOSITE),  # red at red's site, at the greens beside and below it, at blue's
-        (GREEN, itself, itself, GREEN),
-        (OPPOSITE, ACROSS, ALONG, itself),
+    """Return the demosaicing weights [12, 1, 6, 6].
+
+    They map a square of four with a border of two px to its colours; the outputs of one colour are adjacent.
+    """
+    identity_taps = np.zeros((5, 5))
+    identity_taps[2, 2] = 8.0
+    taps_of_colours = (
+        (identity_taps, ALONG, ACROSS, OPPOSITE),  # red at red's site, at the greens beside and below it, at blue's
+        (GREEN, identity_taps, identity_taps, GREEN),
+        (OPPOSITE, ACROSS, ALONG, identity_taps),
     )
     square = np.zeros((12, 1, 6, 6))
-    for colour, sites in enumerate(taps):
+    for colour, sites in enumerate(taps_of_colours):
         for site, weights in enumerate(sites):
             y, x = divmod(site, 2)
             square[4 * colour + site, 0, y : y + 5, x : x + 5] = np.array(weights) / 8
@@ -85,22 +90,22 @@ def _demosaic_weights(device: torch.device, dtype: torch.dtype) -> Tensor:
 def _squares(picture: Tensor, weights: Tensor, border: int) -> Tensor:
     """A picture [B, C, H, W], mirrored at its borders, in squares of four: [B, C', H, W]."""
     height, width = picture.shape[2:]
-    wide = pad(picture, (border, border + width % 2, border, border + height % 2), mode="reflect")
-    return pixel_shuffle(conv2d(wide, weights, stride=2), 2)[:, :, :height, :width]
+    padded = pad(picture, (border, border + width % 2, border, border + height % 2), mode="reflect")
+    return pixel_shuffle(conv2d(padded, weights, stride=2), 2)[:, :, :height, :width]
 
 
 def photosites(light: Tensor, sensor: Sensor) -> Tensor:
-    """What falls on the photosites: the lens's point spread, and one colour for each where there is a mosaic.
+    """Return the light on the photosites: the lens's point spread, and one colour for each with a mosaic.
 
     Args:
         light: Linear, [B, H, W, 3].
-        sensor: Whose lens and mosaic.
+        sensor: Sensor with lens and mosaic.
 
     Returns:
         Light of each photosite, [B, H, W] with a mosaic, [B, H, W, 3] without.
 
     Raises:
-        ConfigError: The picture is smaller than 4 x 4.
+        ConfigError: The image is smaller than 4 x 4.
     """
     sensor.check_size(*light.shape[1:3])
     colours = light.permute(0, 3, 1, 2)
@@ -114,16 +119,16 @@ def photosites(light: Tensor, sensor: Sensor) -> Tensor:
 
 
 def fill(light: Tensor, exposure: Tensor | float, sensor: Sensor, noise: Tensor | None = None) -> Tensor:
-    """What the photosites hold: light with noise, and no more than fits. Zero slope where they are full.
+    """Return the content of the photosites: light with noise, clipped where they are full, with slope zero there.
 
     Args:
         light: Exposed light on each photosite, [B, H, W] or [B, H, W, 3].
-        exposure: [B] or one for all, on which the level of the noise depends.
-        sensor: Whose noise and full photosites.
-        noise: Independent normal numbers of deviation one, shaped as light; None for none.
+        exposure: [B] or one for all; determines the level of the noise.
+        sensor: Sensor with noise and full photosites.
+        noise: Independent standard normal numbers, shaped as light; None for none.
 
     Returns:
-        The raw picture, shaped as light. The slope counts that noise grows with light.
+        The raw image, shaped as light. The slope includes that noise grows with light.
 
     Raises:
         ConfigError: The noise has another shape.
@@ -133,25 +138,26 @@ def fill(light: Tensor, exposure: Tensor | float, sensor: Sensor, noise: Tensor 
             raise ConfigError(f"noise of shape {list(noise.shape)} for photosites {list(light.shape)}")
         scale = torch.as_tensor(exposure, dtype=light.dtype, device=light.device).reshape(-1, *[1] * (light.ndim - 1))
         gain = (scale / DAY_EXPOSURE).clamp_min(1.0).sqrt()
+        # `noise_levels` takes one exposure; the gain of each image is applied to its result.
         photons, dark = noise_levels(sensor.noise, DAY_EXPOSURE)
         light = light + torch.sqrt(photons * gain * light.clamp_min(0.0) + (dark * gain) ** 2) * noise
     return light.clamp_max(sensor.full)
 
 
 def demosaic(raw: Tensor) -> Tensor:
-    """The missing colours of an RGGB mosaic by Malvar, He and Cutler (ICASSP 2004).
+    """Interpolate the missing colours of an RGGB mosaic by Malvar, He and Cutler (ICASSP 2004).
 
     Args:
-        raw: What the photosites hold, [B, H, W].
+        raw: Content of the photosites, [B, H, W].
 
     Returns:
-        Linear colours, [B, H, W, 3]; noise and edges can take them a little below zero.
+        Linear colours, [B, H, W, 3]; noise and edges can make them slightly negative.
     """
     return _squares(raw[:, None], _demosaic_weights(raw.device, raw.dtype), 2).permute(0, 2, 3, 1)
 
 
 def curve(light: Tensor) -> Tensor:
-    """The camera's curve: linear to 0.8, a soft shoulder above, then sRGB.
+    """Apply the camera's curve: linear to 0.8, a soft shoulder above, then sRGB.
 
     Args:
         light: Linear, of any shape; used in 0..4.
@@ -159,42 +165,46 @@ def curve(light: Tensor) -> Tensor:
     Returns:
         sRGB in [0, 1]. The slope is finite everywhere.
     """
-    found: Tensor = _Curve.apply(light)
-    return found
+    encoded: Tensor = _Curve.apply(light)
+    return encoded
 
 
 def _soft(light: Tensor) -> tuple[Tensor, Tensor]:
-    """Light in 0..4 under the shoulder, and what is left of a change of it."""
-    left = torch.exp((KNEE - light.clamp_min(KNEE)) / SHOULDER)
-    return light.clamp_max(KNEE) + (1 - KNEE) * (1 - left), left
+    """Return light in 0..4 under the shoulder, and the remaining share of a change of it."""
+    remaining_slope = torch.exp((KNEE - light.clamp_min(KNEE)) / SHOULDER)
+    return light.clamp_max(KNEE) + (1 - KNEE) * (1 - remaining_slope), remaining_slope
 
 
 class _Curve(torch.autograd.Function):
-    """The curve with its slope written out: half of the operations, which is what time goes into on a GPU."""
+    """Curve with an explicit gradient: half of the operations, which dominate the time on a GPU."""
 
     @staticmethod
     def forward(context: Any, light: Tensor) -> Tensor:
         context.save_for_backward(light)
-        soft, _ = _soft(light.clamp(0.0, TOP))
-        return torch.where(soft <= TOE, soft * 12.92, 1.055 * soft.clamp_min(TOE) ** (1 / 2.4) - 0.055)
+        shouldered, _ = _soft(light.clamp(0.0, TOP))
+        return torch.where(
+            shouldered <= TOE, shouldered * 12.92, 1.055 * shouldered.clamp_min(TOE) ** (1 / 2.4) - 0.055
+        )
 
     @staticmethod
     def backward(context: Any, slope: Tensor) -> Tensor:
         (light,) = context.saved_tensors
-        soft, left = _soft(light.clamp(0.0, TOP))
-        steep = torch.where(soft <= TOE, 12.92, (1.055 / 2.4) * soft.clamp_min(TOE) ** (1 / 2.4 - 1))
-        bent = torch.where(light > KNEE, ((1 - KNEE) / SHOULDER) * left, 1.0)
-        changed: Tensor = slope * steep * bent * ((light > 0.0) & (light < TOP))
-        return changed
+        shouldered, remaining_slope = _soft(light.clamp(0.0, TOP))
+        encoding_slope = torch.where(
+            shouldered <= TOE, 12.92, (1.055 / 2.4) * shouldered.clamp_min(TOE) ** (1 / 2.4 - 1)
+        )
+        shoulder_slope = torch.where(light > KNEE, ((1 - KNEE) / SHOULDER) * remaining_slope, 1.0)
+        gradient: Tensor = slope * encoding_slope * shoulder_slope * ((light > 0.0) & (light < TOP))
+        return gradient
 
 
 def draw_noise(shape: Sequence[int], sensor: Sensor, generator: torch.Generator) -> Tensor:
-    """A sample of noise for `develop`: normal numbers of deviation one.
+    """Draw a sample of noise for `develop`: standard normal numbers.
 
     Args:
         shape: B, H, W.
         sensor: With a mosaic a photosite has one number, else three.
-        generator: Where they come from; the sample is on its device.
+        generator: Source of the numbers; the sample is on its device.
 
     Returns:
         [B, H, W] or [B, H, W, 3], float32.
@@ -204,17 +214,21 @@ def draw_noise(shape: Sequence[int], sensor: Sensor, generator: torch.Generator)
 
 
 def large_draws(generators: Sequence[torch.Generator], device: torch.device) -> list[torch.Generator]:
-    """Where to draw a number for each pixel or texel: on the CPU the same generators, on a GPU others that follow.
+    """Return generators for one draw per pixel or texel on a device.
 
-    A GPU draws other numbers than the CPU would; to draw there and copy would take longer than all else of a picture.
+    On the CPU they are the given generators, on a GPU new ones seeded by them. A GPU draws other numbers than
+    the CPU would; drawing on the CPU and copying would take longer than all other work on an image.
 
     Args:
         generators: On the CPU.
-        device: Where the numbers are needed.
+        device: Device that needs the numbers.
+
+    Returns:
+        One generator for each given one.
     """
     if device.type == "cpu":
         return list(generators)
-    seeds = [int(torch.randint(1 << 62, (1,), generator=one)) for one in generators]
+    seeds = [int(torch.randint(1 << 62, (1,), generator=entry)) for entry in generators]
     return [torch.Generator(device).manual_seed(seed) for seed in seeds]
 
 
@@ -224,30 +238,31 @@ def develop(
     sensor: Sensor = DEFAULT_SENSOR,
     noise: Tensor | torch.Generator | None = None,
 ) -> Tensor:
-    """The camera's picture of a radiance, as `ssad.rendering.camera.render` makes it before it rounds to 8 bits.
+    """Develop radiance into the camera's image, as `ssad.camera.render` does before it rounds to 8 bits.
 
     Args:
         radiance: Linear, [B, H, W, 3].
-        exposure: What radiance is multiplied by, [B] or one for all.
+        exposure: Factor of the radiance, [B] or one for all.
         sensor: Lens, mosaic, noise and full photosites.
-        noise: A sample as `draw_noise` gives, which stays fixed over calls; or where to draw one; None for none.
+        noise: A sample from `draw_noise`, which stays fixed over calls; or a generator to draw one; None for
+            none.
 
     Returns:
         sRGB in [0, 1], [B, 3, H, W]; differentiable in the radiance.
 
     Raises:
-        ConfigError: The picture is smaller than 4 x 4, or the noise has another shape.
+        ConfigError: The image is smaller than 4 x 4, or the noise has another shape.
     """
-    scale = torch.as_tensor(exposure, dtype=radiance.dtype, device=radiance.device).reshape(-1, 1, 1, 1)
+    exposure_factor = torch.as_tensor(exposure, dtype=radiance.dtype, device=radiance.device).reshape(-1, 1, 1, 1)
     if isinstance(noise, torch.Generator):
         noise = draw_noise(radiance.shape[:3], sensor, noise)
     if noise is not None:
         noise = noise.to(radiance)
-    raw = fill(photosites(radiance * scale, sensor), exposure, sensor, noise)
+    raw = fill(photosites(radiance * exposure_factor, sensor), exposure, sensor, noise)
     return curve(demosaic(raw) if sensor.mosaic else raw).permute(0, 3, 1, 2)
 
 
-# ---------------------------------------------------------------- only what is touched
+# ---------------------------------------------------------------- windows of changed pixels
 
 
 Span = tuple[int, int]  # first, and one after the last
@@ -255,17 +270,19 @@ Rectangle = tuple[Span, Span]  # of rows and columns
 
 
 def _rectangles(pixels: Tensor, shape: tuple[int, int, int]) -> list[Rectangle]:
-    """The rectangle around flat pixels of each picture; empty where it has none."""
+    """Return the rectangle around flat pixels of each image; empty where there is none."""
     count, height, width = shape
-    flat = pixels.detach().reshape(-1).cpu()
-    if len(flat) and not (int(flat.min()) >= 0 and int(flat.max()) < count * height * width):
+    flat_pixels = pixels.detach().reshape(-1).cpu()
+    if len(flat_pixels) and not (int(flat_pixels.min()) >= 0 and int(flat_pixels.max()) < count * height * width):
         raise ConfigError(f"a pixel outside of {count} pictures of {width} x {height}")
-    batch, y, x = flat // (height * width), flat // width % height, flat % width
+    image_index, y, x = flat_pixels // (height * width), flat_pixels // width % height, flat_pixels % width
     spans = []
-    for values, most in ((y, height), (x, width)):
-        low = torch.full((count,), most).scatter_reduce(0, batch, values, "amin").tolist()
-        high = torch.full((count,), -1).scatter_reduce(0, batch, values, "amax").tolist()
-        spans.append([(a, b + 1) if a <= b else (0, 0) for a, b in zip(low, high, strict=True)])
+    for values, limit in ((y, height), (x, width)):
+        firsts = torch.full((count,), limit).scatter_reduce(0, image_index, values, "amin").tolist()
+        lasts = torch.full((count,), -1).scatter_reduce(0, image_index, values, "amax").tolist()
+        spans.append(
+            [(first, last + 1) if first <= last else (0, 0) for first, last in zip(firsts, lasts, strict=True)]
+        )
     return list(zip(*spans, strict=True))
 
 
@@ -278,25 +295,26 @@ def _grown(span: Span, margin: int, most: int, step: int = 1) -> Span:
 
 def _alike(spans: Sequence[Span], most: int, step: int) -> list[Span]:
     """Spans of one length that hold given ones, in 0..most, at multiples of a step."""
-    length = max(SMALLEST, *(high - low // step * step for low, high in spans))
+    length = max(SMALLEST, *(last - first // step * step for first, last in spans))
     length = -(-length // step) * step
     length = min(length + (most - length) % step, most)
-    starts = [min(low // step * step, most - length) for low, _ in spans]
+    starts = [min(first // step * step, most - length) for first, _ in spans]
     return [(start, start + length) for start in starts]
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """The part of pictures that changes when a few pixels do, and what it is developed from.
+    """Part of images that changes when a few pixels do, and the part that it is developed from.
 
-    All rectangles are spans of rows and of columns, one for each picture; read and coded rectangles have one size.
+    All rectangles are spans of rows and of columns, one for each image; read and coded rectangles have one
+    size.
 
     Attributes:
-        shape: B, H, W of the whole pictures.
-        sensor: Whose pictures.
-        changed: What changes.
+        shape: B, H, W of the whole images.
+        sensor: Sensor of the images.
+        changed: Where images change.
         read: Where the radiance is needed.
-        coded: Where the developed picture is needed: whole JPEG blocks, which can stand out of the picture.
+        coded: Where the developed image is needed: whole JPEG blocks, which can extend beyond the image.
         quality: Of JPEG; None for none.
         subsampling: Of JPEG, "420" or "444".
     """
@@ -318,31 +336,31 @@ class Window:
         quality: int | None = None,
         subsampling: str = "420",
     ) -> Window:
-        """The window of what changes when the radiance of pixels does.
+        """Return the window that changes when the radiance of pixels does.
 
         Args:
             pixels: Flat indices into B * H * W, such as `Taps.pixel`.
-            shape: B, H, W of the pictures.
-            sensor: Whose pictures.
-            quality: Of JPEG, 1 to 100; None for pictures that are not compressed.
+            shape: B, H, W of the images.
+            sensor: Sensor of the images.
+            quality: Of JPEG, 1 to 100; None for images that are not compressed.
             subsampling: Of JPEG, "420" or "444".
 
         Returns:
-            The window; it is empty in pictures without such a pixel.
+            The window; it is empty in images without such a pixel.
 
         Raises:
-            ConfigError: A pixel outside the pictures, or a quality or subsampling that there is not.
+            ConfigError: A pixel lies outside the images, or quality or subsampling is invalid.
         """
         count, height, width = shape
-        block, bleed = 1, 0
+        block_side, block_margin = 1, 0
         if quality is not None:
-            # what is read of the colours next to a block is made of that block
-            block, bleed = block_of(subsampling), 1 if subsampling == "420" else 0
+            # Upsampling reads the colours next to a block, so a change also reaches the neighbouring blocks.
+            block_side, block_margin = block_of(subsampling), 1 if subsampling == "420" else 0
         changed = []
-        for sides in _rectangles(pixels, (count, height, width)):
+        for spans in _rectangles(pixels, (count, height, width)):
             rows, columns = (
-                _grown(_grown(span, sensor.reach, most, block), bleed, most)
-                for span, most in zip(sides, (height, width), strict=True)
+                _grown(_grown(span, sensor.reach, limit, block_side), block_margin, limit)
+                for span, limit in zip(spans, (height, width), strict=True)
             )
             changed.append((rows, columns))
         return Window.of(changed, shape, sensor, quality=quality, subsampling=subsampling)
@@ -356,34 +374,37 @@ class Window:
         quality: int | None = None,
         subsampling: str = "420",
     ) -> Window:
-        """The window that gives the developed values of rectangles.
+        """Return the window that gives the developed values of rectangles.
 
         Args:
-            changed: Spans of rows and of columns, one pair for each picture.
-            shape: B, H, W of the pictures.
-            sensor: Whose pictures.
-            quality: Of JPEG, 1 to 100; None for pictures that are not compressed.
+            changed: Spans of rows and of columns, one pair for each image.
+            shape: B, H, W of the images.
+            sensor: Sensor of the images.
+            quality: Of JPEG, 1 to 100; None for images that are not compressed.
             subsampling: Of JPEG, "420" or "444".
 
         Returns:
             The window.
 
         Raises:
-            ConfigError: A quality or subsampling that there is not.
+            ConfigError: Quality or subsampling is invalid.
         """
         count, height, width = shape
-        block, bleed = 1, 0
+        block_side, block_margin = 1, 0
         if quality is not None:
             quantisation(quality)
-            block, bleed = block_of(subsampling), 1 if subsampling == "420" else 0
+            block_side, block_margin = block_of(subsampling), 1 if subsampling == "420" else 0
         coded, read = [], []
-        for side, most in enumerate((height, width)):
-            room = -(-most // block) * block
-            blocks = [_grown(_grown(rectangle[side], bleed, most), 0, room, block) for rectangle in changed]
-            blocks = _alike(blocks, room, block)
+        for axis, limit in enumerate((height, width)):
+            padded_limit = -(-limit // block_side) * block_side
+            blocks = [
+                _grown(_grown(rectangle[axis], block_margin, limit), 0, padded_limit, block_side)
+                for rectangle in changed
+            ]
+            blocks = _alike(blocks, padded_limit, block_side)
             coded.append(blocks)
-            need = [_grown((low, min(high, most)), sensor.reach, most) for low, high in blocks]
-            read.append(_alike(need, most, 2 if sensor.mosaic else 1))
+            needed = [_grown((first, min(last, limit)), sensor.reach, limit) for first, last in blocks]
+            read.append(_alike(needed, limit, 2 if sensor.mosaic else 1))
         return Window(
             (count, height, width),
             sensor,
@@ -408,37 +429,37 @@ class Window:
         """
         if tuple(picture.shape[:3]) != self.shape:
             raise ConfigError(f"a window of pictures {list(self.shape)}, not {list(picture.shape[:3])}")
-        return torch.stack([one[slice(*y), slice(*x)] for one, (y, x) in zip(picture, self.read, strict=True)])
+        return torch.stack([entry[slice(*y), slice(*x)] for entry, (y, x) in zip(picture, self.read, strict=True)])
 
     def taps(self, taps: Taps) -> Taps:
-        """Taps into the radiance that `crop` gives.
+        """Return the taps with pixels relative to the radiance that `crop` returns.
 
         Args:
-            taps: Into whole pictures, all of their pixels inside the window.
+            taps: Into whole images, all of their pixels inside the window.
 
         Returns:
             The same with other pixels.
 
         Raises:
-            ConfigError: A pixel outside the window.
+            ConfigError: A pixel lies outside the window.
         """
         _, height, width = self.shape
         spans = torch.tensor(self.read, device=taps.pixel.device)  # [B, 2, 2]
         size = spans[0, :, 1] - spans[0, :, 0]
-        batch = taps.pixel // (height * width)
-        y = taps.pixel // width % height - spans[batch, 0, 0]
-        x = taps.pixel % width - spans[batch, 1, 0]
+        image_index = taps.pixel // (height * width)
+        y = taps.pixel // width % height - spans[image_index, 0, 0]
+        x = taps.pixel % width - spans[image_index, 1, 0]
         if bool(((y < 0) | (y >= size[0]) | (x < 0) | (x >= size[1])).any()):
             raise ConfigError("a tap outside of the window")
-        return replace(taps, pixel=(batch * size[0] + y) * size[1] + x)
+        return replace(taps, pixel=(image_index * size[0] + y) * size[1] + x)
 
     def develop(self, radiance: Tensor, exposure: Tensor | float, noise: Tensor | None = None) -> Tensor:
-        """What `develop` and `jpeg` make of the whole pictures, in the coded rectangles; right where it changes.
+        """Return `develop` and `jpeg` of the whole images in the coded rectangles; valid where the images change.
 
         Args:
-            radiance: Of the window, as `crop` gives it, [B, h, w, 3].
+            radiance: Of the window, as from `crop`, [B, h, w, 3].
             exposure: [B] or one for all.
-            noise: Of the window: `crop` of a sample for whole pictures; None for none.
+            noise: Of the window: `crop` of a sample for whole images; None for none.
 
         Returns:
             [B, 3, h', w'] of the coded rectangles.
@@ -446,20 +467,22 @@ class Window:
         Raises:
             ConfigError: The noise has another shape.
         """
-        picture = develop(radiance, exposure, self.sensor, noise)
+        developed = develop(radiance, exposure, self.sensor, noise)
         _, height, width = self.shape
-        parts, sizes, corners = [], [], []
+        extended_parts, sizes, corners = [], [], []
         for (rows, columns), (y, x) in zip(self.coded, self.read, strict=True):
             sizes.append((min(rows[1], height) - rows[0], min(columns[1], width) - columns[0]))
             corners.append((rows[0] - y[0], columns[0] - x[0]))
-        whole = _size(self.coded[0])
-        if len({*sizes, whole}) == 1 and len(set(corners)) == 1:  # as of all pictures whose border is not near
-            (top, left), (high, wide) = corners[0], whole
-            image = picture[:, :, top : top + high, left : left + wide]
+        coded_size = _size(self.coded[0])
+        if len({*sizes, coded_size}) == 1 and len(set(corners)) == 1:  # the usual case: no border is near
+            (top, left), (part_height, part_width) = corners[0], coded_size
+            image = developed[:, :, top : top + part_height, left : left + part_width]
         else:
-            for one, (top, left), (high, wide) in zip(picture, corners, sizes, strict=True):
-                parts.append(extended(one[:, top : top + high, left : left + wide], *whole))
-            image = torch.stack(parts)
+            for single, (top, left), (part_height, part_width) in zip(developed, corners, sizes, strict=True):
+                extended_parts.append(
+                    extended(single[:, top : top + part_height, left : left + part_width], *coded_size)
+                )
+            image = torch.stack(extended_parts)
         if self.quality is None:
             return image
         return compressed(image, sizes, self.quality, self.subsampling, fast=self.quality < ACCURATE)
@@ -474,34 +497,38 @@ class Window:
         Returns:
             [B, 3, H, W]; differentiable in both, but not in codes.
         """
-        found: Tensor = _Paste.apply(developed, picture, self.changed, self.coded)
-        return found
+        pasted: Tensor = _Paste.apply(developed, picture, self.changed, self.coded)
+        return pasted
 
 
 class _Paste(torch.autograd.Function):
-    """`Window.paste`: one copy a picture each way, where slices would copy whole pictures for their gradient."""
+    """Autograd function of `Window.paste`: one copy an image each way; slices would copy whole images."""
 
     @staticmethod
     def forward(
         context: Any, developed: Tensor, picture: Tensor, changed: Sequence[Rectangle], coded: Sequence[Rectangle]
     ) -> Tensor:
         context.parts = parts = []
-        found = picture.float().div_(255) if picture.dtype == torch.uint8 else picture.clone()
-        for n, ((y, x), (rows, columns)) in enumerate(zip(changed, coded, strict=True)):
+        pasted = picture.float().div_(255) if picture.dtype == torch.uint8 else picture.clone()
+        for image_index, ((y, x), (rows, columns)) in enumerate(zip(changed, coded, strict=True)):
             inside = slice(y[0] - rows[0], y[1] - rows[0]), slice(x[0] - columns[0], x[1] - columns[0])
-            parts.append(((n, slice(None), slice(*y), slice(*x)), (n, slice(None), *inside)))
-            found[parts[-1][0]] = developed[parts[-1][1]]
+            parts.append(((image_index, slice(None), slice(*y), slice(*x)), (image_index, slice(None), *inside)))
+            pasted[parts[-1][0]] = developed[parts[-1][1]]
         context.size = developed.shape
-        return found
+        return pasted
 
     @staticmethod
     def backward(context: Any, slope: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
-        renewed, before = slope.new_zeros(context.size), slope.clone() if context.needs_input_grad[1] else None
-        for there, here in context.parts:
-            renewed[here] = slope[there]
-            if before is not None:
-                before[there] = 0.0
-        return renewed, before, None, None
+        window_gradient, background_gradient = (
+            slope.new_zeros(context.size),
+            slope.clone() if context.needs_input_grad[1] else None,
+        )
+        for image_part, window_part in context.parts:
+            window_gradient[window_part] = slope[image_part]
+            # Replaced pixels of the images before have no influence.
+            if background_gradient is not None:
+                background_gradient[image_part] = 0.0
+        return window_gradient, background_gradient, None, None
 
 
 def _size(rectangle: Rectangle) -> tuple[int, int]:
@@ -518,27 +545,27 @@ def develop_at(
     quality: int | None = None,
     subsampling: str = "420",
 ) -> Tensor:
-    """Developed pixels alone: `develop`, then `jpeg` where a quality is given, of the pictures' parts that they need.
+    """Develop single pixels: `develop`, then `jpeg` if a quality is given, of only the parts that they need.
 
     Args:
         radiance: Linear, [B, H, W, 3].
-        exposure: What radiance is multiplied by, [B] or one for all.
+        exposure: Factor of the radiance, [B] or one for all.
         sensor: Lens, mosaic, noise and full photosites.
         pixels: Flat indices into B * H * W, [F].
-        noise: A sample for the whole pictures, as `draw_noise` gives; None for none.
-        quality: Of JPEG, 1 to 100; None for pictures that are not compressed.
+        noise: A sample for the whole images, as from `draw_noise`; None for none.
+        quality: Of JPEG, 1 to 100; None for images that are not compressed.
         subsampling: Of JPEG, "420" or "444".
 
     Returns:
-        sRGB in [0, 1], [F, 3]: the same as of the whole pictures.
+        sRGB in [0, 1], [F, 3]: the same as of the whole images.
 
     Raises:
-        ConfigError: A pixel outside the pictures, or bad settings.
+        ConfigError: A pixel lies outside the images, or a setting is invalid.
     """
     count, height, width = radiance.shape[:3]
-    wanted = _rectangles(pixels, (count, height, width))
-    window = Window.of(wanted, radiance.shape[:3], sensor, quality=quality, subsampling=subsampling)
+    rectangles = _rectangles(pixels, (count, height, width))
+    window = Window.of(rectangles, radiance.shape[:3], sensor, quality=quality, subsampling=subsampling)
     developed = window.develop(window.crop(radiance), exposure, None if noise is None else window.crop(noise))
-    batch = pixels // (height * width)
-    corner = torch.tensor([[rows[0], columns[0]] for rows, columns in window.coded], device=pixels.device)[batch]
-    return developed[batch, :, pixels // width % height - corner[:, 0], pixels % width - corner[:, 1]]
+    image_index = pixels // (height * width)
+    corner = torch.tensor([[rows[0], columns[0]] for rows, columns in window.coded], device=pixels.device)[image_index]
+    return developed[image_index, :, pixels // width % height - corner[:, 0], pixels % width - corner[:, 1]]

@@ -1,4 +1,4 @@
-"""What the readers of mesh files give before it is a mesh: triangles in the frame of the file; and how much is read."""
+"""Triangles as mesh readers return them, in the frame of the file, and the limits of what is read."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from ssad.core import safeio
 from ssad.core.errors import FormatError
 from ssad.rendering.meshes.mesh import F64, Material
 
+# Limits that keep a malformed or hostile file from exhausting memory.
 MAX_VERTICES = 2_000_000
 MAX_FACES = 2_000_000
 MAX_BYTES = 256 * safeio.MIB
@@ -17,7 +18,7 @@ DEFAULT = Material("default", (0.5, 0.5, 0.5))
 
 @dataclass
 class FaceList:
-    """Triangles as read: for each one its corners, texture coordinates (v down), normals, material and group."""
+    """Triangles as read: corners, texture coordinates (v down), normals, material and group of each."""
 
     points: list[F64] = field(default_factory=list)  # [n, 3, 3] each
     uv: list[F64] = field(default_factory=list)
@@ -28,7 +29,7 @@ class FaceList:
     groups: list[str] = field(default_factory=list)
 
     def add(self, points: F64, uv: F64, normals: F64, *, material: int, group: int) -> None:
-        """Triangles [n, 3, 3] with [n, 3, 2] texture coordinates."""
+        """Append triangles [n, 3, 3] with [n, 3, 2] texture coordinates."""
         self.points.append(points)
         self.uv.append(uv)
         self.normals.append(normals)
@@ -37,13 +38,14 @@ class FaceList:
 
 
 def beside(file: Path, reference: str) -> Path:
-    """A file that another one refers to: it must be in the same folder or below.
+    """Return the path of a file that another file refers to; it must lie in the same folder or below.
 
     Raises:
-        FormatError: It is elsewhere.
+        FormatError: It lies elsewhere.
     """
     folder = file.parent.resolve()
     target = (folder / reference).resolve()
+    # Mesh files are untrusted: a reference must not reach other folders, drives or URLs.
     if "\0" in reference or ":" in reference or not target.is_relative_to(folder):
         raise FormatError(f"{file}: refers to '{reference[:80]}' outside its folder; put the file beside the mesh")
     return target

@@ -1,7 +1,7 @@
 """Reader of glTF 2.0 meshes (.gltf with data URIs or files beside it, and .glb): geometry and material factors.
 
-Source: Khronos glTF 2.0 specification. Sparse accessors, compressed geometry, skins and animations are not read; a
-file that requires an extension is refused.
+Source: Khronos glTF 2.0 specification. Sparse accessors, compressed geometry, skins and animations are not read;
+files that require an unknown extension are rejected.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ MAX_NODES = 20_000
 
 
 def read_gltf(file: Path) -> FaceList:
-    """Triangles of the default scene, in the frame of the file.
+    """Read the triangles of the default scene, in the frame of the file.
 
     Raises:
-        FormatError: The file is broken, or uses what is not supported.
+        FormatError: The file is broken, or uses an unsupported feature.
     """
-    data = safeio.read_bytes(file, limit=MAX_BYTES)
-    chunk = None
+    content = safeio.read_bytes(file, limit=MAX_BYTES)
+    binary_chunk = None
     if file.suffix.lower() == ".glb":
-        data, chunk = _split_glb(data, file)
-    tree = safeio.parse_json(data, str(file))
+        content, binary_chunk = _split_glb(content, file)
+    tree = safeio.parse_json(content, str(file))
     if not isinstance(tree, dict):
         raise FormatError(f"{file}: not a glTF file (an object is expected)")
     try:
-        return _Reader(file, tree, chunk).read()
+        return _Reader(file, tree, binary_chunk).read()
     except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError) as error:
         raise FormatError(f"{file}: not a valid glTF file: {type(error).__name__} {error}") from None
 
 
 def _split_glb(data: bytes, file: Path) -> tuple[bytes, bytes | None]:
-    """JSON text and binary chunk of a .glb."""
+    """Return the JSON text and the binary chunk of a .glb file."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise FormatError(f"{file}: not a binary glTF file")
     version, total = struct.unpack_from("<II", data, 4)
@@ -57,20 +57,21 @@ def _split_glb(data: bytes, file: Path) -> tuple[bytes, bytes | None]:
     if total > len(data):
         raise FormatError(f"{file}: cut short: {len(data)} of {total} bytes")
     chunks: dict[int, bytes] = {}
-    at = 12
-    while at + 8 <= total:
-        size, kind = struct.unpack_from("<II", data, at)
-        if at + 8 + size > total:
+    offset = 12
+    while offset + 8 <= total:
+        size, chunk_type = struct.unpack_from("<II", data, offset)
+        if offset + 8 + size > total:
             raise FormatError(f"{file}: a chunk of {size} bytes is cut short")
-        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
-        at += 8 + size
+        chunks.setdefault(chunk_type, data[offset + 8 : offset + 8 + size])
+        offset += 8 + size
+    # Chunk types are the ASCII codes of "JSON" and "BIN\\0".
     if 0x4E4F534A not in chunks:
         raise FormatError(f"{file}: no JSON chunk")
     return chunks[0x4E4F534A], chunks.get(0x004E4942)
 
 
 class _Reader:
-    """One pass over the scene graph of a parsed glTF tree."""
+    """Reader of the scene graph of a parsed glTF tree, for one pass."""
 
     def __init__(self, file: Path, tree: dict[str, Any], chunk: bytes | None) -> None:
         self.file, self.tree, self.chunk = file, tree, chunk
@@ -91,25 +92,30 @@ class _Reader:
         version = str(self.tree.get("asset", {}).get("version", ""))
         if not version.startswith("2"):
             raise self.fail(f"glTF version '{version[:20]}'; only version 2 is read")
-        needed = [e for e in self.tree.get("extensionsRequired", []) if not str(e).startswith(_HARMLESS)]
-        if needed:
-            raise self.fail(f"requires the extension {str(needed[0])[:60]}; export without it")
-        self.triangles.materials = [self.material(m, k) for k, m in enumerate(self.tree.get("materials", []))] + [
-            DEFAULT
+        unsupported = [
+            extension
+            for extension in self.tree.get("extensionsRequired", [])
+            if not str(extension).startswith(_HARMLESS)
         ]
+        if unsupported:
+            raise self.fail(f"requires the extension {str(unsupported[0])[:60]}; export without it")
+        self.triangles.materials = [
+            self.material(material, index) for index, material in enumerate(self.tree.get("materials", []))
+        ] + [DEFAULT]
         scenes = self.tree.get("scenes", [])
         nodes = self.tree.get("nodes", [])
         if scenes:
             roots = self.item("scenes", self.tree.get("scene", 0)).get("nodes", [])
         else:
-            children = {c for n in nodes for c in n.get("children", [])}
-            roots = [k for k in range(len(nodes)) if k not in children]
+            children = {child for entry in nodes for child in entry.get("children", [])}
+            roots = [index for index in range(len(nodes)) if index not in children]
         for root in roots:
             self.node(root, np.eye(4), ())
         return self.triangles
 
     def node(self, index: int, parent: F64, above: tuple[int, ...]) -> None:
         self.visited += 1
+        # The graph comes from an untrusted file and may contain cycles.
         if index in above or len(above) > safeio.MAX_DEPTH or self.visited > MAX_NODES:
             raise self.fail(f"nodes[{index}]: the tree of nodes is a loop or too large")
         node = self.item("nodes", index)
@@ -119,8 +125,8 @@ class _Reader:
         if "mesh" in node:
             mesh = self.item("meshes", node["mesh"])
             name = str(node.get("name") or mesh.get("name") or f"mesh {node['mesh']}")[:80]
-            for k, primitive in enumerate(mesh["primitives"]):
-                self.primitive(primitive, matrix, name, f"meshes[{node['mesh']}].primitives[{k}]")
+            for primitive_index, primitive in enumerate(mesh["primitives"]):
+                self.primitive(primitive, matrix, name, f"meshes[{node['mesh']}].primitives[{primitive_index}]")
         for child in node.get("children", []):
             self.node(child, matrix, (*above, index))
 
@@ -139,12 +145,12 @@ class _Reader:
         if not len(points) == len(uv) == len(normals):
             raise self.fail(f"{where}: attributes have different lengths")
         if "indices" in data:
-            index = self.accessor(data["indices"], "SCALAR", where)[:, 0].astype(np.int64)
+            indices = self.accessor(data["indices"], "SCALAR", where)[:, 0].astype(np.int64)
         else:
-            index = np.arange(len(points))
-        if len(index) and (index.min() < 0 or index.max() >= len(points)):
-            raise self.fail(f"{where}: index {int(index.max())} is out of range (there are {len(points)} vertices)")
-        faces = _triangles(index, mode)
+            indices = np.arange(len(points))
+        if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
+            raise self.fail(f"{where}: index {int(indices.max())} is out of range (there are {len(points)} vertices)")
+        faces = _triangles(indices, mode)
         self.faces += len(faces)
         if self.faces > MAX_FACES:
             raise self.fail(f"more than {MAX_FACES} triangles; simplify the mesh")
@@ -152,56 +158,59 @@ class _Reader:
         determinant = float(np.linalg.det(linear))
         if abs(determinant) < 1e-18:
             raise self.fail(f"{where}: its node has a singular matrix")
+        # A mirroring node turns its faces inside out.
         if determinant < 0.0:
             faces = faces[:, ::-1]
-        placed = points @ linear.T + matrix[:3, 3]
-        turned = normals @ np.linalg.inv(linear)
-        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
-        look = len(self.triangles.materials) - 1
+        positions = points @ linear.T + matrix[:3, 3]
+        face_normals = normals @ np.linalg.inv(linear)
+        face_normals /= np.maximum(np.linalg.norm(face_normals, axis=1, keepdims=True), 1e-12)
+        material_index = len(self.triangles.materials) - 1
         if "material" in data:
             self.item("materials", data["material"])
-            look = data["material"]
+            material_index = data["material"]
         if name not in self.triangles.groups:
             self.triangles.groups.append(name)
         group = self.triangles.groups.index(name)
-        self.triangles.add(placed[faces], uv[faces], turned[faces], material=look, group=group)
+        self.triangles.add(positions[faces], uv[faces], face_normals[faces], material=material_index, group=group)
 
     def accessor(self, index: int, kind: str, where: str) -> F64:
         """Values [n, width] of an accessor as float64."""
-        data = self.item("accessors", index)
+        description = self.item("accessors", index)
         label = f"accessors[{index}]"
-        if "sparse" in data or "bufferView" not in data:
+        if "sparse" in description or "bufferView" not in description:
             raise self.fail(f"{label}: sparse accessors are not read; export without them")
-        if data.get("type") != kind or data.get("componentType") not in _TYPES:
+        if description.get("type") != kind or description.get("componentType") not in _TYPES:
             raise self.fail(
-                f"{label}: type {data.get('type')} of {data.get('componentType')} where {kind} is needed ({where})"
+                f"{label}: type {description.get('type')} of {description.get('componentType')} "
+                f"where {kind} is needed ({where})"
             )
-        count, width = int(data["count"]), _WIDTHS[kind]
+        count, width = int(description["count"]), _WIDTHS[kind]
         if not 0 <= count <= 3 * MAX_VERTICES:
             raise self.fail(f"{label}: {count} entries; simplify the mesh")
-        dtype = np.dtype(_TYPES[data["componentType"]])
-        view = self.item("bufferViews", data["bufferView"])
-        buffer = self.buffer(view["buffer"])
-        start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
-        step = int(view.get("byteStride", 0)) or dtype.itemsize * width
-        offset = int(data.get("byteOffset", 0))
-        last = offset + (count - 1) * step + dtype.itemsize * width if count else 0
-        if min(start, size, offset) < 0 or step < dtype.itemsize * width or start + size > len(buffer) or last > size:
+        dtype = np.dtype(_TYPES[description["componentType"]])
+        buffer_view = self.item("bufferViews", description["bufferView"])
+        buffer = self.buffer(buffer_view["buffer"])
+        start, size = int(buffer_view.get("byteOffset", 0)), int(buffer_view["byteLength"])
+        stride = int(buffer_view.get("byteStride", 0)) or dtype.itemsize * width
+        offset = int(description.get("byteOffset", 0))
+        # Offsets and counts come from the file: check them before any view into the buffer is made.
+        end = offset + (count - 1) * stride + dtype.itemsize * width if count else 0
+        if min(start, size, offset) < 0 or stride < dtype.itemsize * width or start + size > len(buffer) or end > size:
             raise self.fail(f"{label}: reaches past the end of its buffer ({len(buffer)} bytes): the file is cut short")
         if not count:
             return np.zeros((0, width))
-        flat = np.frombuffer(buffer, np.uint8, count=last, offset=start)[offset:]
-        rows = np.lib.stride_tricks.as_strided(flat, (count, dtype.itemsize * width), (step, 1))
+        raw_bytes = np.frombuffer(buffer, np.uint8, count=end, offset=start)[offset:]
+        rows = np.lib.stride_tricks.as_strided(raw_bytes, (count, dtype.itemsize * width), (stride, 1))
         values = np.ascontiguousarray(rows).view(dtype).astype(np.float64)
-        if data.get("normalized") and dtype.kind in "iu":
+        if description.get("normalized") and dtype.kind in "iu":
             values = np.maximum(values / np.iinfo(dtype).max, -1.0)
         return np.asarray(values)
 
     def buffer(self, index: int) -> bytes:
         if index in self.buffers:
             return self.buffers[index]
-        data = self.item("buffers", index)
-        uri = data.get("uri")
+        description = self.item("buffers", index)
+        uri = description.get("uri")
         if uri is None:
             if self.chunk is None or index != 0:
                 raise self.fail(f"buffers[{index}] has no data")
@@ -213,32 +222,35 @@ class _Reader:
                 raise self.fail(f"buffers[{index}]: the data URI is not base64") from None
         else:
             content = safeio.read_bytes(beside(self.file, unquote(uri)), limit=MAX_BYTES)
-        if len(content) < int(data["byteLength"]):
-            raise self.fail(f"buffers[{index}] is cut short: {len(content)} of {data['byteLength']} bytes")
+        if len(content) < int(description["byteLength"]):
+            raise self.fail(f"buffers[{index}] is cut short: {len(content)} of {description['byteLength']} bytes")
         self.buffers[index] = content
         return content
 
     def material(self, data: dict[str, Any], index: int) -> Material:
         """Base colour (linear), metal share as specular share, roughness as lack of gloss."""
-        rough = data.get("pbrMetallicRoughness", {})
-        colour = [float(v) for v in rough.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])][:3]
-        glow = [float(v) for v in data.get("emissiveFactor", [0.0, 0.0, 0.0])]
-        metal, roughness = float(rough.get("metallicFactor", 1.0)), float(rough.get("roughnessFactor", 1.0))
-        values = np.array([*colour, *glow, metal, roughness])
+        metallic_roughness = data.get("pbrMetallicRoughness", {})
+        colour = [float(value) for value in metallic_roughness.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])][:3]
+        emissive = [float(value) for value in data.get("emissiveFactor", [0.0, 0.0, 0.0])]
+        metallic, roughness = (
+            float(metallic_roughness.get("metallicFactor", 1.0)),
+            float(metallic_roughness.get("roughnessFactor", 1.0)),
+        )
+        values = np.array([*colour, *emissive, metallic, roughness])
         if len(colour) != 3 or not np.isfinite(values).all():
             raise self.fail(f"materials[{index}]: a colour is not three finite numbers")
-        r, g, b = (float(np.clip(v, 0.0, 1.0)) for v in colour)
-        share = 0.04 + 0.46 * float(np.clip(metal, 0.0, 1.0)) if "metallicFactor" in rough else 0.04
+        red, green, blue = (float(np.clip(value, 0.0, 1.0)) for value in colour)
+        specular = 0.04 + 0.46 * float(np.clip(metallic, 0.0, 1.0)) if "metallicFactor" in metallic_roughness else 0.04
         gloss = 1.0 - float(np.clip(roughness, 0.0, 1.0))
         name = str(data.get("name") or f"material {index}")[:80]
-        return Material(name, (r, g, b), specular=share, gloss=gloss, emission=max(0.0, *glow))
+        return Material(name, (red, green, blue), specular=specular, gloss=gloss, emission=max(0.0, *emissive))
 
 
 def _local(node: dict[str, Any]) -> F64:
-    """Matrix [4, 4] of a node: given as a whole (column by column), or as translation, rotation and scale."""
+    """Return the matrix [4, 4] of a node, from its matrix (column by column) or translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = (float(v) for v in node.get("rotation", (0.0, 0.0, 0.0, 1.0)))
+    x, y, z, w = (float(component) for component in node.get("rotation", (0.0, 0.0, 0.0, 1.0)))
     matrix = pose_matrix(np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3), (w, x, y, z))
     matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
     return matrix
@@ -249,8 +261,9 @@ def _triangles(index: npt.NDArray[np.int64], mode: int) -> npt.NDArray[np.int64]
     if mode == 4:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
     count = max(len(index) - 2, 0)
-    k = np.arange(count)
+    first = np.arange(count)
     if mode == 6:
-        return np.stack([index[np.zeros(count, np.int64)], index[k + 1], index[k + 2]], 1)
-    odd = k % 2
-    return np.stack([index[k], index[k + 1 + odd], index[k + 2 - odd]], 1)
+        return np.stack([index[np.zeros(count, np.int64)], index[first + 1], index[first + 2]], 1)
+    # Every second triangle of a strip has the opposite winding.
+    parity = first % 2
+    return np.stack([index[first], index[first + 1 + parity], index[first + 2 - parity]], 1)

@@ -15,7 +15,7 @@ from ssad.rendering.meshes.mesh import F64, Material, triangulate
 
 
 class _Obj:
-    """The state of an OBJ reader: tables so far, current material and group."""
+    """State of the OBJ reader: tables so far, current material and group."""
 
     def __init__(self, file: Path) -> None:
         self.file, self.line = file, 0
@@ -35,7 +35,7 @@ class _Obj:
 
     def numbers(self, words: Sequence[str], count: int) -> tuple[float, ...]:
         try:
-            values = tuple(float(w) for w in words[:count])
+            values = tuple(float(word) for word in words[:count])
         except ValueError:
             raise self.fail(f"'{' '.join(words)[:40]}' is not a list of numbers") from None
         if len(values) < count:
@@ -46,57 +46,68 @@ class _Obj:
 
     def corner(self, word: str) -> tuple[int, int, int]:
         parts = [*word.split("/"), "", ""][:3]
-        found = []
-        for text, table, what in zip(parts, (self.v, self.vt, self.vn), ("vertex", "texture", "normal"), strict=True):
-            if not text:
-                found.append(-1)
+        indices = []
+        for token, table, label in zip(parts, (self.v, self.vt, self.vn), ("vertex", "texture", "normal"), strict=True):
+            if not token:
+                indices.append(-1)
                 continue
             try:
-                index = int(text)
+                index = int(token)
             except ValueError:
                 raise self.fail(f"'{word[:40]}' is not a corner of a face") from None
+            # OBJ indices count from 1; negative ones count back from the latest entry.
             index = index - 1 if index > 0 else len(table) + index
             if index == -1 or not 0 <= index < len(table):
-                raise self.fail(f"{what} index {text} is out of range (there are {len(table)})")
-            found.append(index)
-        if found[0] < 0:
+                raise self.fail(f"{label} index {token} is out of range (there are {len(table)})")
+            indices.append(index)
+        if indices[0] < 0:
             raise self.fail("a corner of a face names no vertex")
-        if found[1] < 0:
+        if indices[1] < 0:
             raise self.fail("a face has no texture coordinates (UVs); unwrap the mesh before the export")
-        return found[0], found[1], found[2]
+        return indices[0], indices[1], indices[2]
 
     def face(self, words: Sequence[str]) -> None:
         if len(words) < 3:
             raise self.fail("a face needs three corners")
         if len(words) > 1000:
             raise self.fail(f"a face with {len(words)} corners; triangulate the mesh")
-        corners = [self.corner(w) for w in words]
-        triangles = [(0, 1, 2)] if len(corners) == 3 else self.split(np.array([self.v[c[0]] for c in corners]))
+        corners = [self.corner(word) for word in words]
+        triangles = (
+            [(0, 1, 2)]
+            if len(corners) == 3
+            else self.split(np.array([self.v[corner_triple[0]] for corner_triple in corners]))
+        )
         if len(self.look) + len(triangles) > MAX_FACES:
             raise self.fail(f"more than {MAX_FACES} triangles; simplify the mesh")
-        look = self.order.setdefault(self.material, len(self.order))
-        panel = self.groups.setdefault(self.group, len(self.groups))
+        material_index = self.order.setdefault(self.material, len(self.order))
+        group_index = self.groups.setdefault(self.group, len(self.groups))
         for triangle in triangles:
-            self.corners += [corners[i] for i in triangle]
-            self.look.append(look)
-            self.panel.append(panel)
+            self.corners += [corners[corner_index] for corner_index in triangle]
+            self.look.append(material_index)
+            self.panel.append(group_index)
 
     def split(self, p: F64) -> list[tuple[int, int, int]]:
         """Triangles of a plane polygon [P, 3]."""
         normal = np.cross(p - p[0], np.roll(p, -1, axis=0) - p[0]).sum(axis=0)
-        drop = int(np.argmax(np.abs(normal)))
-        flat = np.delete(p, drop, axis=1)
+        # Dropping the axis of the largest normal component keeps the projection from degenerating.
+        dropped_axis = int(np.argmax(np.abs(normal)))
+        projected = np.delete(p, dropped_axis, axis=1)
         try:
-            faces = [(int(a), int(b), int(c)) for a, b, c in triangulate(flat)]
+            faces = [(int(first), int(second), int(third)) for first, second, third in triangulate(projected)]
         except ConfigError:
-            faces = [(0, k, k + 1) for k in range(1, len(p) - 1)]
-        a, b, c = p[[f[0] for f in faces]], p[[f[1] for f in faces]], p[[f[2] for f in faces]]
-        turned = float(np.cross(b - a, c - a).sum(axis=0) @ normal) < 0.0
-        return [f[::-1] for f in faces] if turned else faces
+            faces = [(0, index, index + 1) for index in range(1, len(p) - 1)]
+        first, second, third = (
+            p[[face[0] for face in faces]],
+            p[[face[1] for face in faces]],
+            p[[face[2] for face in faces]],
+        )
+        # The projection may mirror the polygon: restore the winding of the file.
+        is_reversed = float(np.cross(second - first, third - first).sum(axis=0) @ normal) < 0.0
+        return [face[::-1] for face in faces] if is_reversed else faces
 
 
 def read_obj(file: Path) -> FaceList:
-    """Triangles of an OBJ file with the materials of its MTL files, in the frame of the file.
+    """Read the triangles of an OBJ file and the materials of its MTL files, in the frame of the file.
 
     Raises:
         FormatError: A file is broken.
@@ -104,25 +115,25 @@ def read_obj(file: Path) -> FaceList:
     text = safeio.read_text(file, limit=MAX_BYTES).replace("\\\n", " ").replace("\\\r\n", " ")
     state = _Obj(file)
     tables = {"v": (state.v, 3), "vt": (state.vt, 2), "vn": (state.vn, 3)}
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if not words:
+    for line_number, line in enumerate(text.splitlines(), start=1):
+        tokens = line.split("#", 1)[0].split()
+        if not tokens:
             continue
-        state.line = number
-        key, rest = words[0], words[1:]
+        state.line = line_number
+        key, arguments = tokens[0], tokens[1:]
         if key in tables:
-            table, count = tables[key]
-            if len(table) >= MAX_VERTICES:
+            entries, count = tables[key]
+            if len(entries) >= MAX_VERTICES:
                 raise state.fail(f"more than {MAX_VERTICES} entries '{key}'; simplify the mesh")
-            table.append(state.numbers(rest, count))
+            entries.append(state.numbers(arguments, count))
         elif key == "f":
-            state.face(rest)
+            state.face(arguments)
         elif key in ("g", "o"):
-            state.group = " ".join(rest) or "default"
+            state.group = " ".join(arguments) or "default"
         elif key == "usemtl":
-            state.material = " ".join(rest) or "default"
+            state.material = " ".join(arguments) or "default"
         elif key == "mtllib":
-            state.materials.update(_read_mtl(beside(file, " ".join(rest))))
+            state.materials.update(_read_mtl(beside(file, " ".join(arguments))))
     if not state.corners:
         raise FormatError(f"{file}: the file has no faces")
     index = np.array(state.corners).reshape(-1, 3, 3)
@@ -134,8 +145,12 @@ def read_obj(file: Path) -> FaceList:
 
 
 def _read_mtl(file: Path) -> dict[str, Material]:
-    """Materials of an MTL file: diffuse colour as albedo, mean of the specular colour, exponent as gloss."""
-    found: dict[str, Material] = {}
+    """Read the materials of an MTL file.
+
+    The diffuse colour becomes the albedo, the mean of the specular colour the specular share, and the exponent
+    the gloss.
+    """
+    materials: dict[str, Material] = {}
     name = ""
     for number, line in enumerate(safeio.read_text(file, limit=16 * safeio.MIB).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
@@ -143,21 +158,21 @@ def _read_mtl(file: Path) -> dict[str, Material]:
             continue
         if words[0] == "newmtl":
             name = " ".join(words[1:]) or "default"
-            found[name] = replace(DEFAULT, name=name)
+            materials[name] = replace(DEFAULT, name=name)
         elif words[0] in ("Kd", "Ks", "Ke", "Ns") and name:
             try:
-                values = np.clip([float(w) for w in words[1:4]], 0.0, 1000.0)
+                values = np.clip([float(word) for word in words[1:4]], 0.0, 1000.0)
             except ValueError:
                 raise FormatError(f"{file}:{number}: '{line.strip()[:40]}' is not a colour") from None
             if not len(values) or not np.isfinite(values).all():
                 raise FormatError(f"{file}:{number}: '{line.strip()[:40]}' is not a colour")
-            r, g, b = (float(v) for v in np.minimum(np.resize(values, 3), 1.0))
+            red, green, blue = (float(component) for component in np.minimum(np.resize(values, 3), 1.0))
             if words[0] == "Kd":
-                found[name] = replace(found[name], colour=(r, g, b))
+                materials[name] = replace(materials[name], colour=(red, green, blue))
             elif words[0] == "Ks":
-                found[name] = replace(found[name], specular=min(0.5, (r + g + b) / 3.0))
+                materials[name] = replace(materials[name], specular=min(0.5, (red + green + blue) / 3.0))
             elif words[0] == "Ke":
-                found[name] = replace(found[name], emission=max(r, g, b))
+                materials[name] = replace(materials[name], emission=max(red, green, blue))
             else:
-                found[name] = replace(found[name], gloss=float(np.sqrt(min(values[0], 1000.0) / 1000.0)))
-    return found
+                materials[name] = replace(materials[name], gloss=float(np.sqrt(min(values[0], 1000.0) / 1000.0)))
+    return materials

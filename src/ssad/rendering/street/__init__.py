@@ -1,4 +1,4 @@
-"""Streets: the static geometry of a town, from its lane graph to triangles, materials and masts."""
+"""Streets: the static geometry of a town, built from its lane graph as triangles, materials and masts."""
 
 from ssad.rendering.street.build import build_street, cached_street
 from ssad.rendering.street.model import Street, load_street, save_street

@@ -1,4 +1,4 @@
-"""From the lane graph of a town to its street: all parts in order, deterministic for town, seed and style."""
+"""Construction of the street of a town from its lane graph, deterministic for town, seed and style."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from ssad.rendering.street.region import survey
 from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tiles
 from ssad.world.roads.library import load_town
 
-REVISION = 3  # of what is built: a cached street of another revision is not used
+REVISION = 3  # of the construction: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
-    """The static geometry of a town; equal arguments give equal bytes.
+    """Build the static geometry of a town; equal arguments give equal bytes.
 
     Args:
         town: A lane graph, or the name of a town.
-        seed: Draws facades, colours and plants.
+        seed: Seed of facades, colours and plants.
         style: One of STYLES; None: that of the town.
 
     Raises:
@@ -40,28 +40,29 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     """
     graph = load_town(town) if isinstance(town, str) else town
     name = style_of(graph.name, style)
-    look = Look(STYLES[name], Palette(), generator("street", graph.name, seed, name))
-    soup, ground = TriangleBuilder(), survey(graph)
-    site, masts, along = FreeGround(graph, ground), Masts(), sides(graph)
-    pave(soup, graph, ground, look)
-    paint(soup, graph, look)
-    signals(soup, graph, site, look, masts)
-    light_streets(soup, site, look, along, masts)
-    plots = line_streets(soup, site, look, along)
-    fill_blocks(soup, site, look, tries=int(ground.paved.size / 700))
-    furnish(soup, site, look, along)
-    plant(soup, site, look, plots.parks)
-    piece = join(soup.pieces)
-    origin, nx, ny, order, offset = tiles(np.concatenate(soup.owner), piece.levels)
+    materials = Look(STYLES[name], Palette(), generator("street", graph.name, seed, name))
+    builder, ground = TriangleBuilder(), survey(graph)
+    free_ground, masts, street_sides = FreeGround(graph, ground), Masts(), sides(graph)
+    # The order matters: each step occupies free ground and draws from the same generator.
+    pave(builder, graph, ground, materials)
+    paint(builder, graph, materials)
+    signals(builder, graph, free_ground, materials, masts)
+    light_streets(builder, free_ground, materials, street_sides, masts)
+    plots = line_streets(builder, free_ground, materials, street_sides)
+    fill_blocks(builder, free_ground, materials, tries=int(ground.paved.size / 700))
+    furnish(builder, free_ground, materials, street_sides)
+    plant(builder, free_ground, materials, plots.parks)
+    geometry = join(builder.pieces)
+    origin, nx, ny, order, offset = tiles(np.concatenate(builder.owner), geometry.levels)
     return Street(
         name=graph.name,
         style=name,
-        vertices=_f32(piece.vertices, 3),
-        faces=np.ascontiguousarray(piece.faces, np.int32),
-        normals=np.ascontiguousarray(piece.normals, np.float32),
-        uv=np.ascontiguousarray(piece.uv, np.float32),
-        material=np.ascontiguousarray(piece.material, np.int32),
-        materials=tuple(look.palette.table),
+        vertices=_f32(geometry.vertices, 3),
+        faces=np.ascontiguousarray(geometry.faces, np.int32),
+        normals=np.ascontiguousarray(geometry.normals, np.float32),
+        uv=np.ascontiguousarray(geometry.uv, np.float32),
+        material=np.ascontiguousarray(geometry.material, np.int32),
+        materials=tuple(materials.palette.table),
         tile=TILE,
         origin=origin,
         nx=nx,
@@ -81,10 +82,13 @@ def _f32(rows: object, columns: int) -> F32:
 
 
 def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
-    """`build_street`, kept in $SSAD_HOME/cache/streets; where that cannot be written the street is built each time."""
+    """Return `build_street` from a cache in $SSAD_HOME/cache/streets.
+
+    If the cache cannot be written, the street is built each time.
+    """
     graph = load_town(town) if isinstance(town, str) else town
     name = style_of(graph.name, style)
-    what = hashlib.sha256(f"{FORMAT} {REVISION} {graph.name} {seed} {name}".encode())
+    digest = hashlib.sha256(f"{FORMAT} {REVISION} {graph.name} {seed} {name}".encode())
     for key in (
         "xy",
         "width",
@@ -106,10 +110,10 @@ def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = N
         "rule_sign",
         "rule_lane",
     ):
-        what.update(getattr(graph, key).tobytes())
-    path = home() / "cache" / "streets" / f"{what.hexdigest()[:24]}.npz"
+        digest.update(getattr(graph, key).tobytes())
+    path = home() / "cache" / "streets" / f"{digest.hexdigest()[:24]}.npz"
     if path.exists():
-        with contextlib.suppress(FormatError):  # broken: built again below
+        with contextlib.suppress(FormatError):  # a broken file is built again below
             return load_street(path)
     street = build_street(graph, seed=seed, style=name)
     with contextlib.suppress(StoreError):

@@ -1,4 +1,4 @@
-"""Kinds of buildings, drawn by a generator. Frame: x along the front about its middle, y inwards from 0, z up."""
+"""Building kinds with random details. Frame: x along the front about its middle, y inwards from 0, z up."""
 
 from __future__ import annotations
 
@@ -58,54 +58,62 @@ def _dormers(count: int, width: float, y: float, z: float, look: Look, *, wall: 
     """Windows that stand out of the front of a roof."""
     parts: list[Piece] = []
     for x in rows(width, count, 1.5).tolist():
-        left = x - width / 2
-        spans = (left, left + 1.5), (y, y + 2.4), (z, z + 1.5)
-        parts.append(block(*spans, wall))
-        parts += gable(spans[0], spans[1], z + 1.5, 0.6, roof=roof, wall=wall, across=True, eaves=0.15)
-        at = np.array([0.3]), np.array([0.35])
-        parts += panes(walls(*spans)[0], *at, (0.9, 0.95), look, frame=look.frame[0], sill=False)
+        left_edge = x - width / 2
+        extent = (left_edge, left_edge + 1.5), (y, y + 2.4), (z, z + 1.5)
+        parts.append(block(*extent, wall))
+        parts += gable(extent[0], extent[1], z + 1.5, 0.6, roof=roof, wall=wall, across=True, eaves=0.15)
+        window_corner = np.array([0.3]), np.array([0.35])
+        parts += panes(walls(*extent)[0], *window_corner, (0.9, 0.95), look, frame=look.frame[0], sill=False)
     return parts
 
 
 def _terrace(size: Size, look: Look, *, shop: bool = False) -> list[Piece]:
     """A house in a row: bare side walls, roof with its ridge along the street."""
-    rng, (w, d) = look.generator, size
+    rng, (width, depth) = look.generator, size
     storey, floors = rng.uniform(2.8, 3.3), int(rng.integers(2, 5 if look.style.old else 4))
-    ground = storey * 1.2 if shop else storey
-    h = ground + storey * (floors - 1)
-    x, y = (-w / 2, w / 2), (0.0, d)
+    ground_height = storey * 1.2 if shop else storey
+    eaves_height = ground_height + storey * (floors - 1)
+    x, y = (-width / 2, width / 2), (0.0, depth)
     material, roof, frame = _masonry(look), look.pick("roof_tiles"), int(rng.choice(look.frame))
-    rise = 0.5 * d * rng.uniform(0.65, 1.05)
-    turned = look.style.old and rng.random() < 0.25
-    parts = [block(x, y, (0.0, h), material)]
-    if turned:
-        rise = 0.5 * w * rng.uniform(1.0, 1.5)
-        parts += gable(x, y, h, rise, roof=roof, wall=material, across=True, eaves=0.12)
+    rise = 0.5 * depth * rng.uniform(0.65, 1.05)
+    gable_to_street = look.style.old and rng.random() < 0.25
+    parts = [block(x, y, (0.0, eaves_height), material)]
+    if gable_to_street:
+        rise = 0.5 * width * rng.uniform(1.0, 1.5)
+        parts += gable(x, y, eaves_height, rise, roof=roof, wall=material, across=True, eaves=0.12)
     else:
-        parts += gable(x, y, h, rise, roof=roof, wall=material, eaves=0.3)
-    front, _, back, _ = walls(x, y, (0.0, h))
-    window = (rng.uniform(0.85, 1.15), rng.uniform(1.3, 1.7))
-    bay = rng.uniform(1.7, 2.3)
-    at = float(rng.uniform(1.0, min(2.0, w - 1.0)))
+        parts += gable(x, y, eaves_height, rise, roof=roof, wall=material, eaves=0.3)
+    front, _, back, _ = walls(x, y, (0.0, eaves_height))
+    window_size = (rng.uniform(0.85, 1.15), rng.uniform(1.3, 1.7))
+    bay_width = rng.uniform(1.7, 2.3)
+    door_centre = float(rng.uniform(1.0, min(2.0, width - 1.0)))
     if shop:
-        parts += _shop_front(w, ground, front, look)
-        parts += grid(front, floors - 1, storey, look, size=window, bay=bay, frame=frame, ground=ground)
+        parts += _shop_front(width, ground_height, front, look)
+        parts += grid(
+            front, floors - 1, storey, look, size=window_size, bay=bay_width, frame=frame, ground=ground_height
+        )
     else:
-        parts += door(front, at, look)
-        parts += grid(front, floors, storey, look, size=window, bay=bay, frame=frame, skip=np.array([at]))
-    parts += grid(back, floors, storey, look, size=window, bay=2.4, frame=frame, sill=False)
+        parts += door(front, door_centre, look)
+        parts += grid(
+            front, floors, storey, look, size=window_size, bay=bay_width, frame=frame, skip=np.array([door_centre])
+        )
+    parts += grid(back, floors, storey, look, size=window_size, bay=2.4, frame=frame, sill=False)
     if rng.random() < 0.6:  # bands between the storeys
-        level = ground + storey * np.arange(floors - 1)
-        parts.append(flat(front.quads(0.0, level - 0.1, w, 0.2, 0.05), look.stone[0], levels=VISIBLE))
+        band_heights = ground_height + storey * np.arange(floors - 1)
+        parts.append(flat(front.quads(0.0, band_heights - 0.1, width, 0.2, 0.05), look.stone[0], levels=VISIBLE))
     if rng.random() < 0.5 and not shop:
         plinth = look.palette.shade(material, 0.6, "plinth")
-        parts.append(flat(front.quads(0.0, 0.0, w, 0.5, 0.03), plinth, levels=VISIBLE))
-    if not turned:
-        parts.append(_chimney(x[0] + 0.5, d / 2, h + rise, look))
+        parts.append(flat(front.quads(0.0, 0.0, width, 0.5, 0.03), plinth, levels=VISIBLE))
+    if not gable_to_street:
+        parts.append(_chimney(x[0] + 0.5, depth / 2, eaves_height + rise, look))
         if rng.random() < 0.4 and rise > 2.6:
-            parts += _dormers(int(w // 3), w, 0.18 * d, h + 0.1 * rise, look, wall=material, roof=roof)
+            parts += _dormers(
+                int(width // 3), width, 0.18 * depth, eaves_height + 0.1 * rise, look, wall=material, roof=roof
+            )
     elif rise > 2.5:
-        parts += panes(front, np.array([w / 2 - 0.4]), np.array([h + 0.5]), (0.8, 1.0), look, frame=frame)
+        parts += panes(
+            front, np.array([width / 2 - 0.4]), np.array([eaves_height + 0.5]), (0.8, 1.0), look, frame=frame
+        )
     return parts
 
 
@@ -117,72 +125,83 @@ def _shop_front(w: float, ground: float, front: Wall, look: Look) -> list[Piece]
     """Large windows, a door, a sign board and an awning on the ground floor."""
     rng = look.generator
     trim = look.pick("door")
-    at = float(rng.choice([0.9, w - 0.9, w / 2]))
+    door_centre = float(rng.choice([0.9, w - 0.9, w / 2]))
     parts = [flat(front.quads(0.15, 0.0, w - 0.3, ground - 0.35, 0.03), trim, levels=VISIBLE)]
-    edges = sorted({0.4, at - 0.65, at + 0.65, w - 0.4})
-    for a, b in pairwise(edges):
-        if b - a > 0.6 and not (a < at < b):
+    edges = sorted({0.4, door_centre - 0.65, door_centre + 0.65, w - 0.4})
+    for start, end in pairwise(edges):
+        if end - start > 0.6 and not (start < door_centre < end):
             glass = int(rng.choice(look.shop))
-            parts.append(flat(front.quads(a + 0.08, 0.55, b - a - 0.16, ground - 1.5, 0.05), glass, levels=VISIBLE))
-    parts.append(flat(front.quads(at - 0.5, 0.05, 1.0, 2.2, 0.05), look.shop[0], levels=VISIBLE))
+            parts.append(
+                flat(front.quads(start + 0.08, 0.55, end - start - 0.16, ground - 1.5, 0.05), glass, levels=VISIBLE)
+            )
+    parts.append(flat(front.quads(door_centre - 0.5, 0.05, 1.0, 2.2, 0.05), look.shop[0], levels=VISIBLE))
     colour = look.pick("awning")
-    low, high = (front.quads(0.2, ground - 0.85, w - 0.4, 0.55, away) for away in (0.12, 0.0))
-    parts.append(flat(low, colour, levels=VISIBLE))
-    parts.append(flat(np.stack([low[:, 3], low[:, 2], high[:, 2], high[:, 3]], axis=1), colour, levels=NEAR))
+    board, board_back = (front.quads(0.2, ground - 0.85, w - 0.4, 0.55, away) for away in (0.12, 0.0))
+    parts.append(flat(board, colour, levels=VISIBLE))
+    parts.append(
+        flat(np.stack([board[:, 3], board[:, 2], board_back[:, 2], board_back[:, 3]], axis=1), colour, levels=NEAR)
+    )
     parts.append(flat(front.quads(w * 0.3, ground - 0.68, w * 0.4, 0.2, 0.14), look.sign["white"], levels=NEAR))
     if rng.random() < 0.45:
-        wall = front.quads(0.3, ground - 0.95, w - 0.6, 0.0, 0.02)
-        edge = front.quads(0.3, ground - 1.35, w - 0.6, 0.0, 1.1)
-        stripe = look.pick("awning")
-        top = np.stack([edge[:, 0], edge[:, 1], wall[:, 1], wall[:, 0]], axis=1)
-        parts += [flat(top, stripe, levels=VISIBLE), flat((top - [0, 0, 0.02])[:, ::-1], stripe, levels=VISIBLE)]
-        parts.append(flat(front.quads(0.3, ground - 1.55, w - 0.6, 0.2, 1.1), stripe, levels=NEAR))
+        awning_top = front.quads(0.3, ground - 0.95, w - 0.6, 0.0, 0.02)
+        awning_edge = front.quads(0.3, ground - 1.35, w - 0.6, 0.0, 1.1)
+        awning_material = look.pick("awning")
+        awning_faces = np.stack([awning_edge[:, 0], awning_edge[:, 1], awning_top[:, 1], awning_top[:, 0]], axis=1)
+        parts += [
+            flat(awning_faces, awning_material, levels=VISIBLE),
+            flat((awning_faces - [0, 0, 0.02])[:, ::-1], awning_material, levels=VISIBLE),
+        ]
+        parts.append(flat(front.quads(0.3, ground - 1.55, w - 0.6, 0.2, 1.1), awning_material, levels=NEAR))
     return parts
 
 
 def _house(size: Size, look: Look, *, floors: int = 2) -> list[Piece]:
     """A detached house: gable or hip roof, windows all round, often a lower wing with a garage."""
-    rng, (w, d) = look.generator, size
+    rng, (width, depth) = look.generator, size
     storey = rng.uniform(2.6, 2.9)
-    wing = float(rng.uniform(3.2, 4.2)) if w > 11.0 and rng.random() < 0.75 else 0.0
+    wing = float(rng.uniform(3.2, 4.2)) if width > 11.0 and rng.random() < 0.75 else 0.0
     side = 1.0 if rng.random() < 0.5 else -1.0
-    x = (-w / 2 + (wing if side < 0 else 0.0), w / 2 - (wing if side > 0 else 0.0))
-    y, h = (0.0, d), storey * floors
+    x = (-width / 2 + (wing if side < 0 else 0.0), width / 2 - (wing if side > 0 else 0.0))
+    y, eaves_height = (0.0, depth), storey * floors
     material = look.pick(str(rng.choice(["plaster", "brick", "boards", "boards"])))
     roof, frame = look.pick("roof_tiles"), int(rng.choice(look.frame))
     across = floors == 2 and rng.random() < 0.35
-    half = 0.5 * ((x[1] - x[0]) if across else d)
-    rise = half * rng.uniform(0.55, 0.95)
-    hip = half * rng.uniform(0.7, 1.0) if rng.random() < 0.35 and not across and x[1] - x[0] > d else 0.0
+    half_span = 0.5 * ((x[1] - x[0]) if across else depth)
+    rise = half_span * rng.uniform(0.55, 0.95)
+    hip = half_span * rng.uniform(0.7, 1.0) if rng.random() < 0.35 and not across and x[1] - x[0] > depth else 0.0
     parts = [
-        block(x, y, (0.0, h), material),
-        *gable(x, y, h, rise, roof=roof, wall=material, across=across, eaves=0.5, hip=hip),
+        block(x, y, (0.0, eaves_height), material),
+        *gable(x, y, eaves_height, rise, roof=roof, wall=material, across=across, eaves=0.5, hip=hip),
     ]
-    sides = walls(x, y, (0.0, h))
-    window = (rng.uniform(1.1, 1.6), rng.uniform(1.1, 1.35))
-    length = sides[0].length
-    at = float(rng.choice([0.5 * length, 0.28 * length]))
-    parts += door(sides[0], at, look, size=(1.0, 2.05))
-    parts += grid(sides[0], floors, storey, look, size=window, bay=2.7, frame=frame, skip=np.array([at]))
-    for wall, bay in ((sides[1], 3.6), (sides[2], 2.9), (sides[3], 3.6)):
-        parts += grid(wall, floors, storey, look, size=(window[0] * 0.85, window[1]), bay=bay, frame=frame)
+    sides = walls(x, y, (0.0, eaves_height))
+    window_size = (rng.uniform(1.1, 1.6), rng.uniform(1.1, 1.35))
+    front_length = sides[0].length
+    door_centre = float(rng.choice([0.5 * front_length, 0.28 * front_length]))
+    parts += door(sides[0], door_centre, look, size=(1.0, 2.05))
+    parts += grid(sides[0], floors, storey, look, size=window_size, bay=2.7, frame=frame, skip=np.array([door_centre]))
+    for wall, bay_width in ((sides[1], 3.6), (sides[2], 2.9), (sides[3], 3.6)):
+        parts += grid(
+            wall, floors, storey, look, size=(window_size[0] * 0.85, window_size[1]), bay=bay_width, frame=frame
+        )
     if across and rise > 2.0:
-        parts += panes(sides[0], np.array([length / 2 - 0.4]), np.array([h + 0.35]), (0.8, 0.9), look, frame=frame)
+        parts += panes(
+            sides[0], np.array([front_length / 2 - 0.4]), np.array([eaves_height + 0.35]), (0.8, 0.9), look, frame=frame
+        )
     # porch over the door
-    px = x[0] + at
+    porch_x = x[0] + door_centre
     if rng.random() < 0.6:
-        porch = (px - 1.0, px + 1.0), (-1.2, 0.1)
+        porch = (porch_x - 1.0, porch_x + 1.0), (-1.2, 0.1)
         parts += gable(*porch, 2.45, 0.6, roof=roof, wall=look.wood[1], across=True, eaves=0.12)
-        posts = np.array([[px - 0.9, -1.1, 0.0], [px + 0.8, -1.1, 0.0]])
+        posts = np.array([[porch_x - 0.9, -1.1, 0.0], [porch_x + 0.8, -1.1, 0.0]])
         parts.append(box(posts, posts + np.array([0.1, 0.1, 2.4]), look.wood[1], levels=VISIBLE))
-    stack = (x[0] + x[1]) / 2 if across else float(rng.uniform(x[0] + 1.0, x[1] - 1.0))
-    parts.append(_chimney(stack, d / 2, h + rise, look))
+    chimney_x = (x[0] + x[1]) / 2 if across else float(rng.uniform(x[0] + 1.0, x[1] - 1.0))
+    parts.append(_chimney(chimney_x, depth / 2, eaves_height + rise, look))
     if wing:
-        wx = (w / 2 - wing, w / 2) if side > 0 else (-w / 2, -w / 2 + wing)
-        wy = (1.2, min(d, 7.5))
-        parts.append(block(wx, wy, (0.0, 2.6), material))
-        parts += gable(wx, wy, 2.6, 1.2, roof=roof, wall=material, across=True, eaves=0.25)
-        parts += door(walls(wx, wy, (0.0, 2.6))[0], wing / 2, look, size=(2.5, 2.1))
+        wing_x = (width / 2 - wing, width / 2) if side > 0 else (-width / 2, -width / 2 + wing)
+        wing_y = (1.2, min(depth, 7.5))
+        parts.append(block(wing_x, wing_y, (0.0, 2.6), material))
+        parts += gable(wing_x, wing_y, 2.6, 1.2, roof=roof, wall=material, across=True, eaves=0.25)
+        parts += door(walls(wing_x, wing_y, (0.0, 2.6))[0], wing / 2, look, size=(2.5, 2.1))
     return parts
 
 
@@ -192,67 +211,79 @@ def _bungalow(size: Size, look: Look) -> list[Piece]:
 
 def _flats(size: Size, look: Look) -> list[Piece]:
     """A block of flats with balconies."""
-    rng, (w, d) = look.generator, size
+    rng, (width, depth) = look.generator, size
     storey, floors = 2.9, int(rng.integers(3, 7))
-    h = storey * floors
-    x, y = (-w / 2, w / 2), (0.0, d)
+    roof_height = storey * floors
+    x, y = (-width / 2, width / 2), (0.0, depth)
     material = look.pick(str(rng.choice(["plaster", "plaster", "brick", "cladding"])))
     frame = int(rng.choice(look.frame))
-    parts = [block(x, y, (0.0, h), material)]
-    sides = walls(x, y, (0.0, h))
-    window, bay = (rng.uniform(1.1, 1.7), rng.uniform(1.3, 1.6)), rng.uniform(2.6, 3.3)
-    parts += door(sides[0], w / 2, look, size=(1.6, 2.3))
-    parts += grid(sides[0], floors, storey, look, size=window, bay=bay, frame=frame, skip=np.array([w / 2]))
-    parts += grid(sides[2], floors, storey, look, size=window, bay=bay, frame=frame, sill=False)
-    for k in (1, 3):
-        parts += grid(sides[k], floors, storey, look, size=(0.9, window[1]), bay=4.5, frame=frame, sill=False)
-    count = int(w // bay)
-    if count > 2 and rng.random() < 0.75:
-        columns = rows(w, count, 2.4)[1 :: max(2, count // 3)]
-        columns = columns[(columns > 0.2) & (columns < w - 2.6)]
-        xx, zz = (v.reshape(-1) for v in np.meshgrid(columns, storey * np.arange(1, floors)))
+    parts = [block(x, y, (0.0, roof_height), material)]
+    sides = walls(x, y, (0.0, roof_height))
+    window_size, bay_width = (rng.uniform(1.1, 1.7), rng.uniform(1.3, 1.6)), rng.uniform(2.6, 3.3)
+    parts += door(sides[0], width / 2, look, size=(1.6, 2.3))
+    parts += grid(
+        sides[0], floors, storey, look, size=window_size, bay=bay_width, frame=frame, skip=np.array([width / 2])
+    )
+    parts += grid(sides[2], floors, storey, look, size=window_size, bay=bay_width, frame=frame, sill=False)
+    for side_index in (1, 3):
+        parts += grid(
+            sides[side_index], floors, storey, look, size=(0.9, window_size[1]), bay=4.5, frame=frame, sill=False
+        )
+    bay_count = int(width // bay_width)
+    if bay_count > 2 and rng.random() < 0.75:
+        columns = rows(width, bay_count, 2.4)[1 :: max(2, bay_count // 3)]
+        columns = columns[(columns > 0.2) & (columns < width - 2.6)]
+        xx, zz = (grid_values.reshape(-1) for grid_values in np.meshgrid(columns, storey * np.arange(1, floors)))
         parts += balcony(sides[0], xx, zz, 2.4, look, deep=min(1.2, 0.5 * max(0.8, look.style.setback[0] + 0.8)))
     if rng.random() < 0.55:
-        parts += flat_roof(x, y, h, look, coping=look.palette.shade(material, 0.8))
+        parts += flat_roof(x, y, roof_height, look, coping=look.palette.shade(material, 0.8))
     else:
-        parts += gable(x, y, h, 0.25 * d, roof=look.pick("roof_tiles"), wall=material, hip=0.3 * d)
+        parts += gable(x, y, roof_height, 0.25 * depth, roof=look.pick("roof_tiles"), wall=material, hip=0.3 * depth)
     plinth = look.palette.shade(material, 0.6, "plinth")
-    parts.append(flat(sides[0].quads(0.0, 0.0, w, 0.6, 0.03), plinth, levels=VISIBLE))
+    parts.append(flat(sides[0].quads(0.0, 0.0, width, 0.6, 0.03), plinth, levels=VISIBLE))
     return parts
 
 
 def _office(size: Size, look: Look, *, floors: int | None = None) -> list[Piece]:
     """Offices: bands of glass, a grid of windows or a curtain wall; a glazed ground floor; flat roof."""
-    rng, (w, d) = look.generator, size
-    storey, n = 3.6, floors or int(rng.integers(3, 8))
-    h = storey * n + 0.6
-    x, y = (-w / 2, w / 2), (0.0, d)
+    rng, (width, depth) = look.generator, size
+    storey, floor_count = 3.6, floors or int(rng.integers(3, 8))
+    roof_height = storey * floor_count + 0.6
+    x, y = (-width / 2, width / 2), (0.0, depth)
     material = look.pick(str(rng.choice(["cladding", "cladding", "plaster", "brick"])))
-    parts = [block(x, y, (0.0, h), material)]
-    sides, manner = walls(x, y, (0.0, h)), str(rng.choice(["bands", "grid", "curtain"]))
+    parts = [block(x, y, (0.0, roof_height), material)]
+    sides, facade_style = walls(x, y, (0.0, roof_height)), str(rng.choice(["bands", "grid", "curtain"]))
     glass, frame = int(rng.choice(look.glass)), int(rng.choice(look.frame[1:]))
-    for k, wall in enumerate(sides):
-        level = storey * np.arange(1, n) + 0.9
-        if manner == "grid":
-            parts += grid(wall, n, storey, look, size=(1.5, 1.9), bay=2.4, frame=frame, first=1, sill=False)
+    for side_index, wall in enumerate(sides):
+        sills = storey * np.arange(1, floor_count) + 0.9
+        if facade_style == "grid":
+            parts += grid(wall, floor_count, storey, look, size=(1.5, 1.9), bay=2.4, frame=frame, first=1, sill=False)
         else:
-            high = 1.9 if manner == "bands" else storey - 0.25
-            low = level if manner == "bands" else level - 0.75
-            parts.append(flat(wall.quads(0.4, low, wall.length - 0.8, high, 0.03), glass, levels=VISIBLE))
-            bay = 1.5 if manner == "curtain" else 3.0
-            bars = np.arange(0.4 + bay, wall.length - 0.5, bay)
-            xx, zz = (v.reshape(-1) for v in np.meshgrid(bars, low))
-            parts.append(flat(wall.quads(xx, zz, 0.08, high, 0.06), frame, levels=NEAR))
-        shop = int(rng.choice(look.shop))
-        if k in (0, 1, 3):
-            bays = np.arange(0.6, wall.length - 3.0, 3.2)
-            parts.append(flat(wall.quads(bays, 0.3, 2.7, 2.7, 0.04), shop, levels=VISIBLE))
-    parts.append(flat(sides[0].quads(w / 2 - 1.4, 0.0, 2.8, 2.7, 0.08), look.glass[0], levels=VISIBLE))
+            glass_height = 1.9 if facade_style == "bands" else storey - 0.25
+            glass_bottoms = sills if facade_style == "bands" else sills - 0.75
+            parts.append(
+                flat(wall.quads(0.4, glass_bottoms, wall.length - 0.8, glass_height, 0.03), glass, levels=VISIBLE)
+            )
+            bay_width = 1.5 if facade_style == "curtain" else 3.0
+            mullions = np.arange(0.4 + bay_width, wall.length - 0.5, bay_width)
+            xx, zz = (grid_values.reshape(-1) for grid_values in np.meshgrid(mullions, glass_bottoms))
+            parts.append(flat(wall.quads(xx, zz, 0.08, glass_height, 0.06), frame, levels=NEAR))
+        shop_material = int(rng.choice(look.shop))
+        if side_index in (0, 1, 3):
+            window_edges = np.arange(0.6, wall.length - 3.0, 3.2)
+            parts.append(flat(wall.quads(window_edges, 0.3, 2.7, 2.7, 0.04), shop_material, levels=VISIBLE))
+    parts.append(flat(sides[0].quads(width / 2 - 1.4, 0.0, 2.8, 2.7, 0.08), look.glass[0], levels=VISIBLE))
     parts.append(box((-2.0, -1.4, 2.9), (2.0, 0.0, 3.15), look.metal, levels=VISIBLE, base=True))
     if rng.random() < 0.7:
-        sign = look.pick("awning")
-        parts.append(flat(sides[0].quads(w * 0.1, h - 1.0, min(6.0, w * 0.3), 0.8, 0.1), sign, levels=VISIBLE))
-    return parts + flat_roof(x, y, h, look, coping=look.palette.shade(material, 0.8), plant=4)
+        sign_material = look.pick("awning")
+        parts.append(
+            flat(
+                sides[0].quads(width * 0.1, roof_height - 1.0, min(6.0, width * 0.3), 0.8, 0.1),
+                sign_material,
+                levels=VISIBLE,
+            )
+        )
+    return parts + flat_roof(x, y, roof_height, look, coping=look.palette.shade(material, 0.8), plant=4)
 
 
 def _tower(size: Size, look: Look) -> list[Piece]:
@@ -261,57 +292,76 @@ def _tower(size: Size, look: Look) -> list[Piece]:
 
 def _hall(size: Size, look: Look) -> list[Piece]:
     """A warehouse: metal sheet, roller doors, a strip of windows, a low roof."""
-    rng, (w, d) = look.generator, size
-    h = rng.uniform(5.5, 8.5)
-    x, y = (-w / 2, w / 2), (0.0, d)
+    rng, (width, depth) = look.generator, size
+    eaves_height = rng.uniform(5.5, 8.5)
+    x, y = (-width / 2, width / 2), (0.0, depth)
     material, frame = look.pick("sheet"), look.frame[2]
-    parts = [block(x, y, (0.0, h), material)]
-    parts += gable(x, y, h, 0.07 * d, roof=look.palette.shade(look.flat_roof, 1.8, "sheet"), wall=material, eaves=0.2)
-    sides = walls(x, y, (0.0, h))
-    count = int(rng.integers(1, 4))
-    at = rows(w, count, 4.0, margin=0.1 * w)
-    parts.append(flat(sides[0].quads(at, 0.0, 4.0, 4.2, 0.04), look.pick("cladding"), levels=VISIBLE))
-    grooves = sides[0].quads(np.repeat(at, 9), np.tile(0.4 + 0.42 * np.arange(9), count), 4.0, 0.03, 0.05)
+    parts = [block(x, y, (0.0, eaves_height), material)]
+    parts += gable(
+        x,
+        y,
+        eaves_height,
+        0.07 * depth,
+        roof=look.palette.shade(look.flat_roof, 1.8, "sheet"),
+        wall=material,
+        eaves=0.2,
+    )
+    sides = walls(x, y, (0.0, eaves_height))
+    opening_count = int(rng.integers(1, 4))
+    left_edges = rows(width, opening_count, 4.0, margin=0.1 * width)
+    parts.append(flat(sides[0].quads(left_edges, 0.0, 4.0, 4.2, 0.04), look.pick("cladding"), levels=VISIBLE))
+    grooves = sides[0].quads(
+        np.repeat(left_edges, 9), np.tile(0.4 + 0.42 * np.arange(9), opening_count), 4.0, 0.03, 0.05
+    )
     parts.append(flat(grooves, frame, levels=NEAR))
-    parts += door(sides[0], w - 1.5, look)
+    parts += door(sides[0], width - 1.5, look)
     for wall in sides:
-        count = max(1, int(wall.length // 6))
-        at = rows(wall.length, count, 2.6)
-        parts += panes(wall, at, np.full(count, h - 1.3), (2.6, 0.7), look, frame=frame, sill=False)
+        opening_count = max(1, int(wall.length // 6))
+        left_edges = rows(wall.length, opening_count, 2.6)
+        parts += panes(
+            wall, left_edges, np.full(opening_count, eaves_height - 1.3), (2.6, 0.7), look, frame=frame, sill=False
+        )
         parts.append(flat(wall.quads(0.0, 0.0, wall.length, 0.7, 0.02), look.stone[1], levels=VISIBLE))
-    sign = look.pick("awning")
-    parts.append(flat(sides[0].quads(0.35 * w, h - 2.6, 0.3 * w, 1.1, 0.08), sign, levels=VISIBLE))
+    sign_material = look.pick("awning")
+    parts.append(
+        flat(sides[0].quads(0.35 * width, eaves_height - 2.6, 0.3 * width, 1.1, 0.08), sign_material, levels=VISIBLE)
+    )
     return parts
 
 
 def _shed(size: Size, look: Look) -> list[Piece]:
     """A garden shed or garage."""
-    (w, d), h = size, look.generator.uniform(2.1, 2.7)
-    x, y = (-w / 2, w / 2), (0.0, d)
+    (width, depth), eaves_height = size, look.generator.uniform(2.1, 2.7)
+    x, y = (-width / 2, width / 2), (0.0, depth)
     material = int(look.generator.choice([*look.wood, look.pick("boards")]))
-    roof = gable(x, y, h, 0.8, roof=look.pick("roof_tiles"), wall=material, eaves=0.2)
-    parts = [block(x, y, (0.0, h), material), *roof]
-    return parts + door(walls(x, y, (0.0, h))[0], w / 2, look, size=(min(1.6, w - 0.8), 1.9))
+    roof = gable(x, y, eaves_height, 0.8, roof=look.pick("roof_tiles"), wall=material, eaves=0.2)
+    parts = [block(x, y, (0.0, eaves_height), material), *roof]
+    return parts + door(walls(x, y, (0.0, eaves_height))[0], width / 2, look, size=(min(1.6, width - 0.8), 1.9))
 
 
 def _chapel(size: Size, look: Look) -> list[Piece]:
     """A church: a nave with a steep roof and a tower with a spire at the front."""
-    (w, d), stone = size, int(look.generator.choice(look.stone))
-    x, y, h, roof = (-w / 2, w / 2), (4.0, d), 8.0, look.pick("roof_tiles")
-    parts = [block(x, y, (0.0, h), stone), *gable(x, y, h, 0.55 * w, roof=roof, wall=stone, across=True, eaves=0.3)]
-    tower, top = ((-2.6, 2.6), (0.0, 5.2)), float(look.generator.uniform(16.0, 20.0))
-    parts.append(block(*tower, (0.0, top), stone))
-    ring = np.array([[-2.9, -0.3], [2.9, -0.3], [2.9, 5.5], [-2.9, 5.5]])
-    for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        parts.append(flat(np.array([[[*a, top], [*b, top], [0.0, 2.6, top + 11.0]]]), roof))
-    for wall in walls(*tower, (0.0, top)):
-        at = np.array([2.0, 2.0]), np.array([7.0, top - 3.6])
-        parts += panes(wall, *at, (1.2, 2.4), look, frame=look.stone[0], blinds=0.0)
-    for wall in walls(x, y, (0.0, h))[1::2]:
+    (width, depth), stone = size, int(look.generator.choice(look.stone))
+    x, y, eaves_height, roof = (-width / 2, width / 2), (4.0, depth), 8.0, look.pick("roof_tiles")
+    parts = [
+        block(x, y, (0.0, eaves_height), stone),
+        *gable(x, y, eaves_height, 0.55 * width, roof=roof, wall=stone, across=True, eaves=0.3),
+    ]
+    tower, tower_height = ((-2.6, 2.6), (0.0, 5.2)), float(look.generator.uniform(16.0, 20.0))
+    parts.append(block(*tower, (0.0, tower_height), stone))
+    eaves_corners = np.array([[-2.9, -0.3], [2.9, -0.3], [2.9, 5.5], [-2.9, 5.5]])
+    for start, end in zip(eaves_corners, np.roll(eaves_corners, -1, axis=0), strict=True):
+        parts.append(
+            flat(np.array([[[*start, tower_height], [*end, tower_height], [0.0, 2.6, tower_height + 11.0]]]), roof)
+        )
+    for wall in walls(*tower, (0.0, tower_height)):
+        window_corners = np.array([2.0, 2.0]), np.array([7.0, tower_height - 3.6])
+        parts += panes(wall, *window_corners, (1.2, 2.4), look, frame=look.stone[0], blinds=0.0)
+    for wall in walls(x, y, (0.0, eaves_height))[1::2]:
         count = int(wall.length // 3.5)
-        at = rows(wall.length, count, 1.1), np.full(count, 2.2)
-        parts += panes(wall, *at, (1.1, 3.6), look, frame=look.stone[0], blinds=0.0)
-    return parts + door(walls(*tower, (0.0, top))[0], 2.6, look, size=(1.8, 2.9))
+        window_corners = rows(wall.length, count, 1.1), np.full(count, 2.2)
+        parts += panes(wall, *window_corners, (1.1, 3.6), look, frame=look.stone[0], blinds=0.0)
+    return parts + door(walls(*tower, (0.0, tower_height))[0], 2.6, look, size=(1.8, 2.9))
 
 
 KINDS: Mapping[str, Callable[[Size, Look], list[Piece]]] = {
@@ -326,7 +376,7 @@ KINDS: Mapping[str, Callable[[Size, Look], list[Piece]]] = {
     "shed": _shed,
     "chapel": _chapel,
 }
-SIZES: Mapping[str, tuple[Size, Size]] = {  # least and most (front, depth), m
+SIZES: Mapping[str, tuple[Size, Size]] = {  # smallest and largest (front, depth), m
     "terrace": ((5.2, 9.0), (8.5, 12.0)),
     "shop": ((6.0, 9.0), (10.0, 13.0)),
     "house": ((8.5, 7.5), (14.5, 10.0)),

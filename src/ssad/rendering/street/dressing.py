@@ -1,4 +1,4 @@
-"""What stands beside a road: lamps, signals, signs, street trees, benches and bins; and the green of open ground."""
+"""Objects beside a road: lamps, signals, signs, street trees, benches and bins; and the green of open ground."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BIN_ROOM = 0.45  # m between a kerb and the middle of a thing beside it
 
 @dataclass
 class Masts:
-    """Lamps (x, y, z, heading) and signal heads (the same; signal; first face and number of faces of each lens)."""
+    """Lamps (x, y, z, heading), and signal heads: pose, signal, first face and end of the faces of each lens."""
 
     lamps: list[tuple[float, float, float, float]] = field(default_factory=list)
     heads: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -30,24 +30,24 @@ class Masts:
 
 def light_streets(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Side], masts: Masts) -> None:
     """Lamps along one side of each street, by turns, at the kerb."""
-    piece, (reach, height) = lamp(look)
+    lamp_piece, (reach, height) = lamp(look)
     poses = []
-    for number, side in enumerate(sides):
+    for side_index, side in enumerate(sides):
         count = max(1, round(side.length / look.style.lamp))
-        shift = 0.25 if number % 2 else 0.75
-        for k in range(count):
-            x, y, yaw = side.pose((k + shift) * side.length / count, _kerb(side))
+        shift = 0.25 if side_index % 2 else 0.75
+        for lamp_index in range(count):
+            x, y, yaw = side.pose((lamp_index + shift) * side.length / count, _kerb(side))
             if not site.clear((x, y), crossing=0.8):
                 continue
             z = KERB if side.kerb else 0.0
             poses.append((x, y, z, yaw + np.pi / 2))
             masts.lamps.append((x - reach * np.sin(yaw), y + reach * np.cos(yaw), height + z, yaw + np.pi / 2))
             site.take([(x, y)])
-    soup.place(piece, poses)
+    soup.place(lamp_piece, poses)
 
 
 def _kerb(side: Side) -> float:
-    """Offset (m, outwards) of things beside the kerb; without a sidewalk, on the verge."""
+    """Return the offset (m, outwards) of objects beside the kerb; without a sidewalk, on the verge."""
     return BIN_ROOM - side.kerb if side.kerb else 0.9
 
 
@@ -57,40 +57,49 @@ def signals(soup: TriangleBuilder, graph: LaneGraph, site: FreeGround, look: Loo
     The stop and yield signs of the map are bodies of their own: only their ground is taken here.
     """
     for x, y in graph.sign_xy.astype(float).tolist():
-        site.take([(x + u, y + v) for u in (-CELL, 0.0, CELL) for v in (-CELL, 0.0, CELL)])
-    ruled = np.isin(graph.stop_lane, graph.rule_lane)
-    signed = set(graph.signal_junction[graph.stop_signal[ruled]].tolist())
-    posts = {reach: signal_mast(look, reach) for reach in (0.0, 4.2)}
-    lanes = np.bincount(graph.stop_signal, minlength=len(graph.signal_xy))
+        site.take([(x + dx, y + dy) for dx in (-CELL, 0.0, CELL) for dy in (-CELL, 0.0, CELL)])
+    has_sign = np.isin(graph.stop_lane, graph.rule_lane)
+    signed_junctions = set(graph.signal_junction[graph.stop_signal[has_sign]].tolist())
+    masts_by_reach = {reach: signal_mast(look, reach) for reach in (0.0, 4.2)}
+    lane_counts = np.bincount(graph.stop_signal, minlength=len(graph.signal_xy))
     give_way = sign("give_way", look)
-    for k, (x, y) in enumerate(graph.signal_xy.astype(float).tolist()):
-        yaw = float(graph.signal_yaw[k]) + np.pi
-        # a little further from the road where the map is too close to it
-        spot = _moved(site, (x, y), float(graph.signal_yaw[k]))
-        if spot is None:
+    for signal_index, (x, y) in enumerate(graph.signal_xy.astype(float).tolist()):
+        yaw = float(graph.signal_yaw[signal_index]) + np.pi
+        # Some signals of the map stand too close to the road: move them a little.
+        position = _moved(site, (x, y), float(graph.signal_yaw[signal_index]))
+        if position is None:
             continue
-        if graph.signal_virtual[k]:
-            # lower phases are the main road
-            if graph.signal_phase[k] > 0 and graph.signal_junction[k] not in signed:
-                soup.place(give_way, [(*spot, KERB, yaw)])
-                site.take([spot])
+        if graph.signal_virtual[signal_index]:
+            # The lower phases belong to the main road, which has no give-way sign.
+            if graph.signal_phase[signal_index] > 0 and graph.signal_junction[signal_index] not in signed_junctions:
+                soup.place(give_way, [(*position, KERB, yaw)])
+                site.take([position])
             continue
-        post = posts[4.2 if lanes[k] > 1 else 0.0]
-        first = soup.place(post.piece, [(*spot, KERB, yaw)])
-        site.take([spot])
-        for (side, up), lens in zip(post.heads, post.lens, strict=True):
-            c, s = np.cos(yaw), np.sin(yaw)
-            masts.heads.append((spot[0] + 0.25 * c - side * s, spot[1] + 0.25 * s + side * c, KERB + up, yaw))
-            masts.signal.append(k)
-            masts.lens.append([(first + at, first + at + post.sides) for at in lens])
+        mast = masts_by_reach[4.2 if lane_counts[signal_index] > 1 else 0.0]
+        first_face = soup.place(mast.piece, [(*position, KERB, yaw)])
+        site.take([position])
+        for (head_offset, head_height), first_faces in zip(mast.heads, mast.lens, strict=True):
+            cosine, sine = np.cos(yaw), np.sin(yaw)
+            masts.heads.append(
+                (
+                    position[0] + 0.25 * cosine - head_offset * sine,
+                    position[1] + 0.25 * sine + head_offset * cosine,
+                    KERB + head_height,
+                    yaw,
+                )
+            )
+            masts.signal.append(signal_index)
+            masts.lens.append(
+                [(first_face + lens_face, first_face + lens_face + mast.sides) for lens_face in first_faces]
+            )
 
 
 def _moved(site: FreeGround, xy: tuple[float, float], yaw: float) -> tuple[float, float] | None:
-    """The place, or the first one up to 2 m to the right of the traffic that is clear of lanes and crosswalks."""
-    for away in (0.0, 0.25, 0.5, 1.0, 1.5, 2.0):
-        for back in (0.0, 0.4, 0.8):
-            x = xy[0] + away * np.sin(yaw) + back * np.cos(yaw)
-            y = xy[1] - away * np.cos(yaw) + back * np.sin(yaw)
+    """Return the position, or the first one up to 2 m to the right of the traffic that is clear; None if none is."""
+    for outward in (0.0, 0.25, 0.5, 1.0, 1.5, 2.0):
+        for forward in (0.0, 0.4, 0.8):
+            x = xy[0] + outward * np.sin(yaw) + forward * np.cos(yaw)
+            y = xy[1] - outward * np.cos(yaw) + forward * np.sin(yaw)
             if site.clear((x, y), size=0.4, crossing=0.6):
                 return float(x), float(y)
     return None
@@ -101,31 +110,38 @@ def furnish(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Sid
     rng, style = look.generator, look.style
     stock = {"bench": bench(look), "bin": litter_bin(look), "bollard": bollard(look), "shelter": shelter(look)}
     stock |= {name: sign(name, look) for name in ("limit", "crossing", "parking")}
-    trough, plant = planter(look), bush(look)
-    trees = [tree(kind, look) for kind in ("round", "birch", "round")]
+    planter_piece, planter_bush = planter(look), bush(look)
+    trees = [tree(tree_piece, look) for tree_piece in ("round", "birch", "round")]
     for side in sides:
         z = KERB if side.kerb else 0.02
         if style.rows:
-            kind = trees[int(rng.integers(len(trees)))]
-            for k in range(int(side.length / style.rows)):
-                x, y, yaw = side.pose((k + 0.5) * style.rows + float(rng.normal(0, 0.8)), 1.1)
+            tree_piece = trees[int(rng.integers(len(trees)))]
+            for tree_index in range(int(side.length / style.rows)):
+                x, y, yaw = side.pose((tree_index + 0.5) * style.rows + float(rng.normal(0, 0.8)), 1.1)
                 if site.free((x, y), away=0.6) and rng.random() < 0.85:
-                    size = rng.uniform(0.7, 1.0) * np.ones(3)
-                    soup.place(kind, [(x, y, EARTH, rng.uniform(0, 6.28))], scale=size[None])
-                    site.take([(x + u, y + v) for u in (-0.8, 0.0, 0.8) for v in (-0.8, 0.0, 0.8)])
+                    scale = rng.uniform(0.7, 1.0) * np.ones(3)
+                    soup.place(tree_piece, [(x, y, EARTH, rng.uniform(0, 6.28))], scale=scale[None])
+                    site.take(
+                        [
+                            (x + offset, y + side_offset)
+                            for offset in (-0.8, 0.0, 0.8)
+                            for side_offset in (-0.8, 0.0, 0.8)
+                        ]
+                    )
         signs: list[tuple[str, float]] = [("limit", 8.0)] if side.length > 60.0 and rng.random() < 0.4 else []
         if side.frontage:
             signs += [("crossing", side.length - 7.0)] if rng.random() < 0.5 else []
             signs += [("parking", 0.5 * side.length)] if rng.random() < 0.12 else []
-        for name, s in signs:
-            x, y, yaw = side.pose(s, _kerb(side))
+        for name, station in signs:
+            x, y, yaw = side.pose(station, _kerb(side))
             if site.clear((x, y), size=0.5, crossing=0.6):
                 soup.place(stock[name], [(x, y, z, yaw + np.pi)])
                 site.take([(x, y)])
         if not side.kerb:
             continue
-        things = rng.poisson(style.furniture * side.length / 28.0)
-        for name in rng.choice(["bench", "bin", "bin", "bollard", "planter"], things):
+        # 28 m is the mean distance between pieces of furniture at density 1.
+        object_count = rng.poisson(style.furniture * side.length / 28.0)
+        for name in rng.choice(["bench", "bin", "bin", "bollard", "planter"], object_count):
             at_back = name in ("bench", "planter")
             x, y, yaw = side.pose(
                 float(rng.uniform(3.0, max(3.1, side.length - 3.0))), -0.45 if at_back else _kerb(side)
@@ -133,16 +149,16 @@ def furnish(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Sid
             if side.kerb < 1.7 or not site.clear((x, y), size=0.9 if at_back else 0.25):
                 continue
             if name == "planter":
-                soup.place(trough, [(x, y, z, yaw)])
-                soup.place(plant, [(x, y, z + 0.5, yaw)], scale=np.array([0.55]))
+                soup.place(planter_piece, [(x, y, z, yaw)])
+                soup.place(planter_bush, [(x, y, z + 0.5, yaw)], scale=np.array([0.55]))
             else:
                 soup.place(stock[str(name)], [(x, y, z, yaw + np.pi / 2)])
-            site.take([(x + 0.8 * u * np.cos(yaw), y + 0.8 * u * np.sin(yaw)) for u in (-1, 0, 1)])
+            site.take([(x + 0.8 * offset * np.cos(yaw), y + 0.8 * offset * np.sin(yaw)) for offset in (-1, 0, 1)])
         if side.kerb > 1.9 and side.length > 40.0 and rng.random() < 0.16 * style.furniture:
             x, y, yaw = side.pose(float(rng.uniform(14.0, side.length - 14.0)), -0.62)
-            if site.clear([(x + u * np.cos(yaw), y + u * np.sin(yaw)) for u in (-2, 0, 2)], size=0.7):
+            if site.clear([(x + offset * np.cos(yaw), y + offset * np.sin(yaw)) for offset in (-2, 0, 2)], size=0.7):
                 soup.place(stock["shelter"], [(x, y, z, yaw + np.pi / 2)])
-                site.take([(x + u * np.cos(yaw), y + u * np.sin(yaw)) for u in np.arange(-2, 2.1, 0.5)])
+                site.take([(x + offset * np.cos(yaw), y + offset * np.sin(yaw)) for offset in np.arange(-2, 2.1, 0.5)])
 
 
 def plant(
@@ -150,48 +166,52 @@ def plant(
 ) -> None:
     """Trees and bushes on open ground, denser in parks and around the town; patches of dry grass and soil."""
     rng, style = look.generator, look.style
-    stock = [tree(kind, look) for kind in style.tree_kinds for _ in range(3)]
+    tree_pieces = [tree(kind, look) for kind in style.tree_kinds for _ in range(3)]
     shrubs = [bush(look) for _ in range(5)]
     open_ground = float((site.ground.paved > 1.0).sum())
-    wanted = int(open_ground / 1000.0 * style.trees)
-    low, high = site.graph.xy.min(axis=0) - 8.0, site.graph.xy.max(axis=0) + 8.0
-    rows: dict[int, list[tuple[float, ...]]] = {}
-    scale: dict[int, list[float]] = {}
-    middle = [pose for pose, _, _ in parks]
-    for k in range(6 * wanted):
-        if sum(len(v) for v in rows.values()) >= wanted:
+    tree_count = int(open_ground / 1000.0 * style.trees)
+    lower, upper = site.graph.xy.min(axis=0) - 8.0, site.graph.xy.max(axis=0) + 8.0
+    tree_poses: dict[int, list[tuple[float, ...]]] = {}
+    tree_scales: dict[int, list[float]] = {}
+    park_centres = [pose for pose, _, _ in parks]
+    # Rejection sampling: six attempts per tree bound the time in dense towns.
+    for attempt in range(6 * tree_count):
+        if sum(len(poses_of_tree) for poses_of_tree in tree_poses.values()) >= tree_count:
             break
-        if middle and k < 5 * len(middle):
-            p = np.array(middle[k % len(middle)][:2]) + rng.normal(0.0, 5.0, 2)
+        if park_centres and attempt < 5 * len(park_centres):
+            point = np.array(park_centres[attempt % len(park_centres)][:2]) + rng.normal(0.0, 5.0, 2)
         else:
-            p = rng.uniform(site.low + 4.0, site.high - 4.0)
-            inside = bool(((p > low) & (p < high)).all())
-            if inside and rng.random() < 0.25:
+            point = rng.uniform(site.low + 4.0, site.high - 4.0)
+            is_inside = bool(((point > lower) & (point < upper)).all())
+            if is_inside and rng.random() < 0.25:
                 continue
-        ring = p + 1.6 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-        if not site.free(ring, away=1.4):
+        outline = point + 1.6 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+        if not site.free(outline, away=1.4):
             continue
-        site.take(ring)
-        which = int(rng.integers(len(stock)))
-        rows.setdefault(which, []).append((*p, EARTH - 0.03, rng.uniform(0.0, 2.0 * np.pi)))
-        scale.setdefault(which, []).append(float(rng.uniform(0.75, 1.25)))
-    for which, poses in sorted(rows.items()):
-        soup.place(stock[which], poses, scale=np.array(scale[which]))
-    for _ in range(int(1.2 * wanted)):
-        p = rng.uniform(site.low + 4.0, site.high - 4.0)
-        if site.free(p + 0.7 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]), away=1.0):
+        site.take(outline)
+        tree_index = int(rng.integers(len(tree_pieces)))
+        tree_poses.setdefault(tree_index, []).append((*point, EARTH - 0.03, rng.uniform(0.0, 2.0 * np.pi)))
+        tree_scales.setdefault(tree_index, []).append(float(rng.uniform(0.75, 1.25)))
+    for tree_index, poses in sorted(tree_poses.items()):
+        soup.place(tree_pieces[tree_index], poses, scale=np.array(tree_scales[tree_index]))
+    for _ in range(int(1.2 * tree_count)):
+        point = rng.uniform(site.low + 4.0, site.high - 4.0)
+        if site.free(point + 0.7 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]), away=1.0):
             soup.place(
                 shrubs[int(rng.integers(len(shrubs)))],
-                [(*p, EARTH - 0.03, rng.uniform(0.0, 6.28))],
+                [(*point, EARTH - 0.03, rng.uniform(0.0, 6.28))],
                 scale=np.array([rng.uniform(0.7, 1.4)]),
             )
-            site.take([p])
-    angle = np.arange(9) * 2.0 * np.pi / 9
-    for _ in range(int(0.8 * wanted) + 40):
-        p = rng.uniform(site.low + 8.0, site.high - 8.0)
+            site.take([point])
+    angles = np.arange(9) * 2.0 * np.pi / 9
+    for _ in range(int(0.8 * tree_count) + 40):
+        point = rng.uniform(site.low + 8.0, site.high - 8.0)
         size = rng.uniform(0.8, 4.0)
-        ring = p + size * rng.uniform(0.6, 1.3, (9, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1) * [1.4, 1.0]
-        if site.free(ring, away=4.5):
+        outline = point + size * rng.uniform(0.6, 1.3, (9, 1)) * np.stack([np.cos(angles), np.sin(angles)], axis=1) * [
+            1.4,
+            1.0,
+        ]
+        if site.free(outline, away=4.5):
             material = look.lawn if style.old else look.dry if rng.random() < 0.6 else look.soil
-            corners = np.column_stack([ring, np.full(9, EARTH + 0.006)])[None]
-            soup.add(flat(corners, material, levels=NEAR), p)
+            corners = np.column_stack([outline, np.full(9, EARTH + 0.006)])[None]
+            soup.add(flat(corners, material, levels=NEAR), point)

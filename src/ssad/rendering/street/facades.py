@@ -20,7 +20,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Wall:
-    """An upright rectangle: its lower left corner seen from outside, the direction to its right, length, height."""
+    """Upright rectangle: lower left corner seen from outside, direction to the right, length, height."""
 
     foot: F64
     along: F64
@@ -34,26 +34,41 @@ class Wall:
 
     def quads(self, x: npt.ArrayLike, z: npt.ArrayLike, wide: npt.ArrayLike, high: npt.ArrayLike, away: float) -> F64:
         """Rectangles [n, 4, 3] on the wall: left edges x, lower edges z, `away` m before it."""
-        u, v, w, h = np.broadcast_arrays(*(np.atleast_1d(np.asarray(k, np.float64)) for k in (x, z, wide, high)))
-        corner = [(u, v), (u + w, v), (u + w, v + h), (u, v + h)]
+        left_edges, lower_edges, widths, heights = np.broadcast_arrays(
+            *(np.atleast_1d(np.asarray(value, np.float64)) for value in (x, z, wide, high))
+        )
+        corners = [
+            (left_edges, lower_edges),
+            (left_edges + widths, lower_edges),
+            (left_edges + widths, lower_edges + heights),
+            (left_edges, lower_edges + heights),
+        ]
         base = self.foot + away * self.out
-        return np.stack([base + u[:, None] * self.along + v[:, None] * UP for u, v in corner], axis=1)
+        return np.stack(
+            [
+                base + left_edges[:, None] * self.along + lower_edges[:, None] * UP
+                for left_edges, lower_edges in corners
+            ],
+            axis=1,
+        )
 
 
 def walls(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> list[Wall]:
-    """Front, right, back and left wall of a block."""
-    foot = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
-    along = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]
-    size = (x[1] - x[0], y[1] - y[0])
+    """Return the front, right, back and left wall of a block."""
+    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    directions = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]
+    lengths = (x[1] - x[0], y[1] - y[0])
     return [
-        Wall(np.array([*f, z[0]]), np.array([*a, 0.0]), size[k % 2], z[1] - z[0])
-        for k, (f, a) in enumerate(zip(foot, along, strict=True))
+        Wall(np.array([*corner, z[0]]), np.array([*direction, 0.0]), lengths[index % 2], z[1] - z[0])
+        for index, (corner, direction) in enumerate(zip(corners, directions, strict=True))
     ]
 
 
 def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], material: int) -> Piece:
-    """The four walls of a block, without top."""
-    return flat(np.concatenate([w.quads(0.0, 0.0, w.length, w.height, 0.0) for w in walls(x, y, z)]), material)
+    """Return the four walls of a block, without top."""
+    return flat(
+        np.concatenate([wall.quads(0.0, 0.0, wall.length, wall.height, 0.0) for wall in walls(x, y, z)]), material
+    )
 
 
 def panes(
@@ -68,22 +83,29 @@ def panes(
     blinds: float = 0.15,
 ) -> list[Piece]:
     """Windows of one size (width, height) with lower left corners x [n], z [n]; some have blinds drawn."""
-    x, z = (np.atleast_1d(np.asarray(v, np.float64)) for v in (x, z))
+    x, z = (np.atleast_1d(np.asarray(value, np.float64)) for value in (x, z))
     if not len(x):
         return []
-    wide, high = size
+    width, height = size
     rng = look.generator
-    rim = 0.07
-    glass = np.where(rng.random(len(x)) < blinds, rng.choice(look.blind, len(x)), rng.choice(look.glass, len(x)))
+    frame_width = 0.07
+    glass_materials = np.where(
+        rng.random(len(x)) < blinds, rng.choice(look.blind, len(x)), rng.choice(look.glass, len(x))
+    )
     parts = [
-        flat(wall.quads(x - rim, z - rim, wide + 2 * rim, high + 2 * rim, 0.025), frame, levels=NEAR),
-        flat(wall.quads(x, z, wide, high, 0.045), glass, levels=VISIBLE),
+        flat(
+            wall.quads(x - frame_width, z - frame_width, width + 2 * frame_width, height + 2 * frame_width, 0.025),
+            frame,
+            levels=NEAR,
+        ),
+        flat(wall.quads(x, z, width, height, 0.045), glass_materials, levels=VISIBLE),
     ]
-    if wide > 0.9:
-        parts.append(flat(wall.quads(x + wide / 2 - 0.03, z, 0.06, high, 0.06), frame, levels=NEAR))
+    # wide windows have a mullion
+    if width > 0.9:
+        parts.append(flat(wall.quads(x + width / 2 - 0.03, z, 0.06, height, 0.06), frame, levels=NEAR))
     if sill:
-        front = wall.quads(x - 0.12, z - 0.16, wide + 0.24, 0.10, 0.14)
-        back = wall.quads(x - 0.12, z - 0.06, wide + 0.24, 0.0, 0.0)
+        front = wall.quads(x - 0.12, z - 0.16, width + 0.24, 0.10, 0.14)
+        back = wall.quads(x - 0.12, z - 0.06, width + 0.24, 0.0, 0.0)
         top = np.stack([front[:, 3], front[:, 2], back[:, 1], back[:, 0]], axis=1)
         parts.append(flat(np.concatenate([front, top]), look.stone[0], levels=NEAR))
     return parts
@@ -91,8 +113,8 @@ def panes(
 
 def rows(length: float, count: int, wide: float, *, margin: float = 0.0) -> F64:
     """Left edges of `count` things of one width spread evenly over a length."""
-    bay = (length - 2 * margin) / max(count, 1)
-    return np.asarray(margin + bay * (np.arange(count) + 0.5) - wide / 2)
+    bay_width = (length - 2 * margin) / max(count, 1)
+    return np.asarray(margin + bay_width * (np.arange(count) + 0.5) - wide / 2)
 
 
 def grid(
@@ -113,23 +135,23 @@ def grid(
     count = int(wall.length // bay)
     if count < 1 or floors <= first:
         return []
-    x = rows(wall.length, count, size[0])
-    level = ground + np.arange(first, floors) * storey + 0.32 * storey
-    xx, zz = (v.reshape(-1) for v in np.meshgrid(x, level))
+    left_edges = rows(wall.length, count, size[0])
+    sills = ground + np.arange(first, floors) * storey + 0.32 * storey
+    xx, zz = (grid_values.reshape(-1) for grid_values in np.meshgrid(left_edges, sills))
     if skip is not None and first == 0:
-        low = zz < ground + storey
-        keep = ~(low & (np.abs(xx[:, None] + size[0] / 2 - skip[None]).min(axis=1) < 0.9 + size[0] / 2))
-        xx, zz = xx[keep], zz[keep]
+        on_first_floor = zz < ground + storey
+        is_clear = ~(on_first_floor & (np.abs(xx[:, None] + size[0] / 2 - skip[None]).min(axis=1) < 0.9 + size[0] / 2))
+        xx, zz = xx[is_clear], zz[is_clear]
     return panes(wall, xx, zz, size, look, frame=frame, sill=sill)
 
 
 def door(wall: Wall, x: float, look: Look, *, size: tuple[float, float] = (1.0, 2.1)) -> list[Piece]:
     """A door in a frame, its middle at x, with a step."""
-    wide, high = size
-    left = x - wide / 2
+    width, height = size
+    left = x - width / 2
     return [
-        flat(wall.quads(left - 0.12, 0.0, wide + 0.24, high + 0.14, 0.03), look.stone[0], levels=NEAR),
-        flat(wall.quads(left, 0.04, wide, high, 0.05), look.pick("door"), levels=VISIBLE),
+        flat(wall.quads(left - 0.12, 0.0, width + 0.24, height + 0.14, 0.03), look.stone[0], levels=NEAR),
+        flat(wall.quads(left, 0.04, width, height, 0.05), look.pick("door"), levels=VISIBLE),
     ]
 
 
@@ -145,7 +167,7 @@ def gable(
     eaves: float = 0.4,
     hip: float = 0.0,
 ) -> list[Piece]:
-    """A pitched roof over a block.
+    """Return a pitched roof over a block.
 
     Args:
         x: Extent of the block along x, m.
@@ -155,49 +177,127 @@ def gable(
         roof: Material of the roof.
         wall: Material of the gables.
         across: Whether the ridge runs along y; else along x.
-        eaves: How far the roof reaches beyond the block, m.
-        hip: Length by which the ridge is shorter at each end, m; 0: gables, which are walls.
+        eaves: Distance that the roof reaches beyond the block, m.
+        hip: Length by which the ridge is shorter at each end, m; 0: the ends are gable walls.
     """
-    (a0, a1), (b0, b1) = (y, x) if across else (x, y)
-    half = 0.5 * (b1 - b0)
-    slope = rise / half
-    middle, low, thick = 0.5 * (b0 + b1), z - eaves * slope, 0.16
-    end = eaves if hip else 0.25
+    (ridge_start, ridge_end), (eave_start, eave_end) = (y, x) if across else (x, y)
+    half_span = 0.5 * (eave_end - eave_start)
+    slope = rise / half_span
+    ridge_line, eave_height, thickness = 0.5 * (eave_start + eave_end), z - eaves * slope, 0.16
+    end_overhang = eaves if hip else 0.25
 
     def points(*rows: tuple[float, float, float]) -> F64:
-        p = np.array([rows], np.float64)
-        return p[:, ::-1, [1, 0, 2]] if across else p
+        array = np.array([rows], np.float64)
+        return array[:, ::-1, [1, 0, 2]] if across else array
 
-    o0, o1, c0, c1 = a0 - end, a1 + end, b0 - eaves, b1 + eaves
-    r0, r1 = (o0 + hip + end, o1 - hip - end) if hip else (o0, o1)
-    top = z + rise
+    outer_start, outer_end, outer_left, outer_right = (
+        ridge_start - end_overhang,
+        ridge_end + end_overhang,
+        eave_start - eaves,
+        eave_end + eaves,
+    )
+    top_start, top_end = (
+        (outer_start + hip + end_overhang, outer_end - hip - end_overhang) if hip else (outer_start, outer_end)
+    )
+    ridge_height = z + rise
     sides = [
-        points((o0, c0, low), (o1, c0, low), (r1, middle, top), (r0, middle, top)),
-        points((o1, c1, low), (o0, c1, low), (r0, middle, top), (r1, middle, top)),
+        points(
+            (outer_start, outer_left, eave_height),
+            (outer_end, outer_left, eave_height),
+            (top_end, ridge_line, ridge_height),
+            (top_start, ridge_line, ridge_height),
+        ),
+        points(
+            (outer_end, outer_right, eave_height),
+            (outer_start, outer_right, eave_height),
+            (top_start, ridge_line, ridge_height),
+            (top_end, ridge_line, ridge_height),
+        ),
     ]
-    parts = [flat(p, roof) for p in sides]
+    parts = [flat(polygon, roof) for polygon in sides]
     if hip:
-        parts.append(flat(points((o1, c0, low), (o1, c1, low), (r1, middle, top)), roof))
-        parts.append(flat(points((o0, c1, low), (o0, c0, low), (r0, middle, top)), roof))
+        parts.append(
+            flat(
+                points(
+                    (outer_end, outer_left, eave_height),
+                    (outer_end, outer_right, eave_height),
+                    (top_end, ridge_line, ridge_height),
+                ),
+                roof,
+            )
+        )
+        parts.append(
+            flat(
+                points(
+                    (outer_start, outer_right, eave_height),
+                    (outer_start, outer_left, eave_height),
+                    (top_start, ridge_line, ridge_height),
+                ),
+                roof,
+            )
+        )
     else:
-        parts.append(flat(points((a1, b0, z), (a1, b1, z), (a1, middle, top)), wall))
-        parts.append(flat(points((a0, b1, z), (a0, b0, z), (a0, middle, top)), wall))
+        parts.append(
+            flat(
+                points((ridge_end, eave_start, z), (ridge_end, eave_end, z), (ridge_end, ridge_line, ridge_height)),
+                wall,
+            )
+        )
+        parts.append(
+            flat(
+                points(
+                    (ridge_start, eave_end, z), (ridge_start, eave_start, z), (ridge_start, ridge_line, ridge_height)
+                ),
+                wall,
+            )
+        )
     # undersides and edges of the overhang
-    down = thick * UP
-    parts += [flat((p - down)[:, ::-1], roof, levels=NEAR) for p in sides]
-    rim = [
-        points((o0, c0, low - thick), (o1, c0, low - thick), (o1, c0, low), (o0, c0, low)),
-        points((o1, c1, low - thick), (o0, c1, low - thick), (o0, c1, low), (o1, c1, low)),
+    drop = thickness * UP
+    parts += [flat((polygon - drop)[:, ::-1], roof, levels=NEAR) for polygon in sides]
+    edge_polygons = [
+        points(
+            (outer_start, outer_left, eave_height - thickness),
+            (outer_end, outer_left, eave_height - thickness),
+            (outer_end, outer_left, eave_height),
+            (outer_start, outer_left, eave_height),
+        ),
+        points(
+            (outer_end, outer_right, eave_height - thickness),
+            (outer_start, outer_right, eave_height - thickness),
+            (outer_start, outer_right, eave_height),
+            (outer_end, outer_right, eave_height),
+        ),
     ]
     if hip:
-        rim.append(points((o1, c0, low - thick), (o1, c1, low - thick), (o1, c1, low), (o1, c0, low)))
-        rim.append(points((o0, c1, low - thick), (o0, c0, low - thick), (o0, c0, low), (o0, c1, low)))
+        edge_polygons.append(
+            points(
+                (outer_end, outer_left, eave_height - thickness),
+                (outer_end, outer_right, eave_height - thickness),
+                (outer_end, outer_right, eave_height),
+                (outer_end, outer_left, eave_height),
+            )
+        )
+        edge_polygons.append(
+            points(
+                (outer_start, outer_right, eave_height - thickness),
+                (outer_start, outer_left, eave_height - thickness),
+                (outer_start, outer_left, eave_height),
+                (outer_start, outer_right, eave_height),
+            )
+        )
     else:
-        for o, sign in ((o1, 1), (o0, -1)):
-            for c in (c0, c1):
-                ring = [(o, c, low - thick), (o, middle, top - thick), (o, middle, top), (o, c, low)]
-                rim.append(points(*(ring if (c == c0) == (sign > 0) else ring[::-1])))
-    parts += [flat(p, roof, levels=VISIBLE) for p in rim]
+        for end_position, sign in ((outer_end, 1), (outer_start, -1)):
+            for side_position in (outer_left, outer_right):
+                corners = [
+                    (end_position, side_position, eave_height - thickness),
+                    (end_position, ridge_line, ridge_height - thickness),
+                    (end_position, ridge_line, ridge_height),
+                    (end_position, side_position, eave_height),
+                ]
+                edge_polygons.append(
+                    points(*(corners if (side_position == outer_left) == (sign > 0) else corners[::-1]))
+                )
+    parts += [flat(polygon, roof, levels=VISIBLE) for polygon in edge_polygons]
     return parts
 
 
@@ -212,37 +312,60 @@ def flat_roof(
 ) -> list[Piece]:
     """A flat roof with a parapet above z and boxes of building services."""
     rng = look.generator
-    t = 0.3
-    low = np.array([[x[0], y[0], z], [x[0], y[1] - t, z], [x[0], y[0] + t, z], [x[1] - t, y[0] + t, z]])
-    high = np.array([[x[1], y[0] + t, 0], [x[1], y[1], 0], [x[0] + t, y[1] - t, 0], [x[1], y[1] - t, 0]])
-    high[:, 2] = z + PARAPET
-    parts = [box(low, high, coping, levels=VISIBLE)]
+    # m, thickness of the parapet
+    thickness = 0.3
+    lower_corners = np.array(
+        [
+            [x[0], y[0], z],
+            [x[0], y[1] - thickness, z],
+            [x[0], y[0] + thickness, z],
+            [x[1] - thickness, y[0] + thickness, z],
+        ]
+    )
+    upper_corners = np.array(
+        [
+            [x[1], y[0] + thickness, 0],
+            [x[1], y[1], 0],
+            [x[0] + thickness, y[1] - thickness, 0],
+            [x[1], y[1] - thickness, 0],
+        ]
+    )
+    upper_corners[:, 2] = z + PARAPET
+    parts = [box(lower_corners, upper_corners, coping, levels=VISIBLE)]
     deck = [[x[0], y[0], z + 0.1], [x[1], y[0], z + 0.1], [x[1], y[1], z + 0.1], [x[0], y[1], z + 0.1]]
     parts.append(flat(np.array([deck]), look.flat_roof, levels=ALL))
     for _ in range(plant):
-        wide, deep, high_ = rng.uniform(1.5, 4.0), rng.uniform(1.5, 3.5), rng.uniform(0.9, 2.4)
-        if x[1] - x[0] < wide + 3.0 or y[1] - y[0] < deep + 3.0:
+        width, depth, height = rng.uniform(1.5, 4.0), rng.uniform(1.5, 3.5), rng.uniform(0.9, 2.4)
+        if x[1] - x[0] < width + 3.0 or y[1] - y[0] < depth + 3.0:
             continue
-        u, v = rng.uniform(x[0] + 1.0, x[1] - wide - 1.0), rng.uniform(y[0] + 1.0, y[1] - deep - 1.0)
-        parts.append(box((u, v, z), (u + wide, v + deep, z + high_), look.metal, levels=VISIBLE))
+        left, front = rng.uniform(x[0] + 1.0, x[1] - width - 1.0), rng.uniform(y[0] + 1.0, y[1] - depth - 1.0)
+        parts.append(box((left, front, z), (left + width, front + depth, z + height), look.metal, levels=VISIBLE))
     return parts
 
 
 def balcony(wall: Wall, x: F64, z: F64, wide: float, look: Look, *, deep: float = 1.2) -> list[Piece]:
     """Balconies: slabs and railings before a wall, left edges x [n], floors at z [n]."""
-    n = len(x)
-    if not n:
+    count = len(x)
+    if not count:
         return []
-    base = wall.foot + x[:, None] * wall.along + z[:, None] * UP
-    right, out = wide * wall.along, deep * wall.out
-    ring = [base, base + out, base + out + right, base + right]
-    slab, rail = 0.16 * UP, 1.05 * UP
-    quads = [np.stack([p - slab, q - slab, q, p], axis=1) for p, q in pairwise(ring)]
-    quads += [np.stack(ring, axis=1), np.stack([p - slab for p in ring[::-1]], axis=1)]
+    corners = wall.foot + x[:, None] * wall.along + z[:, None] * UP
+    across, forward = wide * wall.along, deep * wall.out
+    slab_corners = [corners, corners + forward, corners + forward + across, corners + across]
+    slab_height, rail_height = 0.16 * UP, 1.05 * UP
+    quads = [
+        np.stack([start - slab_height, end - slab_height, end, start], axis=1) for start, end in pairwise(slab_corners)
+    ]
+    quads += [np.stack(slab_corners, axis=1), np.stack([start - slab_height for start in slab_corners[::-1]], axis=1)]
     parts = [flat(np.concatenate(quads), look.stone[1], levels=VISIBLE)]
-    sides = [np.stack([p + 0.12 * UP, q + 0.12 * UP, q + rail, p + rail], axis=1) for p, q in pairwise(ring)]
-    outwards = (-wall.along, wall.out, wall.along)
-    inner = [(side - 0.04 * away)[:, ::-1] for side, away in zip(sides, outwards, strict=True)]
+    railing_faces = [
+        np.stack([start + 0.12 * UP, end + 0.12 * UP, end + rail_height, start + rail_height], axis=1)
+        for start, end in pairwise(slab_corners)
+    ]
+    directions = (-wall.along, wall.out, wall.along)
+    # Railings are seen from both sides; the reversed copy is offset to avoid coplanar faces.
+    inner_faces = [
+        (side - 0.04 * direction)[:, ::-1] for side, direction in zip(railing_faces, directions, strict=True)
+    ]
     railing = look.frame[1] if look.generator.random() < 0.5 else look.glass[3]
-    parts.append(flat(np.concatenate(sides + inner), railing, levels=VISIBLE))
+    parts.append(flat(np.concatenate(railing_faces + inner_faces), railing, levels=VISIBLE))
     return parts

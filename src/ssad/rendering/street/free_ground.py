@@ -1,4 +1,4 @@
-"""Which ground is free: a raster of what is built on, and the sides of streets along which things stand."""
+"""Raster of the free ground of a town, and the sides of streets along which objects stand."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEEP = 0.6  # m from driving lanes, junctions and crosswalks to anything that st
 
 
 class FreeGround:
-    """Free ground of a town; whatever is placed is marked taken."""
+    """Free ground of a town; ground under placed objects is marked as occupied."""
 
     def __init__(self, graph: LaneGraph, ground: Ground) -> None:
         self.graph, self.ground = graph, ground
@@ -27,8 +27,8 @@ class FreeGround:
         rows, columns = ground.road.shape
         self.taken = np.zeros((int((rows - 1) / CELL), int((columns - 1) / CELL)), bool)
         self.high = self.low + np.array([columns - 1, rows - 1], float)
-        corners = [graph.crosswalk(k).astype(np.float64) for k in range(len(graph.crosswalk_offset) - 1)]
-        self.crosswalks = np.array([c.mean(axis=0) for c in corners]).reshape(-1, 2)
+        corners = [graph.crosswalk(index).astype(np.float64) for index in range(len(graph.crosswalk_offset) - 1)]
+        self.crosswalks = np.array([polygon.mean(axis=0) for polygon in corners]).reshape(-1, 2)
 
     def _cells(self, xy: F64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         cell = np.floor((xy - self.low) / CELL).astype(np.int64)
@@ -36,60 +36,64 @@ class FreeGround:
         return np.clip(cell[:, 1], 0, ny - 1), np.clip(cell[:, 0], 0, nx - 1)
 
     def free(self, xy: npt.ArrayLike, *, away: float) -> bool:
-        """Whether all points [n, 2] lie in the town, `away` m from road and sidewalk, on ground not yet taken."""
-        p = np.asarray(xy, np.float64).reshape(-1, 2)
-        if (p < self.low + 2.0).any() or (p > self.high - 2.0).any() or self.taken[self._cells(p)].any():
+        """Return whether all points [n, 2] are in the town, `away` m from road and sidewalk, and not occupied."""
+        points = np.asarray(xy, np.float64).reshape(-1, 2)
+        # 2 m inside the raster: `_cells` clips and would test the wrong cells outside.
+        if (points < self.low + 2.0).any() or (points > self.high - 2.0).any() or self.taken[self._cells(points)].any():
             return False
-        return bool((self.ground.at(self.ground.paved, p) >= away).all())
+        return bool((self.ground.at(self.ground.paved, points) >= away).all())
 
     def take(self, xy: npt.ArrayLike) -> None:
-        """Mark ground under points [n, 2]."""
+        """Mark the ground under points [n, 2] as occupied."""
         self.taken[self._cells(np.asarray(xy, np.float64).reshape(-1, 2))] = True
 
     def clear(self, xy: npt.ArrayLike, *, size: float = 0.3, crossing: float = 1.5) -> bool:
-        """Whether a thing may stand here, on a sidewalk or beside it.
+        """Return whether an object may stand at points on a sidewalk or beside it.
 
-        It must be `KEEP` away from driving lanes and junctions, on ground not yet taken.
+        It must be `KEEP` away from driving lanes and junctions, on ground that is not occupied.
 
         Args:
             xy: Points [n, 2], m; all must be clear.
-            size: Radius of the thing, m.
+            size: Radius of the object, m.
             crossing: Distance to keep from crosswalks, m.
         """
-        p = np.asarray(xy, np.float64).reshape(-1, 2)
-        if (self.ground.at(self.ground.drive, p) < KEEP + size).any() or self.taken[self._cells(p)].any():
+        points = np.asarray(xy, np.float64).reshape(-1, 2)
+        if (self.ground.at(self.ground.drive, points) < KEEP + size).any() or self.taken[self._cells(points)].any():
             return False
-        return bool((self.crossing(p) > crossing + size).all())
+        return bool((self.crossing(points) > crossing + size).all())
 
     def crossing(self, xy: npt.ArrayLike) -> F64:
-        """Distance [n] from the nearest crosswalk, m."""
-        p = np.asarray(xy, np.float64).reshape(-1, 2)
-        least = np.full(len(p), np.inf)
-        for k in range(len(self.crosswalks)):
-            near = np.hypot(*(p - self.crosswalks[k]).T) < 20.0
-            if near.any():
-                gap = polygon_distance(p[near], self.graph.crosswalk(k).astype(np.float64))
-                least[near] = np.minimum(least[near], gap)
-        return least
+        """Return the distance [n] from the nearest crosswalk, m."""
+        points = np.asarray(xy, np.float64).reshape(-1, 2)
+        distances = np.full(len(points), np.inf)
+        for index in range(len(self.crosswalks)):
+            # The exact distance is only needed near a crosswalk: beyond, any limit is satisfied.
+            is_near = np.hypot(*(points - self.crosswalks[index]).T) < 20.0
+            if is_near.any():
+                crosswalk_distance = polygon_distance(points[is_near], self.graph.crosswalk(index).astype(np.float64))
+                distances[is_near] = np.minimum(distances[is_near], crosswalk_distance)
+        return distances
 
 
 def polygon_distance(xy: F64, corners: F64) -> F64:
-    """Distance [n] of points from a polygon [m, 2], 0 inside."""
-    a, b = corners, np.roll(corners, -1, axis=0)
-    d = b - a
-    t = np.einsum("nmi,mi->nm", xy[:, None] - a, d) / np.maximum((d * d).sum(axis=1), 1e-12)
-    gap = np.hypot(*np.moveaxis(xy[:, None] - a - np.clip(t, 0.0, 1.0)[..., None] * d, -1, 0)).min(axis=1)
-    return np.where(in_polygon(xy, corners), 0.0, gap)
+    """Return the distance [n] of points from a polygon [m, 2]; 0 inside."""
+    starts, ends = corners, np.roll(corners, -1, axis=0)
+    edges = ends - starts
+    edge_share = np.einsum("nmi,mi->nm", xy[:, None] - starts, edges) / np.maximum((edges * edges).sum(axis=1), 1e-12)
+    edge_distance = np.hypot(
+        *np.moveaxis(xy[:, None] - starts - np.clip(edge_share, 0.0, 1.0)[..., None] * edges, -1, 0)
+    ).min(axis=1)
+    return np.where(in_polygon(xy, corners), 0.0, edge_distance)
 
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a street outside junctions: the outer edge of its outermost lane, and where its kerb is.
+    """One side of a street outside junctions: the outer edge of its outermost lane, and its kerb.
 
     Attributes:
         edge: The outer edge.
         kerb: Distance from the outer edge to the kerb, m: the sidewalk's width, 0 without one.
-        frontage: Whether buildings face it; not so a motorway and its ramps.
+        frontage: Whether buildings face it; False for motorways and their ramps.
     """
 
     edge: Edge
@@ -102,7 +106,7 @@ class Side:
         return float(self.edge.s[-1])
 
     def pose(self, s: float, away: float = 0.0) -> tuple[float, float, float]:
-        """A pose beside the street; beyond the ends the line goes straight on.
+        """Return a pose beside the street; beyond the ends the line continues straight.
 
         Args:
             s: Arc length along the edge, m.
@@ -112,34 +116,35 @@ class Side:
             x, y (m) and the heading of the traffic (rad).
         """
         edge = self.edge
-        at = float(np.clip(s, 0.0, self.length))
-        yaw = float(np.interp(at, edge.s, np.unwrap(edge.yaw)))
-        x, y = (float(np.interp(at, edge.s, edge.xy[:, k])) for k in range(2))
-        over, cos, sin = s - at, np.cos(yaw), np.sin(yaw)
-        return x + over * cos + away * sin, y + over * sin - away * cos, yaw
+        clamped = float(np.clip(s, 0.0, self.length))
+        # Unwrapped, so that interpolation does not jump at pi.
+        yaw = float(np.interp(clamped, edge.s, np.unwrap(edge.yaw)))
+        x, y = (float(np.interp(clamped, edge.s, edge.xy[:, column])) for column in range(2))
+        overhang, cos, sin = s - clamped, np.cos(yaw), np.sin(yaw)
+        return x + overhang * cos + away * sin, y + overhang * sin - away * cos, yaw
 
 
 def sides(graph: LaneGraph) -> list[Side]:
-    """The sides of all streets, in the order of their lanes."""
-    found = []
+    """Return the sides of all streets, in the order of their lanes."""
+    street_sides = []
     for lane in np.flatnonzero((graph.junction < 0) & (graph.right < 0)).tolist():
-        walk = graph.kind[lane] == LaneType.SIDEWALK
-        kerb = float(graph.width[graph.points(lane)].min()) if walk else 0.0
+        is_sidewalk = graph.kind[lane] == LaneType.SIDEWALK
+        kerb = float(graph.width[graph.points(lane)].min()) if is_sidewalk else 0.0
         edge = lane_edge(graph, lane, 0.0)
         if edge.s[-1] > 4.0:
-            found.append(Side(edge, kerb, walk or not graph.divided(lane)))
-    return found
+            street_sides.append(Side(edge, kerb, is_sidewalk or not graph.divided(lane)))
+    return street_sides
 
 
 def footprint(pose: tuple[float, float, float], x: tuple[float, float], y: tuple[float, float]) -> F64:
-    """Points [n, 2] about 0.4 m apart over a rectangle in the frame of a pose."""
-    u = np.linspace(*x, max(2, int((x[1] - x[0]) / 0.4) + 1))
-    v = np.linspace(*y, max(2, int((y[1] - y[0]) / 0.4) + 1))
-    local = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    """Return points [n, 2] about 0.4 m apart over a rectangle in the frame of a pose."""
+    along = np.linspace(*x, max(2, int((x[1] - x[0]) / 0.4) + 1))
+    across = np.linspace(*y, max(2, int((y[1] - y[0]) / 0.4) + 1))
+    local = np.stack(np.meshgrid(along, across), axis=-1).reshape(-1, 2)
     return place(pose, local)
 
 
 def place(pose: tuple[float, float, float], local: F64) -> F64:
-    """Points [..., 2] of the frame of a pose in the world."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.asarray(local @ np.array([[c, s], [-s, c]]) + np.array(pose[:2]))
+    """Transform points [..., 2] from the frame of a pose to the world."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    return np.asarray(local @ np.array([[cosine, sine], [-sine, cosine]]) + np.array(pose[:2]))

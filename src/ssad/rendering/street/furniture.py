@@ -1,4 +1,4 @@
-"""Things that stand along streets: lamps, signals, signs, benches, bins, fences. Frame: x towards the road."""
+"""Street furniture: lamps, signals, signs, benches, bins, fences. Frame: x towards the road."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def disc(
     turn: float = 0.0,
     levels: int = NEAR,
 ) -> Piece:
-    """A flat disc that faces along x."""
-    angle = turn + np.arange(sides) * 2.0 * np.pi / sides
-    ring = np.column_stack([0 * angle, np.cos(angle), np.sin(angle)]) * radius + centre
+    """Return a flat disc that faces along x."""
+    angles = turn + np.arange(sides) * 2.0 * np.pi / sides
+    ring = np.column_stack([0 * angles, np.cos(angles), np.sin(angles)]) * radius + centre
     return flat(ring[None], material, levels=levels)
 
 
@@ -40,20 +40,20 @@ def lamp(look: Look) -> tuple[Piece, tuple[float, float]]:
             cylinder((0.26, 0.0), (4.0, 4.25), look.pole, sides=4, levels=VISIBLE),
         ]
         return join(parts), (0.0, 3.7)
-    under = ((-0.3, -0.1), (-0.3, 0.1), (0.3, 0.1), (0.3, -0.1))
-    tall, reach = (8.5, 1.9) if look.style.lamp >= 30.0 else (6.5, 1.2)
+    light_outline = ((-0.3, -0.1), (-0.3, 0.1), (0.3, 0.1), (0.3, -0.1))
+    height, reach = (8.5, 1.9) if look.style.lamp >= 30.0 else (6.5, 1.2)
     parts = [
-        cylinder((0.09, 0.05), (0.0, tall), look.pole, sides=6, levels=VISIBLE),
-        box((0.0, -0.03, tall - 0.08), (reach, 0.03, tall - 0.02), look.pole, levels=VISIBLE, base=True),
-        box((reach - 0.35, -0.13, tall - 0.12), (reach + 0.35, 0.13, tall), look.pole, levels=VISIBLE, base=True),
-        flat(np.array([[[reach + u, v, tall - 0.125] for u, v in under]]), look.glow, levels=VISIBLE),
+        cylinder((0.09, 0.05), (0.0, height), look.pole, sides=6, levels=VISIBLE),
+        box((0.0, -0.03, height - 0.08), (reach, 0.03, height - 0.02), look.pole, levels=VISIBLE, base=True),
+        box((reach - 0.35, -0.13, height - 0.12), (reach + 0.35, 0.13, height), look.pole, levels=VISIBLE, base=True),
+        flat(np.array([[[reach + dx, dy, height - 0.125] for dx, dy in light_outline]]), look.glow, levels=VISIBLE),
     ]
-    return join(parts), (reach, tall - 0.15)
+    return join(parts), (reach, height - 0.15)
 
 
 @dataclass(frozen=True)
 class SignalMast:
-    """A signal post in its own frame: x towards the traffic that it faces, the road towards -y.
+    """Signal post in its own frame: x towards the traffic that it faces, the road towards -y.
 
     Attributes:
         piece: Its triangles.
@@ -71,71 +71,73 @@ class SignalMast:
 def signal_mast(look: Look, reach: float) -> SignalMast:
     """A post with a head; with `reach` > 0 also an arm that holds a second head `reach` m over the road."""
     post = look.black if look.style.old else look.metal
-    tall = 6.2 if reach > 0.0 else 3.5
-    parts = [cylinder((0.10, 0.07), (0.0, tall), post, sides=8, levels=VISIBLE)]
+    height = 6.2 if reach > 0.0 else 3.5
+    parts = [cylinder((0.10, 0.07), (0.0, height), post, sides=8, levels=VISIBLE)]
     heads = [(0.0, 2.95)]
     if reach > 0.0:
         parts.append(box((-0.05, -reach - 0.3, 5.85), (0.05, 0.0, 5.97), post, levels=VISIBLE, base=True))
         heads.append((-reach, 5.6))
-    lens = []
-    count, sides = sum(len(p.faces) for p in parts), 10
+    lens_of_heads = []
+    face_count, sides = sum(len(part.faces) for part in parts), 10
     for y, z in heads:
-        face = 0.06 if y == 0.0 else -0.1
-        case = box((face, y - 0.17, z - 0.5), (0.24, y + 0.17, z + 0.5), look.black, levels=ALL, base=True)
+        front_x = 0.06 if y == 0.0 else -0.1
+        housing = box((front_x, y - 0.17, z - 0.5), (0.24, y + 0.17, z + 0.5), look.black, levels=ALL, base=True)
         plate = box((0.10, y - 0.30, z - 0.62), (0.12, y + 0.30, z + 0.62), look.black, levels=VISIBLE, base=True)
-        parts += [case, plate]
-        count += len(case.faces) + len(plate.faces)
-        mine = []
-        for k, material in enumerate((look.red, look.amber, look.green)):
-            up = z + 0.31 - 0.31 * k
-            roof = (0.24, y - 0.13, up + LENS), (0.42, y + 0.13, up + LENS + 0.02)
-            hood = box(*roof, look.black, levels=VISIBLE, base=True)
+        parts += [housing, plate]
+        face_count += len(housing.faces) + len(plate.faces)
+        lens_faces = []
+        for lens_index, material in enumerate((look.red, look.amber, look.green)):
+            up = z + 0.31 - 0.31 * lens_index
+            hood_corners = (0.24, y - 0.13, up + LENS), (0.42, y + 0.13, up + LENS + 0.02)
+            hood = box(*hood_corners, look.black, levels=VISIBLE, base=True)
             light = disc((0.25, y, up), LENS, material, sides=sides, levels=ALL)
-            mine.append(count)
+            # The renderer lights a lens by its faces, so their numbers must survive `join`.
+            lens_faces.append(face_count)
             parts += [light, hood]
-            count += len(light.faces) + len(hood.faces)
-        lens.append((mine[0], mine[1], mine[2]))
-    return SignalMast(join(parts), tuple(heads), tuple(lens), sides - 2)
+            face_count += len(light.faces) + len(hood.faces)
+        lens_of_heads.append((lens_faces[0], lens_faces[1], lens_faces[2]))
+    return SignalMast(join(parts), tuple(heads), tuple(lens_of_heads), sides - 2)
 
 
 def sign(kind: str, look: Look) -> Piece:
     """A traffic sign on a post, facing along x: give_way, limit, crossing, parking."""
-    s = look.sign
+    sign_materials = look.sign
     parts = [cylinder((0.035, 0.035), (0.0, 2.75), look.metal, sides=5, levels=VISIBLE)]
     z, turn = 2.35, np.pi / 2
     shapes: dict[str, list[tuple[float, int, float, int]]] = {  # radius, sides, turn, material
-        "give_way": [(0.48, 3, -turn, s["red"]), (0.30, 3, -turn, s["white"])],
-        "limit": [(0.36, 16, 0.0, s["red"]), (0.275, 16, 0.0, s["white"])],
-        "crossing": [(0.46, 4, np.pi / 4, s["blue"]), (0.34, 3, turn, s["white"])],
-        "parking": [(0.44, 4, np.pi / 4, s["blue"])],
+        "give_way": [(0.48, 3, -turn, sign_materials["red"]), (0.30, 3, -turn, sign_materials["white"])],
+        "limit": [(0.36, 16, 0.0, sign_materials["red"]), (0.275, 16, 0.0, sign_materials["white"])],
+        "crossing": [(0.46, 4, np.pi / 4, sign_materials["blue"]), (0.34, 3, turn, sign_materials["white"])],
+        "parking": [(0.44, 4, np.pi / 4, sign_materials["blue"])],
     }
-    for k, (radius, sides, angle, material) in enumerate(shapes[kind]):
-        parts.append(disc((0.05 + 0.006 * k, 0.0, z), radius, material, sides=sides, turn=angle, levels=VISIBLE))
+    for layer, (radius, sides, angle, material) in enumerate(shapes[kind]):
+        parts.append(disc((0.05 + 0.006 * layer, 0.0, z), radius, material, sides=sides, turn=angle, levels=VISIBLE))
     radius, sides, angle, _ = shapes[kind][0]
-    back = disc((0.0, 0.0, z), radius, s["back"], sides=sides, turn=angle, levels=VISIBLE)
-    away = back.vertices + np.array([0.045, 0, 0])
+    back = disc((0.0, 0.0, z), radius, sign_materials["back"], sides=sides, turn=angle, levels=VISIBLE)
+    back_vertices = back.vertices + np.array([0.045, 0, 0])
+    # `disc` faces along x: reverse it to get the back.
     faces, uv = back.faces[:, ::-1].copy(), back.uv[:, ::-1]
-    parts.append(Piece(away, faces, -back.normals, uv, back.material, back.levels))
+    parts.append(Piece(back_vertices, faces, -back.normals, uv, back.material, back.levels))
     bars: dict[str, list[tuple[float, float, float, float]]] = {  # y0, z0, y1, z1 of letters, roughly
         "limit": [(-0.14, -0.11, -0.03, 0.11), (0.03, -0.11, 0.14, 0.11)],
         "parking": [(-0.1, -0.18, -0.03, 0.18), (-0.03, 0.0, 0.12, 0.18)],
     }
     for y0, z0, y1, z1 in bars.get(kind, []):
         quad = [[0.065, y0, z + z0], [0.065, y1, z + z0], [0.065, y1, z + z1], [0.065, y0, z + z1]]
-        parts.append(flat(np.array([quad]), look.black if kind == "limit" else s["white"], levels=NEAR))
+        parts.append(flat(np.array([quad]), look.black if kind == "limit" else sign_materials["white"], levels=NEAR))
     return join(parts)
 
 
 def bench(look: Look) -> Piece:
     """A bench that faces along x."""
     wood = look.wood[0]
-    slats = np.array([[0.02 + 0.14 * k, -0.9, 0.42] for k in range(3)])
-    backs = np.array([[-0.08, -0.9, 0.56], [-0.08, -0.9, 0.74]])
+    slats = np.array([[0.02 + 0.14 * slat, -0.9, 0.42] for slat in range(3)])
+    backrests = np.array([[-0.08, -0.9, 0.56], [-0.08, -0.9, 0.74]])
     legs = np.array([[0.0, -0.75, 0.0], [0.0, 0.70, 0.0]])
     return join(
         [
             box(slats, slats + np.array([0.12, 1.8, 0.04]), wood, levels=NEAR, base=True),
-            box(backs, backs + np.array([0.04, 1.8, 0.13]), wood, levels=NEAR, base=True),
+            box(backrests, backrests + np.array([0.04, 1.8, 0.13]), wood, levels=NEAR, base=True),
             box(legs, legs + np.array([0.40, 0.05, 0.42]), look.iron, levels=NEAR),
             box(legs + np.array([-0.08, 0, 0.42]), legs + np.array([-0.03, 0.05, 0.88]), look.iron, levels=NEAR),
             box((-0.05, -0.9, 0.40), (0.42, 0.9, 0.46), wood, levels=MID),
@@ -172,11 +174,11 @@ def bollard(look: Look) -> Piece:
 
 def shelter(look: Look) -> Piece:
     """A bus shelter, open along x, 4 m wide."""
-    post = np.array([[x, y, 0.0] for x in (-0.55, 0.55) for y in (-2.0, 1.94)])
+    posts = np.array([[x, y, 0.0] for x in (-0.55, 0.55) for y in (-2.0, 1.94)])
     pane = box((-0.57, -1.95, 0.25), (-0.54, 1.95, 2.2), look.glass[3], levels=VISIBLE, base=True)
     return join(
         [
-            box(post, post + np.array([0.06, 0.06, 2.35]), look.metal, levels=VISIBLE),
+            box(posts, posts + np.array([0.06, 0.06, 2.35]), look.metal, levels=VISIBLE),
             box((-0.7, -2.15, 2.35), (0.8, 2.15, 2.47), look.metal, levels=VISIBLE, base=True),
             pane,
             box((-0.45, -1.4, 0.45), (-0.10, 1.4, 0.5), look.wood[0], levels=NEAR, base=True),
@@ -194,11 +196,11 @@ def fence(kind: str, look: Look) -> Piece:
     """A metre of fence along x: pickets, planks, wall, rail, chain."""
     if kind == "pickets":
         wood = look.wood[1]
-        bar = np.array([[-0.5 + 0.2 * k, -0.012, 0.08] for k in range(5)])
+        pickets = np.array([[-0.5 + 0.2 * picket, -0.012, 0.08] for picket in range(5)])
         rail = np.array([[-0.5, 0.012, 0.25], [-0.5, 0.012, 0.7]])
         return join(
             [
-                box(bar, bar + np.array([0.1, 0.024, 0.87]), wood, levels=NEAR),
+                box(pickets, pickets + np.array([0.1, 0.024, 0.87]), wood, levels=NEAR),
                 box(rail, rail + np.array([1.0, 0.03, 0.07]), wood, levels=NEAR),
                 box((-0.5, -0.01, 0.2), (0.5, 0.01, 0.9), look.palette.shade(wood, 0.7), levels=MID),
             ]

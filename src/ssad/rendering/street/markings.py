@@ -1,4 +1,4 @@
-"""What is painted on a road, and what wears it: lines, stop lines, crosswalks, arrows, patches, manholes."""
+"""Road markings and wear: lines, stop lines, crosswalks, arrows, patches, manholes."""
 
 from __future__ import annotations
 
@@ -32,40 +32,40 @@ _ARROW = {  # polygons of arrows along x from the tail; y to the left
 
 def paint(soup: TriangleBuilder, graph: LaneGraph, look: Look) -> None:
     """All markings of the town, and wear."""
-    driving = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)).tolist()
-    for lane in driving:
+    driving_lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)).tolist()
+    for lane in driving_lanes:
         _lines(soup, graph, lane, look)
         _worn(soup, graph, lane, look)
-    stopped = set(graph.rule_lane[graph.sign_kind[graph.rule_sign] == SignKind.STOP].tolist())
-    ruled = set(graph.rule_lane.tolist())
+    stop_sign_lanes = set(graph.rule_lane[graph.sign_kind[graph.rule_sign] == SignKind.STOP].tolist())
+    sign_lanes = set(graph.rule_lane.tolist())
     for signal, lane, s in zip(
         graph.stop_signal.tolist(), graph.stop_lane.tolist(), graph.stop_s.tolist(), strict=True
     ):
-        if graph.signal_virtual[signal] and lane not in ruled and graph.divided(lane):
+        if graph.signal_virtual[signal] and lane not in sign_lanes and graph.divided(lane):
             continue  # the ring of a roundabout, a motorway
         if graph.kind[lane] == LaneType.DRIVING:
-            give_way = bool(graph.signal_virtual[signal]) and lane not in stopped
+            give_way = bool(graph.signal_virtual[signal]) and lane not in stop_sign_lanes
             _stop(soup, graph, lane, s, give_way=give_way, look=look)
-    for k in range(len(graph.crosswalk_offset) - 1):
-        _crosswalk(soup, graph.crosswalk(k).astype(np.float64), look)
+    for crosswalk in range(len(graph.crosswalk_offset) - 1):
+        _crosswalk(soup, graph.crosswalk(crosswalk).astype(np.float64), look)
 
 
 def _lines(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> None:
     """Lines at both sides of a lane; a line between two lanes is painted by the lower of them."""
-    for share, marking, beside in (
+    for share, marking, neighbour in (
         (1.0, int(graph.left_marking[lane]), int(graph.left[lane])),
         (0.0, int(graph.right_marking[lane]), int(graph.right[lane])),
     ):
-        other = beside >= 0 and graph.kind[beside] == LaneType.DRIVING
-        if marking in (Marking.NONE, Marking.CURB) or (other and beside < lane):
+        shares_line = neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING
+        if marking in (Marking.NONE, Marking.CURB) or (shares_line and neighbour < lane):
             continue
-        oncoming = other and not graph.same_direction(lane, beside)
+        oncoming = shares_line and not graph.same_direction(lane, neighbour)
         material = look.centre if oncoming else look.white
         edge = _between_crosswalks(graph, lane_edge(graph, lane, share))
         if edge is None:
             continue
-        # lines between a lane and the shoulder lie within the lane
-        inset = 0.0 if other else (0.06 + LINE / 2) * (1.0 if share == 0.0 else -1.0)
+        # Lines between a lane and the shoulder lie within the lane.
+        inset = 0.0 if shares_line else (0.06 + LINE / 2) * (1.0 if share == 0.0 else -1.0)
         if marking == Marking.BROKEN:
             _dashes(soup, edge, inset, material)
         elif marking == Marking.DOUBLE:
@@ -76,48 +76,54 @@ def _lines(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> No
 
 
 def _between_crosswalks(graph: LaneGraph, edge: Edge) -> Edge | None:
-    """The part of a line between the crosswalks at its ends, None if nothing is left."""
-    step = np.arange(0.0, float(edge.s[-1]), 0.25)
-    at = np.stack([np.interp(step, edge.s, edge.xy[:, k]) for k in range(2)], axis=1)
-    low, high, end = 0.0, float(edge.s[-1]), float(edge.s[-1])
-    for k in range(len(graph.crosswalk_offset) - 1):
-        area = graph.crosswalk(k).astype(np.float64)
-        middle = area.mean(axis=0)
-        if min(np.hypot(*(middle - edge.xy[0])), np.hypot(*(middle - edge.xy[-1]))) > 12.0:
+    """Return the part of a line between the crosswalks at its ends, or None if nothing remains."""
+    samples = np.arange(0.0, float(edge.s[-1]), 0.25)
+    sample_points = np.stack([np.interp(samples, edge.s, edge.xy[:, column]) for column in range(2)], axis=1)
+    lower, upper, length = 0.0, float(edge.s[-1]), float(edge.s[-1])
+    for column in range(len(graph.crosswalk_offset) - 1):
+        corners = graph.crosswalk(column).astype(np.float64)
+        centre = corners.mean(axis=0)
+        if min(np.hypot(*(centre - edge.xy[0])), np.hypot(*(centre - edge.xy[-1]))) > 12.0:
             continue
-        hit = step[polygon_distance(at, area) < 0.3]
-        if len(hit) and hit[0] < 0.5 * end:
-            low = max(low, float(hit[-1]) + 0.1)
-        elif len(hit):
-            high = min(high, float(hit[0]) - 1.2)
-    if high - low < 1.0:
+        covered = samples[polygon_distance(sample_points, corners) < 0.3]
+        if len(covered) and covered[0] < 0.5 * length:
+            lower = max(lower, float(covered[-1]) + 0.1)
+        elif len(covered):
+            upper = min(upper, float(covered[0]) - 1.2)
+    if upper - lower < 1.0:
         return None
-    inner = edge.s[(edge.s > low + 0.05) & (edge.s < high - 0.05)]
-    s = np.concatenate([[low], inner, [high]])
+    inner_s = edge.s[(edge.s > lower + 0.05) & (edge.s < upper - 0.05)]
+    s = np.concatenate([[lower], inner_s, [upper]])
     yaw = np.interp(s, edge.s, np.unwrap(edge.yaw))
-    xy = np.stack([np.interp(s, edge.s, edge.xy[:, k]) for k in range(2)], axis=1)
-    return Edge(edge.lane, xy, yaw, s - low)
+    xy = np.stack([np.interp(s, edge.s, edge.xy[:, column]) for column in range(2)], axis=1)
+    return Edge(edge.lane, xy, yaw, s - lower)
 
 
 def _strip(
     soup: TriangleBuilder, edge: Edge, aside: float, material: int, *, width: float = LINE, z: float = PAINT
 ) -> None:
     """A line along an edge, `aside` m to its left."""
-    middle = edge.xy + aside * edge.normal
-    half = 0.5 * width * edge.normal
-    soup.add(ribbon(middle + half, middle - half, (z, z), material, levels=VISIBLE))
+    centre_line = edge.xy + aside * edge.normal
+    half_width = 0.5 * width * edge.normal
+    soup.add(ribbon(centre_line + half_width, centre_line - half_width, (z, z), material, levels=VISIBLE))
 
 
 def _dashes(soup: TriangleBuilder, edge: Edge, aside: float, material: int) -> None:
     """Dashes that begin and end with half a space."""
     period = DASH + SPACE
     count = max(1, round(float(edge.s[-1]) / period))
-    start = (np.arange(count) + 0.5) * float(edge.s[-1]) / count - DASH / 2
-    cut = np.stack([start, start + DASH / 2, start + DASH], axis=1).clip(0.0, edge.s[-1])
-    xy = np.stack([np.interp(cut, edge.s, edge.xy[:, k] + aside * edge.normal[:, k]) for k in range(2)], axis=-1)
-    normal = np.stack([np.interp(cut, edge.s, edge.normal[:, k]) for k in range(2)], axis=-1) * 0.5 * LINE
+    starts = (np.arange(count) + 0.5) * float(edge.s[-1]) / count - DASH / 2
+    # Each dash has a middle point, so that it follows bends of the road.
+    cut_s = np.stack([starts, starts + DASH / 2, starts + DASH], axis=1).clip(0.0, edge.s[-1])
+    xy = np.stack(
+        [np.interp(cut_s, edge.s, edge.xy[:, column] + aside * edge.normal[:, column]) for column in range(2)], axis=-1
+    )
+    normal = np.stack([np.interp(cut_s, edge.s, edge.normal[:, column]) for column in range(2)], axis=-1) * 0.5 * LINE
     left, right = xy + normal, xy - normal
-    quads = [np.stack([right[:, k], right[:, k + 1], left[:, k + 1], left[:, k]], axis=1) for k in range(2)]
+    quads = [
+        np.stack([right[:, column], right[:, column + 1], left[:, column + 1], left[:, column]], axis=1)
+        for column in range(2)
+    ]
     _paint(soup, np.concatenate(quads), material)
 
 
@@ -132,48 +138,59 @@ def _stop(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, *, give_
     give_way: no signal or stop sign stands here.
     """
     x, y, yaw, width = graph.at(lane, s)
-    half = 0.5 * width - 0.12
+    half_width = 0.5 * width - 0.12
     if give_way:
-        at = np.arange(-half, half - 0.3, 0.75)[:, None, None]
+        tooth_offsets = np.arange(-half_width, half_width - 0.3, 0.75)[:, None, None]
         tooth = np.array([[0.5, 0.0], [0.5, 0.44], [0.0, 0.22]])
-        _paint(soup, place((x, y, yaw), tooth + at * [0.0, 1.0]), look.white)
+        _paint(soup, place((x, y, yaw), tooth + tooth_offsets * [0.0, 1.0]), look.white)
     else:
-        box = np.array([[[0.0, -half], [STOP, -half], [STOP, half], [0.0, half]]])
-        _paint(soup, place((x, y, yaw), box), look.white)
-    beside = [int(n) for n in (graph.left[lane], graph.right[lane]) if n >= 0]
-    if any(graph.kind[n] == LaneType.DRIVING and graph.same_direction(lane, n) for n in beside) and s > 30.0:
+        bar = np.array([[[0.0, -half_width], [STOP, -half_width], [STOP, half_width], [0.0, half_width]]])
+        _paint(soup, place((x, y, yaw), bar), look.white)
+    neighbours = [int(neighbour) for neighbour in (graph.left[lane], graph.right[lane]) if neighbour >= 0]
+    if (
+        any(
+            graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour)
+            for neighbour in neighbours
+        )
+        and s > 30.0
+    ):
         _arrows(soup, graph, lane, s, look)
 
 
 def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, look: Look) -> None:
     """Arrows for the turns that a lane leads to, twice before the stop line."""
-    ways = set()
-    for after in graph.successors(lane).tolist():
-        part = graph.points(after)
-        turn = float((graph.yaw[part.stop - 1] - graph.yaw[part.start] + np.pi) % (2 * np.pi) - np.pi)
-        ways.add("ahead" if abs(turn) < 0.5 else "left" if turn > 0 else "right")
-    for back in (9.0, 24.0):
-        x, y, yaw, _ = graph.at(lane, s - back)
-        for way in sorted(ways):
-            for polygon in _ARROW["ahead" if way == "ahead" else "left"]:
-                points = np.array([polygon])
-                if way == "right":
-                    points = points[:, ::-1] * [1.0, -1.0]
-                _paint(soup, place((x, y, yaw), points), look.white)
+    directions = set()
+    for successor in graph.successors(lane).tolist():
+        part = graph.points(successor)
+        turn_angle = float((graph.yaw[part.stop - 1] - graph.yaw[part.start] + np.pi) % (2 * np.pi) - np.pi)
+        directions.add("ahead" if abs(turn_angle) < 0.5 else "left" if turn_angle > 0 else "right")
+    for distance in (9.0, 24.0):
+        x, y, yaw, _ = graph.at(lane, s - distance)
+        for direction in sorted(directions):
+            for polygon in _ARROW["ahead" if direction == "ahead" else "left"]:
+                polygon_points = np.array([polygon])
+                if direction == "right":
+                    polygon_points = polygon_points[:, ::-1] * [1.0, -1.0]
+                _paint(soup, place((x, y, yaw), polygon_points), look.white)
 
 
 def _crosswalk(soup: TriangleBuilder, corners: F64, look: Look) -> None:
     """Bars along the traffic, over a rectangle [4, 2]: along its shorter sides."""
     if len(corners) != 4:
         return
-    a, b = corners[1] - corners[0], corners[3] - corners[0]
-    along, across = (a, b) if np.hypot(*a) < np.hypot(*b) else (b, a)
-    wide = float(np.hypot(*across))
-    unit = across / wide
-    count = int((wide - 0.5) // (2 * BAR))
-    start = 0.5 * (wide - (2 * count - 1) * BAR) + 2 * BAR * np.arange(count)
-    foot = corners[0] + start[:, None] * unit
-    quads = np.stack([foot, foot + along, foot + along + BAR * unit, foot + BAR * unit], axis=1)
+    first_side, second_side = corners[1] - corners[0], corners[3] - corners[0]
+    along, across = (
+        (first_side, second_side) if np.hypot(*first_side) < np.hypot(*second_side) else (second_side, first_side)
+    )
+    span = float(np.hypot(*across))
+    unit = across / span
+    count = int((span - 0.5) // (2 * BAR))
+    bar_starts = 0.5 * (span - (2 * count - 1) * BAR) + 2 * BAR * np.arange(count)
+    bar_corners = corners[0] + bar_starts[:, None] * unit
+    quads = np.stack(
+        [bar_corners, bar_corners + along, bar_corners + along + BAR * unit, bar_corners + BAR * unit], axis=1
+    )
+    # Faces must be counter-clockwise seen from above, whichever way the rectangle runs.
     if along[0] * unit[1] - along[1] * unit[0] < 0.0:
         quads = quads[:, ::-1]
     _paint(soup, quads, look.white)
@@ -187,13 +204,13 @@ def _worn(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> Non
     length = float(graph.length[lane])
     for _ in range(rng.poisson(length / 45.0)):
         x, y, yaw, width = graph.at(lane, float(rng.uniform(2.0, max(2.1, length - 6.0))))
-        long, wide = rng.uniform(1.0, 4.0), rng.uniform(0.6, 0.8 * width)
-        aside = rng.uniform(-0.5, 0.5) * (width - wide)
-        low, high = aside - wide / 2, aside + wide / 2
-        box = np.array([[[0.0, low], [long, low], [long, high], [0.0, high]]])
-        _paint(soup, place((x, y, yaw), box), look.patch, z=WEAR, levels=NEAR)
-    angle = np.arange(8) * np.pi / 4
-    disc = 0.32 * np.stack([np.cos(angle), np.sin(angle)], axis=1)[None]
+        patch_length, patch_width = rng.uniform(1.0, 4.0), rng.uniform(0.6, 0.8 * width)
+        aside = rng.uniform(-0.5, 0.5) * (width - patch_width)
+        lower, upper = aside - patch_width / 2, aside + patch_width / 2
+        patch = np.array([[[0.0, lower], [patch_length, lower], [patch_length, upper], [0.0, upper]]])
+        _paint(soup, place((x, y, yaw), patch), look.patch, z=WEAR, levels=NEAR)
+    angles = np.arange(8) * np.pi / 4
+    disc = 0.32 * np.stack([np.cos(angles), np.sin(angles)], axis=1)[None]
     for _ in range(rng.poisson(length / 40.0)):
         x, y, yaw, width = graph.at(lane, float(rng.uniform(1.0, max(1.1, length - 1.0))))
         cover = place((x, y, yaw), disc + np.array([0.0, rng.uniform(-0.3, 0.3) * width]))

@@ -1,4 +1,4 @@
-"""The static geometry of a town as a camera sees it: triangles, materials, tiles with levels of detail, masts.
+"""Static geometry of a town for the camera: triangles, materials, tiles with levels of detail, masts.
 
 Shape letters: V vertices, F faces, M masts, H signal heads. World frame, metres, radians.
 """
@@ -77,50 +77,74 @@ class Street:
     parking: F32
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
+        # Streets are cached and shared between scenes, so their arrays must not change.
+        for field in fields(self):
+            value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
 
     def tile_faces(self, tile: int, level: int = 0) -> I32:
-        """Faces of one tile at one level (0 full, 2 coarsest)."""
+        """Return the faces of one tile at one level (0 full, 2 coarsest)."""
         return self.order[self.offset[level, tile] : self.offset[level, tile + 1]]
 
     def select(self, eye: tuple[float, float], *, far: float = 500.0, reach: tuple[float, float] = REACH) -> I32:
-        """Faces that a camera at x, y needs: near tiles at level 0, then 1, then 2 up to `far` m, and the horizon.
+        """Return the faces that a camera at x, y needs.
 
-        The distance of a tile is that of its nearest point.
+        Near tiles come at level 0, then 1, then 2 up to `far` m; the horizon is always included. The distance of a
+        tile is that of its nearest point.
         """
-        parts = [self.tile_faces(self.nx * self.ny)]
-        for tile, away in enumerate(self._away(eye)):
-            if away <= far:
-                parts.append(self.tile_faces(tile, 0 if away <= reach[0] else 1 if away <= reach[1] else 2))
-        return np.concatenate(parts)
+        selections = [self.tile_faces(self.nx * self.ny)]
+        for tile_index, distance in enumerate(self._away(eye)):
+            if distance <= far:
+                selections.append(
+                    self.tile_faces(tile_index, 0 if distance <= reach[0] else 1 if distance <= reach[1] else 2)
+                )
+        return np.concatenate(selections)
 
     def _away(self, eye: tuple[float, float]) -> npt.NDArray[np.float64]:
-        """Distance [nx * ny] of each tile from a point, m."""
-        gaps = []
+        """Return the distance [nx * ny] of each tile from a point, m."""
+        axis_gaps = []
         for axis, count in ((0, self.nx), (1, self.ny)):
-            low = self.origin[axis] + self.tile * np.arange(count)
-            gaps.append(np.maximum(np.maximum(low - eye[axis], eye[axis] - low - self.tile), 0.0))
-        return np.asarray(np.hypot(gaps[0][None, :], gaps[1][:, None]).reshape(-1))
+            lower_edges = self.origin[axis] + self.tile * np.arange(count)
+            axis_gaps.append(np.maximum(np.maximum(lower_edges - eye[axis], eye[axis] - lower_edges - self.tile), 0.0))
+        return np.asarray(np.hypot(axis_gaps[0][None, :], axis_gaps[1][:, None]).reshape(-1))
 
     def check(self) -> None:
-        """FormatError (one line): arrays that contradict each other."""
-        f, tiles = len(self.faces), self.nx * self.ny + 1
+        """Check that the arrays agree with each other.
+
+        Raises:
+            FormatError: They do not; the message is one line.
+        """
+        face_count, tile_count = len(self.faces), self.nx * self.ny + 1
 
         def require(ok: bool, what: str) -> None:
             if not ok:
                 raise FormatError(f"street of {self.name}: {what}; delete the cached file and build it again")
 
-        shapes = {"normals": (f, 3, 3), "uv": (f, 3, 2), "material": (f,), "offset": (LEVELS, tiles + 1)}
-        for name, shape in shapes.items():
-            require(getattr(self, name).shape == shape, f"{name} has shape {getattr(self, name).shape}, not {shape}")
-        for name in ("vertices", "normals", "uv", "lamps", "heads", "parking"):
-            require(bool(np.isfinite(getattr(self, name)).all()), f"{name} holds a number that is not finite")
-        for name, size in (("faces", len(self.vertices)), ("material", len(self.materials)), ("order", f)):
-            value = getattr(self, name)
-            require(value.size > 0 and value.min() >= 0 and value.max() < size, f"{name} points outside the table")
+        shapes = {
+            "normals": (face_count, 3, 3),
+            "uv": (face_count, 3, 2),
+            "material": (face_count,),
+            "offset": (LEVELS, tile_count + 1),
+        }
+        for array_name, shape in shapes.items():
+            require(
+                getattr(self, array_name).shape == shape,
+                f"{array_name} has shape {getattr(self, array_name).shape}, not {shape}",
+            )
+        for array_name in ("vertices", "normals", "uv", "lamps", "heads", "parking"):
+            require(
+                bool(np.isfinite(getattr(self, array_name)).all()), f"{array_name} holds a number that is not finite"
+            )
+        for array_name, limit in (
+            ("faces", len(self.vertices)),
+            ("material", len(self.materials)),
+            ("order", face_count),
+        ):
+            value = getattr(self, array_name)
+            require(
+                value.size > 0 and value.min() >= 0 and value.max() < limit, f"{array_name} points outside the table"
+            )
         require(bool((np.diff(self.offset, axis=1) >= 0).all()), "offset does not grow")
         require(int(self.offset.max()) == len(self.order), "offset does not cover the order")
         require(len(self.head_signal) == len(self.heads) == len(self.head_lens), "heads do not agree")
@@ -136,37 +160,45 @@ def save_street(street: Street, path: Path | str) -> None:
     Raises:
         StoreError: The file cannot be written.
     """
-    table = street.materials
-    head = [f"ssad-street {FORMAT}", street.name, street.style]
+    materials = street.materials
+    header = [f"ssad-street {FORMAT}", street.name, street.style]
     arrays: dict[str, npt.NDArray[Any]] = {
-        "header": np.array(head),
+        "header": np.array(header),
         "size": np.array([street.tile, *street.origin, street.nx, street.ny], np.float64),
-        "material_name": np.array([m.name for m in table]),
-        "material_value": np.array([[*m.colour, *(getattr(m, k) for k in _MATERIAL), m.paint] for m in table]),
+        "material_name": np.array([material.name for material in materials]),
+        "material_value": np.array(
+            [
+                [*material.colour, *(getattr(material, attribute) for attribute in _MATERIAL), material.paint]
+                for material in materials
+            ]
+        ),
     }
     save_npz(path, arrays | {name: getattr(street, name) for name in _ARRAYS})
 
 
 def load_street(path: Path | str) -> Street:
-    """Read what `save_street` wrote.
+    """Read a street that `save_street` wrote.
 
     Raises:
         FormatError: The file is missing, broken, or not a street.
     """
     arrays = load_npz(path)
     header = arrays.get("header")
-    wanted = {"header", "size", "material_name", "material_value", *_ARRAYS}
-    if header is None or header.shape != (3,) or str(header[0]) != f"ssad-street {FORMAT}" or set(arrays) != wanted:
+    expected = {"header", "size", "material_name", "material_value", *_ARRAYS}
+    # A cached file of another format is rejected here and built again by `cached_street`.
+    if header is None or header.shape != (3,) or str(header[0]) != f"ssad-street {FORMAT}" or set(arrays) != expected:
         raise FormatError(f"{path}: not a street of format {FORMAT}; delete it and build the street again")
-    for name, dtype in _ARRAYS.items():
-        if arrays[name].dtype != dtype:
-            raise FormatError(f"{path}: array {name} is {arrays[name].dtype}; delete it and build the street again")
-    size, value = arrays["size"], arrays["material_value"]
-    if size.shape != (5,) or value.shape != (len(arrays["material_name"]), 7):
+    for array_name, dtype in _ARRAYS.items():
+        if arrays[array_name].dtype != dtype:
+            raise FormatError(
+                f"{path}: array {array_name} is {arrays[array_name].dtype}; delete it and build the street again"
+            )
+    size, material_values = arrays["size"], arrays["material_value"]
+    if size.shape != (5,) or material_values.shape != (len(arrays["material_name"]), 7):
         raise FormatError(f"{path}: its tables are cut short; delete it and build the street again")
     materials = tuple(
-        Material(str(name), (row[0], row[1], row[2]), row[3], row[4], row[5], bool(row[6]))
-        for name, row in zip(arrays["material_name"].tolist(), value.tolist(), strict=True)
+        Material(str(array_name), (values[0], values[1], values[2]), values[3], values[4], values[5], bool(values[6]))
+        for array_name, values in zip(arrays["material_name"].tolist(), material_values.tolist(), strict=True)
     )
     street = Street(
         name=str(header[1]),
@@ -176,7 +208,7 @@ def load_street(path: Path | str) -> Street:
         origin=(float(size[1]), float(size[2])),
         nx=int(size[3]),
         ny=int(size[4]),
-        **{name: arrays[name] for name in _ARRAYS},
+        **{array_name: arrays[array_name] for array_name in _ARRAYS},
     )
     street.check()
     return street

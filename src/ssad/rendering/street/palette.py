@@ -1,4 +1,4 @@
-"""Styles of towns and the colours of one town: drawn anew for each seed, so that no wall is seen twice."""
+"""Styles of towns and the colours of one town, drawn anew for each seed so that walls rarely repeat."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ ASPHALT = (0.088, 0.088, 0.092)  # linear RGB; towns differ a little
 
 @dataclass(frozen=True)
 class TownStyle:
-    """What lines the streets of a kind of town.
+    """Buildings, plants and furniture that line the streets of a kind of town.
 
     Attributes:
         buildings: Kind -> weight, along streets.
         back: Kind -> weight, inside blocks.
-        setback: Least and largest distance from the sidewalk, m.
-        gap: Least and largest distance between neighbours, m.
+        setback: Smallest and largest distance from the sidewalk, m.
+        gap: Smallest and largest distance between neighbours, m.
         earth: Name of the ground.
         trees: Number for 1,000 m^2 of open ground.
         rows: Distance between street trees, m; 0: none.
@@ -137,7 +137,7 @@ OF_TOWN = {
 
 
 def style_of(town: str, style: str | None = None) -> str:
-    """Name of the style asked for, or else of the one that belongs to the town.
+    """Return the name of the requested style, or of the default style of the town.
 
     Raises:
         UnknownNameError: There is no such style.
@@ -148,7 +148,7 @@ def style_of(town: str, style: str | None = None) -> str:
     return name
 
 
-# linear RGB of what is found in streets
+# linear RGB of common street materials
 _PLASTER = [
     (0.68, 0.65, 0.58),
     (0.60, 0.52, 0.37),
@@ -201,7 +201,7 @@ _WALLS = {
 
 @dataclass
 class Look:
-    """The materials of one town, as indices into its palette, and the generator that draws all else."""
+    """Materials of one town, as indices into its palette, and the generator that draws everything else."""
 
     style: TownStyle
     palette: Palette
@@ -210,16 +210,17 @@ class Look:
     leaves: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        # The order of the draws is part of a town's look: append new materials at the end.
         add = self.palette.add
-        grey = self.generator.uniform(0.9, 1.12)
-        self.asphalt = add("asphalt", np.array(ASPHALT) * grey, gloss=0.15)
-        self.patch = add("asphalt_patch", np.array([0.055, 0.055, 0.058]) * grey, gloss=0.2)
-        self.worn = add("asphalt_worn", np.array([0.097, 0.096, 0.098]) * grey, gloss=0.12)
+        brightness = self.generator.uniform(0.9, 1.12)
+        self.asphalt = add("asphalt", np.array(ASPHALT) * brightness, gloss=0.15)
+        self.patch = add("asphalt_patch", np.array([0.055, 0.055, 0.058]) * brightness, gloss=0.2)
+        self.worn = add("asphalt_worn", np.array([0.097, 0.096, 0.098]) * brightness, gloss=0.12)
         self.slab = add("paving", self._jitter((0.27, 0.255, 0.235), 0.06))
         self.kerb = add("kerb", self._jitter((0.37, 0.365, 0.35), 0.04))
         self.drive = add("driveway", self._jitter((0.22, 0.20, 0.185), 0.08))
-        base = self._jitter(_EARTH[self.style.earth], 0.10)
-        self.earth = add(self.style.earth, base)
+        earth_colour = self._jitter(_EARTH[self.style.earth], 0.10)
+        self.earth = add(self.style.earth, earth_colour)
         self.dry = add("dry_grass", self._jitter((0.20, 0.185, 0.085), 0.08))
         self.soil = add("soil", self._jitter((0.11, 0.082, 0.055), 0.08))
         self.lawn = add("lawn", self._jitter(_EARTH["lawn"], 0.1))
@@ -231,41 +232,42 @@ class Look:
         self.centre = self.yellow if self.style.yellow else self.white
         self.iron = add("cast_iron", (0.045, 0.045, 0.048), gloss=0.4)
         self.metal = add("galvanised", (0.36, 0.37, 0.38), specular=0.3, gloss=0.5)
-        post = (0.06, 0.075, 0.07) if self.style.old else (0.30, 0.31, 0.32)
-        self.pole = add("lamp_post", self._jitter(post, 0.1), gloss=0.4)
+        post_colour = (0.06, 0.075, 0.07) if self.style.old else (0.30, 0.31, 0.32)
+        self.pole = add("lamp_post", self._jitter(post_colour, 0.1), gloss=0.4)
         self.black = add("black_plastic", (0.02, 0.02, 0.022), gloss=0.4)
         self.glow = add("lamp_light", (0.85, 0.80, 0.68), gloss=0.5)
         self.red = add("signal_red", (0.30, 0.02, 0.015), gloss=0.6)
         self.amber = add("signal_amber", (0.30, 0.14, 0.01), gloss=0.6)
         self.green = add("signal_green", (0.01, 0.22, 0.10), gloss=0.6)
         self.glass = [
-            add("window", self._jitter(c, 0.3), specular=0.09, gloss=0.9)
-            for c in ((0.035, 0.045, 0.055), (0.05, 0.055, 0.055), (0.02, 0.028, 0.036), (0.07, 0.085, 0.10))
+            add("window", self._jitter(rgb, 0.3), specular=0.09, gloss=0.9)
+            for rgb in ((0.035, 0.045, 0.055), (0.05, 0.055, 0.055), (0.02, 0.028, 0.036), (0.07, 0.085, 0.10))
         ]
         self.blind = [
-            add("window_blind", self._jitter(c, 0.1), specular=0.06, gloss=0.7)
-            for c in ((0.36, 0.34, 0.30), (0.20, 0.20, 0.19))
+            add("window_blind", self._jitter(rgb, 0.1), specular=0.06, gloss=0.7)
+            for rgb in ((0.36, 0.34, 0.30), (0.20, 0.20, 0.19))
         ]
         self.shop = [
-            add("shop_window", self._jitter(c, 0.3), specular=0.09, gloss=0.9)
-            for c in ((0.10, 0.09, 0.07), (0.05, 0.06, 0.07))
+            add("shop_window", self._jitter(rgb, 0.3), specular=0.09, gloss=0.9)
+            for rgb in ((0.10, 0.09, 0.07), (0.05, 0.06, 0.07))
         ]
-        self.frame = [add("window_frame", c) for c in ((0.68, 0.68, 0.66), (0.10, 0.09, 0.08), (0.32, 0.33, 0.34))]
-        self.stone = [add("stone", self._jitter(c, 0.08)) for c in ((0.46, 0.43, 0.37), (0.34, 0.33, 0.31))]
-        for name, table in _WALLS.items():
+        self.frame = [add("window_frame", rgb) for rgb in ((0.68, 0.68, 0.66), (0.10, 0.09, 0.08), (0.32, 0.33, 0.34))]
+        self.stone = [add("stone", self._jitter(rgb, 0.08)) for rgb in ((0.46, 0.43, 0.37), (0.34, 0.33, 0.31))]
+        for name, colours in _WALLS.items():
             gloss = 0.4 if name in ("cladding", "sheet", "door") else 0.1
-            self.walls[name] = [add(name, self._jitter(c, 0.12), gloss=gloss) for c in table for _ in range(2)]
+            self.walls[name] = [add(name, self._jitter(rgb, 0.12), gloss=gloss) for rgb in colours for _ in range(2)]
         self.flat_roof = add("roofing_felt", self._jitter((0.13, 0.13, 0.13), 0.15))
-        self.bark = [add("bark", c) for c in ((0.085, 0.062, 0.045), (0.45, 0.44, 0.40))]
+        self.bark = [add("bark", rgb) for rgb in ((0.085, 0.062, 0.045), (0.45, 0.44, 0.40))]
         for kind, colour in _LEAF.items():
             self.leaves[kind] = [add(f"leaves_{kind}", self._jitter(colour, 0.22)) for _ in range(5)]
         self.hedge = [add("hedge", self._jitter((0.045, 0.095, 0.025), 0.2)) for _ in range(3)]
         self.wood = [
-            add("wood", self._jitter(c, 0.15)) for c in ((0.20, 0.13, 0.075), (0.55, 0.54, 0.50), (0.12, 0.08, 0.05))
+            add("wood", self._jitter(rgb, 0.15))
+            for rgb in ((0.20, 0.13, 0.075), (0.55, 0.54, 0.50), (0.12, 0.08, 0.05))
         ]
         self.sign = {
-            name: add(f"sign_{name}", c, gloss=0.4)
-            for name, c in (
+            name: add(f"sign_{name}", rgb, gloss=0.4)
+            for name, rgb in (
                 ("white", (0.78, 0.78, 0.76)),
                 ("red", (0.42, 0.015, 0.02)),
                 ("blue", (0.01, 0.08, 0.36)),
@@ -275,10 +277,10 @@ class Look:
         }
 
     def _jitter(self, colour: npt.ArrayLike, amount: float) -> npt.NDArray[np.float64]:
-        """A colour a little lighter or darker, and a little off in hue."""
-        lighter = self.generator.uniform(1 - amount, 1 + amount)
-        return np.asarray(colour, np.float64) * lighter * self.generator.uniform(1 - amount / 3, 1 + amount / 3, 3)
+        """Return the colour slightly lighter or darker, and slightly shifted in hue."""
+        brightness = self.generator.uniform(1 - amount, 1 + amount)
+        return np.asarray(colour, np.float64) * brightness * self.generator.uniform(1 - amount / 3, 1 + amount / 3, 3)
 
     def pick(self, name: str) -> int:
-        """One of the wall, roof or door materials of this name."""
+        """Draw one of the wall, roof or door materials of this name."""
         return int(self.generator.choice(self.walls[name]))

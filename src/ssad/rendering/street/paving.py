@@ -24,7 +24,10 @@ STRAIGHT = 16.0  # m, longest quad of a straight line
 
 @dataclass(frozen=True)
 class Edge:
-    """One side of a lane as a line: xy [n, 2], heading [n] of the traffic, s [n] m along it; normal [n, 2]: left."""
+    """One side of a lane as a line.
+
+    xy [n, 2] m; yaw [n] heading of the traffic, rad; s [n] arc length, m; normal [n, 2] points to the left.
+    """
 
     lane: int
     xy: F64
@@ -38,66 +41,73 @@ class Edge:
 
 
 def lane_edge(graph: LaneGraph, lane: int, share: float) -> Edge:
-    """The line at `share` of a lane's width from its right edge (0 right edge, 1 left edge)."""
-    part = graph.points(lane)
-    keep = _bends(graph.yaw[part], graph.s[part], graph.width[part])
-    yaw = graph.yaw[part].astype(np.float64)[keep]
-    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    width = graph.width[part].astype(np.float64)[keep]
-    xy = graph.xy[part].astype(np.float64)[keep] + left * (share - 0.5) * width[:, None]
+    """Return the line at `share` of a lane's width from its right edge (0 right edge, 1 left edge)."""
+    point_range = graph.points(lane)
+    indices = _bends(graph.yaw[point_range], graph.s[point_range], graph.width[point_range])
+    yaw = graph.yaw[point_range].astype(np.float64)[indices]
+    left_normals = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    width = graph.width[point_range].astype(np.float64)[indices]
+    xy = graph.xy[point_range].astype(np.float64)[indices] + left_normals * (share - 0.5) * width[:, None]
     s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     return Edge(lane, xy, yaw, s)
 
 
 def _bends(yaw: F32, s: F32, width: F32) -> list[int]:
-    """Points of a lane that its shape needs: on straight stretches one in `STRAIGHT` m."""
-    keep, last = [0], len(s) - 1
-    for i in range(1, last):
-        k = keep[-1]
-        turn = abs(float((yaw[i + 1] - yaw[k] + np.pi) % (2.0 * np.pi) - np.pi))
-        if turn > 0.003 or s[i + 1] - s[k] > STRAIGHT or abs(width[i + 1] - width[k]) > 0.002:
-            keep.append(i)
-    return [*keep, last]
+    """Return the indices of the lane points that its shape needs; straight stretches keep one in `STRAIGHT` m."""
+    indices, last = [0], len(s) - 1
+    for index in range(1, last):
+        previous = indices[-1]
+        heading_change = abs(float((yaw[index + 1] - yaw[previous] + np.pi) % (2.0 * np.pi) - np.pi))
+        # Long quads would make tiles draw too much, so straight lines are cut as well.
+        if (
+            heading_change > 0.003
+            or s[index + 1] - s[previous] > STRAIGHT
+            or abs(width[index + 1] - width[previous]) > 0.002
+        ):
+            indices.append(index)
+    return [*indices, last]
 
 
 def ribbon(left: F64, right: F64, z: tuple[float, float], material: int, *, levels: int = ALL) -> Piece:
-    """Quads between two lines [n, 2] at heights z (left, right)."""
-    a = np.column_stack([right, np.full(len(right), z[1])])
-    b = np.column_stack([left, np.full(len(left), z[0])])
-    return flat(np.stack([a[:-1], a[1:], b[1:], b[:-1]], axis=1), material, levels=levels)
+    """Return quads between two lines [n, 2] at heights z (left, right)."""
+    right_line = np.column_stack([right, np.full(len(right), z[1])])
+    left_line = np.column_stack([left, np.full(len(left), z[0])])
+    return flat(
+        np.stack([right_line[:-1], right_line[1:], left_line[1:], left_line[:-1]], axis=1), material, levels=levels
+    )
 
 
 def pave(soup: TriangleBuilder, graph: LaneGraph, ground: Ground, look: Look) -> None:
     """Road surface, sidewalks and kerbs, earth, far ground."""
-    low = np.array(ground.origin)
+    origin = np.array(ground.origin)
     vertices, faces = region_mesh(ground.road[::2, ::2] - 0.3)
-    soup.add(level_ground(low + 2.0 * vertices, faces, np.zeros(len(vertices)), look.asphalt))
-    for lane in np.flatnonzero(np.isin(graph.kind, [int(k) for k in WALK])).tolist():
+    soup.add(level_ground(origin + 2.0 * vertices, faces, np.zeros(len(vertices)), look.asphalt))
+    for lane in np.flatnonzero(np.isin(graph.kind, [int(lane_kind) for lane_kind in WALK])).tolist():
         _sidewalk(soup, graph, lane, look)
     vertices, faces = region_mesh(-0.7 - ground.open()[::4, ::4], largest=8)
-    xy = low + 4.0 * vertices
+    xy = origin + 4.0 * vertices
     road, walk = ground.at(ground.road, xy), ground.at(ground.walk, xy)
-    bare = BELOW + (EARTH - BELOW) * np.clip((road - 0.5) / 4.0, 0.0, 1.0)
-    middle = np.round(xy[faces].mean(axis=1) - low).astype(int)
-    inner = ground.inner | (ground.paved < 2.5)
+    bare_height = BELOW + (EARTH - BELOW) * np.clip((road - 0.5) / 4.0, 0.0, 1.0)
+    face_cells = np.round(xy[faces].mean(axis=1) - origin).astype(int)
+    is_town_ground = ground.inner | (ground.paved < 2.5)
     soup.add(
         level_ground(
             xy,
             faces,
-            np.where(walk <= road + 0.05, EARTH, bare),
-            np.where(inner[middle[:, 1], middle[:, 0]], look.earth, look.earth_far),
+            np.where(walk <= road + 0.05, EARTH, bare_height),
+            np.where(is_town_ground[face_cells[:, 1], face_cells[:, 0]], look.earth, look.earth_far),
         )
     )
     _far(soup, ground, look)
 
 
 def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) -> Piece:
-    """Nearly level triangles with upright normals and world coordinates as uv."""
-    up = np.broadcast_to([0.0, 0.0, 1.0], (len(faces), 3, 3))
+    """Return nearly level triangles with vertical normals and world coordinates as uv."""
+    normals = np.broadcast_to([0.0, 0.0, 1.0], (len(faces), 3, 3))
     return Piece(
         np.column_stack([xy, z]),
         faces,
-        up,
+        normals,
         xy[faces],
         np.broadcast_to(np.asarray(material, np.int32), len(faces)),
         np.full(len(faces), ALL, np.int32),
@@ -110,26 +120,32 @@ def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) ->
     if float(graph.width[graph.points(lane)].max()) < 0.3:
         return
     inner, outer = (left.xy, right.xy), (right.xy, left.xy)
-    stone = []
-    for side, (edge, _), beside in ((1.0, inner, int(graph.left[lane])), (-1.0, outer, int(graph.right[lane]))):
-        line = edge - side * STONE * left.normal
-        if beside < 0:
-            # the back: a face down to the earth
-            z = (0.0, KERB) if side > 0 else (KERB, 0.0)
-            soup.add(ribbon(edge, edge, z, look.slab))
-            stone.append(edge)
+    slab_edges = []
+    for side, (edge, _), neighbour in ((1.0, inner, int(graph.left[lane])), (-1.0, outer, int(graph.right[lane]))):
+        inner_line = edge - side * STONE * left.normal
+        if neighbour < 0:
+            # The back: a face down to the earth.
+            heights = (0.0, KERB) if side > 0 else (KERB, 0.0)
+            soup.add(ribbon(edge, edge, heights, look.slab))
+            slab_edges.append(edge)
             continue
-        top = (edge, line) if side > 0 else (line, edge)
+        top = (edge, inner_line) if side > 0 else (inner_line, edge)
         soup.add(ribbon(*top, (KERB, KERB), look.kerb))
-        foot = edge + side * 0.02 * left.normal
-        face = (foot, edge) if side > 0 else (edge, foot)
-        soup.add(ribbon(*face, (-0.02, KERB) if side > 0 else (KERB, -0.02), look.kerb))
-        stone.append(line)
-    soup.add(ribbon(stone[0], stone[1], (KERB, KERB), look.slab))
-    for neighbours, at, order in ((graph.predecessors(lane), 0, (0, 1)), (graph.successors(lane), -1, (1, 0))):
+        base_line = edge + side * 0.02 * left.normal
+        face_lines = (base_line, edge) if side > 0 else (edge, base_line)
+        soup.add(ribbon(*face_lines, (-0.02, KERB) if side > 0 else (KERB, -0.02), look.kerb))
+        slab_edges.append(inner_line)
+    soup.add(ribbon(slab_edges[0], slab_edges[1], (KERB, KERB), look.slab))
+    for neighbours, end_index, corner_order in (
+        (graph.predecessors(lane), 0, (0, 1)),
+        (graph.successors(lane), -1, (1, 0)),
+    ):
         if not len(neighbours):
-            p, q = (left.xy[at], right.xy[at])[order[0]], (left.xy[at], right.xy[at])[order[1]]
-            corners = [[*p, -0.02], [*q, -0.02], [*q, KERB], [*p, KERB]]
+            first_corner, second_corner = (
+                (left.xy[end_index], right.xy[end_index])[corner_order[0]],
+                (left.xy[end_index], right.xy[end_index])[corner_order[1]],
+            )
+            corners = [[*first_corner, -0.02], [*second_corner, -0.02], [*second_corner, KERB], [*first_corner, KERB]]
             soup.add(flat(np.array([corners]), look.kerb))
 
 
@@ -137,34 +153,46 @@ def _far(soup: TriangleBuilder, ground: Ground, look: Look) -> None:
     """Ground to the horizon and two rows of hills, in every view."""
     x0, y0 = np.array(ground.origin) + 1.0
     x1, y1 = np.array(ground.origin) + np.array(ground.paved.shape[::-1]) - 2.0
-    middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
-    n = 8
-    t = np.arange(n) / n
-    inner = np.concatenate(
+    centre = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
+    points_per_side = 8
+    shares = np.arange(points_per_side) / points_per_side
+    border = np.concatenate(
         [
-            np.stack([x0 + t * (x1 - x0), y0 + 0 * t], 1),
-            np.stack([x1 + 0 * t, y0 + t * (y1 - y0)], 1),
-            np.stack([x1 - t * (x1 - x0), y1 + 0 * t], 1),
-            np.stack([x0 + 0 * t, y1 - t * (y1 - y0)], 1),
+            np.stack([x0 + shares * (x1 - x0), y0 + 0 * shares], 1),
+            np.stack([x1 + 0 * shares, y0 + shares * (y1 - y0)], 1),
+            np.stack([x1 - shares * (x1 - x0), y1 + 0 * shares], 1),
+            np.stack([x0 + 0 * shares, y1 - shares * (y1 - y0)], 1),
         ]
     )
-    away = inner - middle
-    rings = [inner]
-    for radius in (1.2 * float(np.hypot(*away.T).max()), FAR_AWAY):
-        rings.append(middle + radius * away / np.hypot(*away.T)[:, None])
-    for a, b in pairwise(rings):
-        low, high = np.vstack([a, a[:1]]), np.vstack([b, b[:1]])
-        soup.add(ribbon(low, high, (EARTH - 0.04, EARTH - 0.04), look.earth_far), HORIZON_OWNER)
-    # a plane under everything, so that no pixel between two triangles shows the sky
+    offsets = border - centre
+    rings = [border]
+    for radius in (1.2 * float(np.hypot(*offsets.T).max()), FAR_AWAY):
+        rings.append(centre + radius * offsets / np.hypot(*offsets.T)[:, None])
+    for lower_ring, upper_ring in pairwise(rings):
+        inner_line, outer_line = np.vstack([lower_ring, lower_ring[:1]]), np.vstack([upper_ring, upper_ring[:1]])
+        soup.add(ribbon(inner_line, outer_line, (EARTH - 0.04, EARTH - 0.04), look.earth_far), HORIZON_OWNER)
+    # A plane under everything keeps the sky from showing through between two triangles.
     corners = [[x0, y0, -0.4], [x1, y0, -0.4], [x1, y1, -0.4], [x0, y1, -0.4]]
     soup.add(flat(np.array([corners]), look.earth_far), HORIZON_OWNER)
-    span = float(np.hypot(*away.T).max())
-    angle = np.linspace(0.0, 2.0 * np.pi, 97)
-    for radius, tall, material in ((span + 350.0, 16.0, look.hill_near), (span + 1400.0, 90.0, look.hill_far)):
-        phase = look.generator.uniform(0.0, 2.0 * np.pi, 5)
-        wave = sum(np.sin(k * angle + p) / k**0.5 for k, p in zip((2, 3, 5, 9, 14), phase, strict=True))
-        z = tall * (0.55 + 0.22 * wave)
-        ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        foot, crest = middle + radius * ring, middle + (radius + 3.0 * tall) * ring
-        a, b = np.column_stack([foot, 0.0 * z]), np.column_stack([crest, np.maximum(z, 0.2 * tall)])
-        soup.add(flat(np.stack([a[1:], a[:-1], b[:-1], b[1:]], axis=1), material), HORIZON_OWNER)
+    town_radius = float(np.hypot(*offsets.T).max())
+    angles = np.linspace(0.0, 2.0 * np.pi, 97)
+    for radius, height, material in (
+        (town_radius + 350.0, 16.0, look.hill_near),
+        (town_radius + 1400.0, 90.0, look.hill_far),
+    ):
+        phases = look.generator.uniform(0.0, 2.0 * np.pi, 5)
+        skyline = sum(
+            np.sin(frequency * angles + phase_shift) / frequency**0.5
+            for frequency, phase_shift in zip((2, 3, 5, 9, 14), phases, strict=True)
+        )
+        crest_heights = height * (0.55 + 0.22 * skyline)
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        base_line, crest_line = centre + radius * directions, centre + (radius + 3.0 * height) * directions
+        lower_ring, upper_ring = (
+            np.column_stack([base_line, 0.0 * crest_heights]),
+            np.column_stack([crest_line, np.maximum(crest_heights, 0.2 * height)]),
+        )
+        soup.add(
+            flat(np.stack([lower_ring[1:], lower_ring[:-1], upper_ring[:-1], upper_ring[1:]], axis=1), material),
+            HORIZON_OWNER,
+        )

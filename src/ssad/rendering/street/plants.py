@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges: a trunk, dark blobs for the inside of the crown, and leaves as triangles around them."""
+"""Trees, bushes and hedges: a trunk, dark blobs inside the crown, and leaves as triangles around them."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ VISIBLE = NEAR | MID
 
 
 def _ball() -> tuple[F64, np.ndarray]:
-    """Vertices [12, 3] and faces [20, 3] of an icosahedron."""
-    g = (1.0 + 5.0**0.5) / 2.0
-    v = np.array(
+    """Return the unit vertices [12, 3] and faces [20, 3] of an icosahedron."""
+    golden_ratio = (1.0 + 5.0**0.5) / 2.0
+    vertices = np.array(
         [
-            (-1, g, 0),
-            (1, g, 0),
-            (-1, -g, 0),
-            (1, -g, 0),
-            (0, -1, g),
-            (0, 1, g),
-            (0, -1, -g),
-            (0, 1, -g),
-            (g, 0, -1),
-            (g, 0, 1),
-            (-g, 0, -1),
-            (-g, 0, 1),
+            (-1, golden_ratio, 0),
+            (1, golden_ratio, 0),
+            (-1, -golden_ratio, 0),
+            (1, -golden_ratio, 0),
+            (0, -1, golden_ratio),
+            (0, 1, golden_ratio),
+            (0, -1, -golden_ratio),
+            (0, 1, -golden_ratio),
+            (golden_ratio, 0, -1),
+            (golden_ratio, 0, 1),
+            (-golden_ratio, 0, -1),
+            (-golden_ratio, 0, 1),
         ],
         np.float64,
     )
-    f = np.array(
+    faces = np.array(
         [
             (0, 11, 5),
             (0, 5, 1),
@@ -58,7 +58,7 @@ def _ball() -> tuple[F64, np.ndarray]:
             (9, 8, 1),
         ]
     )
-    return v / np.linalg.norm(v[0]), f
+    return vertices / np.linalg.norm(vertices[0]), faces
 
 
 BALL, BALL_FACES = _ball()
@@ -68,30 +68,41 @@ def blob(centre: F64, radius: F64, material: int, look: Look, *, levels: int, ro
     """An uneven ellipsoid of 20 triangles, shaded smooth."""
     rng = look.generator
     angle = rng.uniform(0.0, 2.0 * np.pi)
-    c, s = np.cos(angle), np.sin(angle)
-    unit = BALL @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    v = unit * radius * rng.uniform(1 - rough, 1 + rough, (12, 1)) + centre
-    return smooth(v, BALL_FACES, unit / radius, material, levels=levels)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    directions = BALL @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    vertices = directions * radius * rng.uniform(1 - rough, 1 + rough, (12, 1)) + centre
+    return smooth(vertices, BALL_FACES, directions / radius, material, levels=levels)
 
 
 def leaves(centre: F64, radius: F64, look: Look, *, count: int, size: float, materials: list[int]) -> Piece:
     """Triangles about `size` m on an ellipsoid, tilted at random, with their outsides away from its centre."""
     rng = look.generator
-    k = np.arange(count) + 0.5
-    z = 1.0 - 1.85 * k / count  # few leaves at the underside
-    angle = np.pi * (1.0 + 5.0**0.5) * k + rng.uniform(0.0, 6.0)
-    ring = np.sqrt(np.maximum(1.0 - z * z, 0.0))
-    unit = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-    place = unit * radius * rng.uniform(0.86, 1.08, (count, 1)) + centre
-    tilt = unit + 0.75 * rng.normal(size=(count, 3))
-    tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
-    tilt *= np.sign((tilt * unit).sum(axis=1, keepdims=True) + 1e-9)
-    side = cross(tilt, rng.normal(size=(count, 3)))
-    half = size * rng.uniform(0.6, 1.1, (count, 1, 1))
-    normal = np.repeat(unit / radius + [0.0, 0.0, 0.15], 3, axis=0)
-    # the upper leaves catch more light: lighter greens come first in the table
-    index = np.clip((0.5 * (1.0 - z) * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1)
-    return _scraps(place, tilt, side, half, (0.0, 2.0, 4.2), normal, np.array(materials)[index])
+    positions = np.arange(count) + 0.5
+    z = 1.0 - 1.85 * positions / count  # few leaves at the underside
+    # Golden-angle spiral: an even distribution for any number of leaves.
+    azimuths = np.pi * (1.0 + 5.0**0.5) * positions + rng.uniform(0.0, 6.0)
+    circle_radii = np.sqrt(np.maximum(1.0 - z * z, 0.0))
+    directions = np.stack([circle_radii * np.cos(azimuths), circle_radii * np.sin(azimuths), z], axis=1)
+    centres = directions * radius * rng.uniform(0.86, 1.08, (count, 1)) + centre
+    leaf_normals = directions + 0.75 * rng.normal(size=(count, 3))
+    leaf_normals /= np.linalg.norm(leaf_normals, axis=1, keepdims=True)
+    leaf_normals *= np.sign((leaf_normals * directions).sum(axis=1, keepdims=True) + 1e-9)
+    side_axes = cross(leaf_normals, rng.normal(size=(count, 3)))
+    half_sizes = size * rng.uniform(0.6, 1.1, (count, 1, 1))
+    vertex_normals = np.repeat(directions / radius + [0.0, 0.0, 0.15], 3, axis=0)
+    # The upper leaves catch more light: lighter greens come first in the table.
+    material_index = np.clip(
+        (0.5 * (1.0 - z) * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1
+    )
+    return _scraps(
+        centres,
+        leaf_normals,
+        side_axes,
+        half_sizes,
+        (0.0, 2.0, 4.2),
+        vertex_normals,
+        np.array(materials)[material_index],
+    )
 
 
 def _scraps(  # noqa: PLR0917
@@ -99,17 +110,17 @@ def _scraps(  # noqa: PLR0917
 ) -> Piece:
     """A triangle about each place [n, 3]: across `out` (unit), its corners turned from `side`, `half` m away."""
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    cos, sin = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
-    corners = place[:, None] + half * (cos * side[:, None] + sin * cross(out, side)[:, None])
+    cosines, sines = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
+    corners = place[:, None] + half * (cosines * side[:, None] + sines * cross(out, side)[:, None])
     faces = np.arange(3 * len(place), dtype=np.int32).reshape(-1, 3)
     return smooth(corners.reshape(-1, 3), faces, normal, material, levels=NEAR)
 
 
 def _greens(kind: str, look: Look) -> list[int]:
     """Three greens of a kind, light to dark."""
-    table = list(look.palette.table)
-    chosen = look.generator.choice(look.leaves[kind], 3, replace=False).tolist()
-    return sorted(chosen, key=lambda i: -sum(table[i].colour))
+    entries = list(look.palette.table)
+    indices = look.generator.choice(look.leaves[kind], 3, replace=False).tolist()
+    return sorted(indices, key=lambda index: -sum(entries[index].colour))
 
 
 def tree(kind: str, look: Look) -> Piece:
@@ -118,64 +129,84 @@ def tree(kind: str, look: Look) -> Piece:
     if kind == "conifer":
         return _conifer(look)
     greens = _greens(kind, look)
-    dark = look.palette.shade(greens[-1], 0.6)
-    tall = {"round": rng.uniform(6.0, 9.5), "tall": rng.uniform(9.0, 13.5), "birch": rng.uniform(7.5, 11.0)}[kind]
-    share = {"round": (0.34, 0.36), "tall": (0.15, 0.42), "birch": (0.20, 0.36)}[kind]
-    radius = np.array([share[0], share[0], share[1]]) * tall * rng.uniform(0.9, 1.12, 3)
-    middle = np.array([0.0, 0.0, tall - radius[2]])
-    thick = 0.020 * tall if kind != "birch" else 0.013 * tall
+    dark_green = look.palette.shade(greens[-1], 0.6)
+    height = {"round": rng.uniform(6.0, 9.5), "tall": rng.uniform(9.0, 13.5), "birch": rng.uniform(7.5, 11.0)}[kind]
+    radius_shares = {"round": (0.34, 0.36), "tall": (0.15, 0.42), "birch": (0.20, 0.36)}[kind]
+    radius = np.array([radius_shares[0], radius_shares[0], radius_shares[1]]) * height * rng.uniform(0.9, 1.12, 3)
+    centre = np.array([0.0, 0.0, height - radius[2]])
+    trunk_radius = 0.020 * height if kind != "birch" else 0.013 * height
     bark = look.bark[1] if kind == "birch" else look.bark[0]
     parts = [
-        cylinder((thick, 0.55 * thick), (-0.1, 0.75 * tall), bark, sides=6, levels=VISIBLE),
-        cylinder((thick, 0.6 * thick), (-0.1, 0.6 * tall), bark, sides=3, levels=FAR),
-        blob(middle, 0.98 * radius, greens[1], look, levels=FAR, rough=0.1),
+        cylinder((trunk_radius, 0.55 * trunk_radius), (-0.1, 0.75 * height), bark, sides=6, levels=VISIBLE),
+        cylinder((trunk_radius, 0.6 * trunk_radius), (-0.1, 0.6 * height), bark, sides=3, levels=FAR),
+        blob(centre, 0.98 * radius, greens[1], look, levels=FAR, rough=0.1),
     ]
-    lobes = {"round": 3, "tall": 2, "birch": 3}[kind]
-    count = {"round": 32, "tall": 38, "birch": 26}[kind]
-    for k in range(lobes):
-        angle = 2.0 * np.pi * k / lobes + rng.uniform(-0.5, 0.5)
-        up = (k / max(lobes - 1, 1) - 0.5) * 0.7
-        shift = np.array([0.42 * np.cos(angle), 0.42 * np.sin(angle), up]) * radius
-        size = radius * rng.uniform(0.6, 0.75, 3) * ([1.0, 1.0, 1.0] if kind == "round" else [1.15, 1.15, 0.95])
-        parts.append(blob(middle + shift, 0.9 * size, dark, look, levels=VISIBLE))
-        parts.append(leaves(middle + shift, size, look, count=count, size=0.33 * float(size.mean()), materials=greens))
+    lobe_count = {"round": 3, "tall": 2, "birch": 3}[kind]
+    leaf_count = {"round": 32, "tall": 38, "birch": 26}[kind]
+    for lobe_index in range(lobe_count):
+        angle = 2.0 * np.pi * lobe_index / lobe_count + rng.uniform(-0.5, 0.5)
+        height_offset = (lobe_index / max(lobe_count - 1, 1) - 0.5) * 0.7
+        lobe_offset = np.array([0.42 * np.cos(angle), 0.42 * np.sin(angle), height_offset]) * radius
+        lobe_radius = radius * rng.uniform(0.6, 0.75, 3) * ([1.0, 1.0, 1.0] if kind == "round" else [1.15, 1.15, 0.95])
+        parts.append(blob(centre + lobe_offset, 0.9 * lobe_radius, dark_green, look, levels=VISIBLE))
+        parts.append(
+            leaves(
+                centre + lobe_offset,
+                lobe_radius,
+                look,
+                count=leaf_count,
+                size=0.33 * float(lobe_radius.mean()),
+                materials=greens,
+            )
+        )
     return join(parts)
 
 
 def _conifer(look: Look) -> Piece:
     """Whorls of branches as cones with ragged rims."""
     rng, greens = look.generator, _greens("conifer", look)
-    tall = rng.uniform(7.5, 13.0)
-    wide = tall * rng.uniform(0.17, 0.24)
+    height = rng.uniform(7.5, 13.0)
+    base_radius = height * rng.uniform(0.17, 0.24)
     parts = [
-        cylinder((0.018 * tall, 0.012 * tall), (-0.1, 0.3 * tall), look.bark[0], sides=5, levels=NEAR | MID | FAR),
-        cylinder((wide, 0.0), (0.14 * tall, tall), greens[1], sides=6, levels=FAR),
+        cylinder(
+            (0.018 * height, 0.012 * height), (-0.1, 0.3 * height), look.bark[0], sides=5, levels=NEAR | MID | FAR
+        ),
+        cylinder((base_radius, 0.0), (0.14 * height, height), greens[1], sides=6, levels=FAR),
     ]
-    whorls, sides = 6, 9
-    for k in range(whorls):
-        low, high = (0.12 + 0.84 * k / whorls) * tall, (0.12 + 0.84 * (k + 1.75) / whorls) * tall
-        radius = wide * (1.0 - 0.86 * k / whorls)
-        angle = (np.arange(sides) + rng.uniform()) * 2.0 * np.pi / sides
-        reach = radius * rng.uniform(0.7, 1.1, sides)
-        rim = np.column_stack(
-            [reach * np.cos(angle), reach * np.sin(angle), low + 0.05 * tall * rng.uniform(-0.5, 0.5, sides)]
+    whorl_count, side_count = 6, 9
+    for whorl_index in range(whorl_count):
+        lower, upper = (
+            (0.12 + 0.84 * whorl_index / whorl_count) * height,
+            (0.12 + 0.84 * (whorl_index + 1.75) / whorl_count) * height,
         )
-        v = np.vstack([rim, [[0.0, 0.0, min(high, tall)]]])
-        i = np.arange(sides)
-        up = np.column_stack([np.cos(angle), np.sin(angle), np.full(sides, 0.6)])
+        radius = base_radius * (1.0 - 0.86 * whorl_index / whorl_count)
+        angles = (np.arange(side_count) + rng.uniform()) * 2.0 * np.pi / side_count
+        rim_radii = radius * rng.uniform(0.7, 1.1, side_count)
+        rim = np.column_stack(
+            [
+                rim_radii * np.cos(angles),
+                rim_radii * np.sin(angles),
+                lower + 0.05 * height * rng.uniform(-0.5, 0.5, side_count),
+            ]
+        )
+        vertices = np.vstack([rim, [[0.0, 0.0, min(upper, height)]]])
+        indices = np.arange(side_count)
+        outer_normals = np.column_stack([np.cos(angles), np.sin(angles), np.full(side_count, 0.6)])
         parts.append(
             smooth(
-                v,
-                np.stack([i, (i + 1) % sides, np.full(sides, sides)], 1),
-                np.vstack([up, [[0, 0, 1]]]),
-                greens[k % 2],
+                vertices,
+                np.stack([indices, (indices + 1) % side_count, np.full(side_count, side_count)], 1),
+                np.vstack([outer_normals, [[0, 0, 1]]]),
+                greens[whorl_index % 2],
                 levels=VISIBLE,
             )
         )
-        under = np.vstack([rim, [[0.0, 0.0, low + 0.3 * radius]]])
-        inwards = np.stack([(i + 1) % sides, i, np.full(sides, sides)], 1)
-        down = np.broadcast_to([0.0, 0.0, -1.0], under.shape)
-        parts.append(smooth(under, inwards, down, look.palette.shade(greens[2], 0.6), levels=NEAR))
+        lower_vertices = np.vstack([rim, [[0.0, 0.0, lower + 0.3 * radius]]])
+        lower_faces = np.stack([(indices + 1) % side_count, indices, np.full(side_count, side_count)], 1)
+        lower_normals = np.broadcast_to([0.0, 0.0, -1.0], lower_vertices.shape)
+        parts.append(
+            smooth(lower_vertices, lower_faces, lower_normals, look.palette.shade(greens[2], 0.6), levels=NEAR)
+        )
     return join(parts)
 
 
@@ -196,18 +227,20 @@ def bush(look: Look) -> Piece:
 def hedge(look: Look, material: int) -> Piece:
     """A metre of hedge along x, 0.7 m thick and 1 m tall; scale it."""
     rng = look.generator
-    light = look.palette.shade(material, 1.5)
+    light_green = look.palette.shade(material, 1.5)
     parts = [box((-0.52, -0.33, -0.1), (0.52, 0.33, 0.97), material, levels=VISIBLE)]
-    count = 15
-    place = np.column_stack(
-        [rng.uniform(-0.5, 0.5, count), rng.choice([-0.34, 0.34], count), rng.uniform(0.05, 1.0, count)]
+    leaf_count = 15
+    centres = np.column_stack(
+        [rng.uniform(-0.5, 0.5, leaf_count), rng.choice([-0.34, 0.34], leaf_count), rng.uniform(0.05, 1.0, leaf_count)]
     )
-    place[::3, 1], place[::3, 2] = rng.uniform(-0.33, 0.33, len(place[::3])), 0.98
-    out = np.column_stack([np.zeros(count), np.sign(place[:, 1]), np.zeros(count)])
-    out[::3] = 0.0, 0.0, 1.0
-    tilt = out + 0.5 * rng.normal(size=(count, 3))
-    tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
-    side = cross(tilt, [0.3, 0.2, 0.9])
-    index = np.where(rng.random(count) < 0.5, light, material)
-    parts.append(_scraps(place, tilt, side, 0.12, (0.0, 2.1, 4.2), np.repeat(out, 3, axis=0), index))
+    centres[::3, 1], centres[::3, 2] = rng.uniform(-0.33, 0.33, len(centres[::3])), 0.98
+    outwards = np.column_stack([np.zeros(leaf_count), np.sign(centres[:, 1]), np.zeros(leaf_count)])
+    outwards[::3] = 0.0, 0.0, 1.0
+    leaf_normals = outwards + 0.5 * rng.normal(size=(leaf_count, 3))
+    leaf_normals /= np.linalg.norm(leaf_normals, axis=1, keepdims=True)
+    side_axes = cross(leaf_normals, [0.3, 0.2, 0.9])
+    leaf_materials = np.where(rng.random(leaf_count) < 0.5, light_green, material)
+    parts.append(
+        _scraps(centres, leaf_normals, side_axes, 0.12, (0.0, 2.1, 4.2), np.repeat(outwards, 3, axis=0), leaf_materials)
+    )
     return join(parts)

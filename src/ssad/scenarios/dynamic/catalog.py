@@ -1,4 +1,4 @@
-"""The scenario classes by name."""
+"""Scenario classes by name."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CUSTOM = "Custom"
 
 
 def scenario_type(name: str) -> ScenarioType:
-    """The scenario class of a name.
+    """Return the scenario class with a name.
 
     Args:
         name: A key of `SCENARIOS`, "Custom", the name of an entry point, or "module:object".
@@ -37,17 +37,17 @@ def scenario_type(name: str) -> ScenarioType:
         The class.
 
     Raises:
-        UnknownNameError: There is none of that name; the message has the closest ones.
-        ConfigError: A module of the user does not import, or has something else under that name.
+        UnknownNameError: No class has that name; the message lists the closest ones.
+        ConfigError: A user module fails to import, or the name refers to another object.
     """
-    found = resolve("scenario", {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}, name)
-    if not isinstance(found, ScenarioType):
-        raise ConfigError(f"scenario type '{name}': expected a ScenarioType, found {type(found).__name__}")
-    return found
+    resolved = resolve("scenario", {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}, name)
+    if not isinstance(resolved, ScenarioType):
+        raise ConfigError(f"scenario type '{name}': expected a ScenarioType, found {type(resolved).__name__}")
+    return resolved
 
 
 def parameter_box(type_name: str) -> dict[str, Parameter]:
-    """The parameters of a scenario class, those of the ego's start among them.
+    """Return the parameters of a scenario class, including those of the ego start.
 
     Args:
         type_name: Name of the class, as for `scenario_type`.
@@ -56,7 +56,7 @@ def parameter_box(type_name: str) -> dict[str, Parameter]:
         Parameter name -> range, default, unit and spread.
 
     Raises:
-        UnknownNameError: There is no class of that name.
+        UnknownNameError: No class has that name.
         ConfigError: As for `scenario_type`.
     """
     return dict(scenario_type(type_name).box)

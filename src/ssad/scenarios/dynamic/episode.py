@@ -1,4 +1,4 @@
-"""From a scenario to a concrete episode on a lane graph."""
+"""Construction of a concrete episode from a scenario on a lane graph."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ from ssad.scenarios.dynamic.schema import check, scenario_data
 from ssad.world.models import model
 
 EGO_MODEL = "car"
-_ATTEMPTS = 8  # draws before a spread counts as impossible
+_ATTEMPTS = 8  # draws before a spread is reported as impossible
 _FORCED = {"off": SignalState.OFF, "red": SignalState.RED, "green": SignalState.GREEN}
 
 
 def build_episode(scenario: Scenario, graph: LaneGraph, *, seed: int, spread: float = 0.0) -> Episode:
-    """The scenario on its town's lane graph: ego route, actors, signals.
+    """Build a scenario on its town's lane graph: ego route, actors, signals.
 
     Signals, traffic and the distance limit that the scenario leaves at their defaults are those of its type.
 
     Args:
-        scenario: What happens.
+        scenario: The scenario.
         graph: Lane graph of the scenario's town.
-        seed: What is random depends on this number, the scenario's name and its own seed alone: on no other episode,
-            driver or machine.
-        spread: How far the episode may differ from the nominal case. 0: parameters, the ego's start and its target
+        seed: All random draws depend only on this number, the scenario's name and its own seed; never on other
+            episodes, drivers or machines.
+        spread: Size of the random variation around the nominal case. 0: parameters, the ego's start and its target
             speed are those of the scenario, and only random traffic depends on the seed. Above 0: they are drawn with
             `sample_parameters`, and drawn again if the actors have no room; 1 is the natural spread.
 
@@ -79,31 +79,32 @@ def build_episode(scenario: Scenario, graph: LaneGraph, *, seed: int, spread: fl
 
 def _build(scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, everybody_apart: bool = False) -> Episode:
     """The episode of just this scenario. everybody_apart: agents whose place was drawn must not touch either."""
-    kind = scenario_type(scenario.type)
-    scenario = _completed(scenario, kind)
-    value = kind.values(scenario.parameters)
+    scenario_kind = scenario_type(scenario.type)
+    scenario = _completed(scenario, scenario_kind)
+    values = scenario_kind.values(scenario.parameters)
     ego = EpisodeAgent(
         name="ego",
         model=EGO_MODEL,
         controller=Controller.EXTERNAL,
-        pose=_start(route, value["ego_longitudinal"], value["ego_lateral"], value["ego_heading"]),
-        speed=value["ego_speed"],
+        pose=_start(route, values["ego_longitudinal"], values["ego_lateral"], values["ego_heading"]),
+        speed=values["ego_speed"],
         target_speed=scenario.target_speed,
         route=route,
     )
-    fixed = scenario.traffic.draw if scenario.traffic else None
-    draw = seed if fixed is None else fixed
-    others = kind.build(scenario, graph, route, generator("scenario", scenario.seed, draw, "actors"))
-    agents = (ego, *others)
+    fixed_draw = scenario.traffic.draw if scenario.traffic else None
+    # A scenario with a fixed draw has the same traffic under every seed.
+    draw = seed if fixed_draw is None else fixed_draw
+    other_agents = scenario_kind.build(scenario, graph, route, generator("scenario", scenario.seed, draw, "actors"))
+    agents = (ego, *other_agents)
     # traffic and an author's own actors stand where they stand in the nominal case: of them only the ego must be clear
-    drawn = everybody_apart and any(parameter.spread for parameter in kind.parameters)
-    _check_start(scenario, agents, movable=len(agents) if drawn else 1)
+    check_all = everybody_apart and any(parameter.spread for parameter in scenario_kind.parameters)
+    _check_start(scenario, agents, movable=len(agents) if check_all else 1)
     return Episode(
         key=f"{scenario.name}@{digest(dump_json(scenario_data(scenario)), seed)[:12]}",
         scenario=scenario,
         town=scenario.town,
         agents=agents,
-        signal_override=dict(_signals(graph, route, scenario.signals, kind.whole_town)),
+        signal_override=dict(_signals(graph, route, scenario.signals, scenario_kind.whole_town)),
         override_until=scenario.signals.until,
         limits=scenario.limits,
         seed=seed,
@@ -112,25 +113,25 @@ def _build(scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, eve
 
 @remembered()
 def _route(graph: LaneGraph, keypoints: tuple[Pose, ...]) -> Route:
-    """The route through key points; its arrays are read-only, since all episodes on it share them."""
+    """Return the route through key points; its arrays are read-only, since all its episodes share them."""
     from ssad.world.roads import route_along
 
     route = route_along(graph, keypoints)
-    for values in (route.xy, route.yaw, route.lane, route.speed_limit, route.width):
-        values.setflags(write=False)
+    for column in (route.xy, route.yaw, route.lane, route.speed_limit, route.width):
+        column.setflags(write=False)
     return route
 
 
 def _start(route: Route, forward: float, left: float, turn: float) -> Pose:
-    """The pose `forward` m along a route and `left` m beside it, turned by `turn` rad."""
+    """Return the pose `forward` m along a route and `left` m beside it, turned by `turn` rad."""
     if forward == left == turn == 0.0:
         return Pose(float(route.xy[0, 0]), float(route.xy[0, 1]), float(route.yaw[0]))
-    at = min(forward / route.spacing, len(route.xy) - 1.0)
-    index = min(int(at), len(route.xy) - 2)
+    position = min(forward / route.spacing, len(route.xy) - 1.0)
+    index = min(int(position), len(route.xy) - 2)
     (x0, y0), (x1, y1) = route.xy[index : index + 2].tolist()
-    yaw, after = route.yaw[index : index + 2].tolist()
-    share = at - index
-    bend = math.remainder(after - yaw, math.tau)
+    yaw, next_yaw = route.yaw[index : index + 2].tolist()
+    share = position - index
+    bend = math.remainder(next_yaw - yaw, math.tau)
     return shifted(Pose(x0 + share * (x1 - x0), y0 + share * (y1 - y0), yaw + share * bend), 0.0, left, turn)
 
 
@@ -149,57 +150,67 @@ def _completed(scenario: Scenario, kind: ScenarioType) -> Scenario:
 
 @remembered()
 def _signals(graph: LaneGraph, route: Route, plan: SignalPlan, whole_town: bool) -> dict[int, SignalState]:
-    """`forced_signals`, worked out once for a route."""
+    """Return `forced_signals`, cached for a route."""
     return forced_signals(graph, route, plan, whole_town=whole_town)
 
 
 def forced_signals(
     graph: LaneGraph, route: Route, plan: SignalPlan, *, whole_town: bool = False
 ) -> dict[int, SignalState]:
-    """The states that a signal plan forces.
+    """Return the states that a signal plan forces.
 
     Args:
         graph: Lane graph of the town.
         route: The ego's route.
-        plan: State of the ego's signals (their stop line is on the route, or on a lane beside it with the same
-            direction), and of the other ones of the junctions on the route.
-        whole_town: The other ones are all the other signals that the map has.
+        plan: State of the ego's signals (stop line on the route, or on a parallel lane of the same direction), and of
+            the other signals of the junctions on the route.
+        whole_town: Apply the state of other signals to the whole map.
 
     Returns:
-        Signal index of the town -> state; signals that keep their program are left out.
+        Signal index of the town -> state; signals that keep their program are omitted.
     """
     lanes = np.unique(route.lane[route.lane >= 0])
-    approach = {(int(graph.road[n]), int(graph.section[n]), int(np.sign(graph.lane_id[n]))) for n in lanes}
-    own = {
-        int(graph.stop_signal[k])
-        for k, lane in enumerate(graph.stop_lane)
+    approach = {
+        (int(graph.road[lane_index]), int(graph.section[lane_index]), int(np.sign(graph.lane_id[lane_index])))
+        for lane_index in lanes
+    }
+    ego_signals = {
+        int(graph.stop_signal[stop_index])
+        for stop_index, lane in enumerate(graph.stop_lane)
         if (int(graph.road[lane]), int(graph.section[lane]), int(np.sign(graph.lane_id[lane]))) in approach
     }
-    junctions = {int(n) for n in np.unique(graph.junction[lanes]) if n >= 0}
-    forced: dict[int, SignalState] = {}
+    junctions = {int(lane_index) for lane_index in np.unique(graph.junction[lanes]) if lane_index >= 0}
+    forced_states: dict[int, SignalState] = {}
     for signal in range(len(graph.signal_junction)):
-        here = int(graph.signal_junction[signal]) in junctions
-        want = plan.ego if signal in own and here else plan.others
-        if want != "program" and (not graph.signal_virtual[signal] if whole_town else here):
-            forced[signal] = _FORCED[want]
-    return forced
+        on_route_junction = int(graph.signal_junction[signal]) in junctions
+        state_name = plan.ego if signal in ego_signals and on_route_junction else plan.others
+        if state_name != "program" and (not graph.signal_virtual[signal] if whole_town else on_route_junction):
+            forced_states[signal] = _FORCED[state_name]
+    return forced_states
 
 
 def _check_start(scenario: Scenario, agents: Sequence[EpisodeAgent], *, movable: int) -> None:
-    """RouteError if one of the first `movable` agents touches another one when the episode begins."""
-    boxes = []
-    here = [
-        agent for agent in agents if not agent.trajectory or agent.trajectory[0][0] <= 0.0 <= agent.trajectory[-1][0]
+    """Raise RouteError if one of the first `movable` agents touches another one at the start."""
+    footprints = []
+    present = [
+        # Agents that appear later or have already left are absent at the start.
+        agent
+        for agent in agents
+        if not agent.trajectory or agent.trajectory[0][0] <= 0.0 <= agent.trajectory[-1][0]
     ]
-    for agent in here:
+    for agent in present:
         body = model(agent.model)
-        boxes.append((agent.pose.x, agent.pose.y, agent.pose.yaw, body.length, body.width))
-    for first, one in enumerate(boxes[:movable]):
-        for second, other in enumerate(boxes[first + 1 :], first + 1):
-            # most are too far apart to touch whichever way they are turned
-            reach = 0.5 * (math.hypot(*one[3:]) + math.hypot(*other[3:]))
-            if math.hypot(one[0] - other[0], one[1] - other[1]) <= reach and obb_distance(one, other) <= 0.0:
+        footprints.append((agent.pose.x, agent.pose.y, agent.pose.yaw, body.length, body.width))
+    for index, footprint in enumerate(footprints[:movable]):
+        for other_index, other_footprint in enumerate(footprints[index + 1 :], index + 1):
+            # cheap test first: most pairs are too far apart in any orientation
+            reach = 0.5 * (math.hypot(*footprint[3:]) + math.hypot(*other_footprint[3:]))
+            if (
+                math.hypot(footprint[0] - other_footprint[0], footprint[1] - other_footprint[1]) <= reach
+                and obb_distance(footprint, other_footprint) <= 0.0
+            ):
                 raise RouteError(
-                    f"scenario {scenario.name}: {here[second].name} stands in the {here[first].name} at the start; "
+                    f"scenario {scenario.name}: {present[other_index].name} stands in the "
+                    f"{present[index].name} at the start; "
                     "move one of them"
                 )

@@ -1,4 +1,4 @@
-"""What happened in an episode as a scenario of its own: the ego is driven anew, all others do what they did."""
+"""Recorded episodes as scenarios of their own: the ego is driven anew, all other agents repeat the recording."""
 
 from __future__ import annotations
 
@@ -13,42 +13,48 @@ from ssad.scenarios.dynamic.catalog import CUSTOM, parameter_box, scenario_type
 
 CLOSE: Final = 0.002, 0.001
 """How far a row may be off the line between its neighbours to be left out, m and rad."""
-MOVED: Final = 0.05  # m; who moves less stands
-BRAKING: Final = 4.0  # m/s^2 at which they stop who still moved when the recording ended
+MOVED: Final = 0.05  # m; an agent that moves less counts as standing
+BRAKING: Final = 4.0  # m/s^2 of agents that still move when the recording ends
 
 Rows = tuple[tuple[float, float, float, float], ...]
 
 
 def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) -> Scenario:
-    """The scenario in which everybody but the ego repeats what was recorded.
+    """Return the scenario in which every agent but the ego repeats the recording.
 
-    Whoever was still moving at the end of the recording brakes to a stop straight ahead, and stays there. It depends
-    on no seed.
+    An agent that is still moving when the recording ends brakes to a stop straight ahead and stays there. The result
+    depends on no seed.
 
     Args:
-        episode: The episode.
-        trace: What happened in it.
-        name: Of the scenario; None: that of the episode's.
+        episode: The recorded episode.
+        trace: The recording.
+        name: Name of the new scenario; None: that of the episode's scenario.
 
     Returns:
         A scenario of type Custom with the same ego, signals and limits.
     """
     base = episode.scenario
-    kind = scenario_type(base.type)
-    box = parameter_box(CUSTOM)
-    values = {key: value for key, value in kind.values(base.parameters).items() if key in box and value != 0.0}
-    until = float(episode.limits.max_steps * trace.dt)
+    scenario_kind = scenario_type(base.type)
+    custom_parameters = parameter_box(CUSTOM)
+    values = {
+        parameter_name: value
+        for parameter_name, value in scenario_kind.values(base.parameters).items()
+        if parameter_name in custom_parameters and value != 0.0
+    }
+    end_time = float(episode.limits.max_steps * trace.dt)
     actors = []
-    for agent in range(1, len(trace.names)):
-        rows = _rows(trace, agent)
+    for agent_index in range(1, len(trace.names)):
+        rows = _rows(trace, agent_index)
         if rows is None:
             continue
-        if np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MOVED and bool(trace.active[:, agent].all()):
-            # things stand by themselves; a vehicle without phases is a parked one
-            actors.append(Actor(trace.names[agent], trace.models[agent], agent_pose(rows[0])))
+        if np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MOVED and bool(trace.active[:, agent_index].all()):
+            # an actor without phases and trajectory stands still
+            actors.append(Actor(trace.names[agent_index], trace.models[agent_index], agent_pose(rows[0])))
             continue
-        told = told_rows(stopping(rows, until) if trace.active[-1, agent] else rows)
-        actors.append(Actor(trace.names[agent], trace.models[agent], Pose(*told[0][1:]), trajectory=told))
+        trajectory = told_rows(stopping(rows, end_time) if trace.active[-1, agent_index] else rows)
+        actors.append(
+            Actor(trace.names[agent_index], trace.models[agent_index], Pose(*trajectory[0][1:]), trajectory=trajectory)
+        )
     return replace(
         base,
         name=name or base.name,
@@ -70,77 +76,84 @@ def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:
         name: Of the actor.
         rows: Its time s, x, y m and yaw rad [T, 4]; at their end it brakes to a stop.
     """
-    told = told_rows(stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
-    pose = Pose(*told[0][1:])
+    trajectory = told_rows(stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
+    pose = Pose(*trajectory[0][1:])
     return replace(
         scenario,
         actors=tuple(
-            replace(actor, pose=pose, phases=(), path=(), trajectory=told) if actor.name == name else actor
+            replace(actor, pose=pose, phases=(), path=(), trajectory=trajectory) if actor.name == name else actor
             for actor in scenario.actors
         ),
     )
 
 
 def agent_pose(row: F64) -> Pose:
-    """The pose of a row of time, x, y and yaw, as scenario files give it."""
+    """Round a row of time, x, y and yaw to the pose that scenario files store."""
     return Pose(round(float(row[1]), 3), round(float(row[2]), 3), round(float(wrap_angle(row[3])), 4))
 
 
 def told_rows(rows: F64, *, thin: bool = True) -> Rows:
-    """Rows [T, 4] as a scenario file gives them: in mm; thin: without those on the line between their neighbours."""
-    kept = np.array(thinned(rows)) if thin else rows
-    told = np.concatenate([kept[:, :3].round(3), np.asarray(wrap_angle(kept[:, 3:])).round(4)], 1)
-    return tuple((t, x, y, yaw) for t, x, y, yaw in told.tolist())
+    """Round rows [T, 4] to the precision of scenario files (mm), optionally without collinear rows."""
+    selected_rows = np.array(thinned(rows)) if thin else rows
+    rounded = np.concatenate([selected_rows[:, :3].round(3), np.asarray(wrap_angle(selected_rows[:, 3:])).round(4)], 1)
+    return tuple((t, x, y, yaw) for t, x, y, yaw in rounded.tolist())
 
 
 def thinned(rows: F64) -> list[list[float]]:
-    """Rows [T, 4] of time, x, y and yaw without those that lie on the line between their neighbours."""
+    """Drop the rows [T, 4] of time, x, y and yaw that lie on the line between their neighbours."""
     unwrapped = rows.copy()
+    # Interpolation across the jump at pi would report a false deviation.
     unwrapped[:, 3] = np.unwrap(rows[:, 3])
-    kept, last = [0], 0
-    for n in range(2, len(rows)):
-        between = unwrapped[last + 1 : n]
-        share = (between[:, :1] - unwrapped[last, 0]) / (unwrapped[n, 0] - unwrapped[last, 0])
-        off = np.abs(unwrapped[last] + share * (unwrapped[n] - unwrapped[last]) - between)
-        if off[:, 1:3].max() > CLOSE[0] or off[:, 3].max() > CLOSE[1]:
-            last = n - 1
-            kept.append(last)
-    kept.append(len(rows) - 1)
-    found: list[list[float]] = rows[kept].tolist()
-    return found
+    retained, last_retained = [0], 0
+    for row in range(2, len(rows)):
+        skipped = unwrapped[last_retained + 1 : row]
+        share = (skipped[:, :1] - unwrapped[last_retained, 0]) / (unwrapped[row, 0] - unwrapped[last_retained, 0])
+        deviation = np.abs(unwrapped[last_retained] + share * (unwrapped[row] - unwrapped[last_retained]) - skipped)
+        if deviation[:, 1:3].max() > CLOSE[0] or deviation[:, 3].max() > CLOSE[1]:
+            last_retained = row - 1
+            retained.append(last_retained)
+    retained.append(len(rows) - 1)
+    simplified: list[list[float]] = rows[retained].tolist()
+    return simplified
 
 
 def _rows(trace: EpisodeTrace, agent: int) -> F64 | None:
-    """Time, x, y, yaw [T, 4] of an agent from its first to its last row; None: it was never there."""
-    there = np.flatnonzero(trace.active[:, agent])
-    if len(there) < 2 or trace.kind[agent] == AgentKind.NONE:
+    """Return time, x, y and yaw [T, 4] of an agent while it is present, or None if it never is."""
+    present_rows = np.flatnonzero(trace.active[:, agent])
+    if len(present_rows) < 2 or trace.kind[agent] == AgentKind.NONE:
         return None
-    span = slice(int(there[0]), int(there[-1]) + 1)
+    active_span = slice(int(present_rows[0]), int(present_rows[-1]) + 1)
     time = np.arange(len(trace.active)) * float(trace.dt)
-    columns = [time[span], *(getattr(trace, name)[span, agent].astype(np.float64) for name in ("x", "y", "yaw"))]
+    columns = [
+        time[active_span],
+        *(getattr(trace, name)[active_span, agent].astype(np.float64) for name in ("x", "y", "yaw")),
+    ]
     return np.stack(columns, 1)
 
 
 def braked(speed: F64, time: F64) -> tuple[F64, F64]:
-    """How far somebody has gone (m) who brakes from a speed (m/s) for a time (s), and its speed then (m/s).
+    """Return the distance covered (m) and the speed left (m/s) after braking from a speed for some time.
 
     Args:
-        speed: [...] before; below 0: backwards.
-        time: [...] broadcast against it; below 0: not yet.
+        speed: Initial speed [...], m/s; negative: backwards.
+        time: Time since braking began [...], s, broadcast against `speed`; negative: not braking yet.
     """
-    size = np.abs(speed)
-    rolling = np.clip(time, 0.0, size / BRAKING)
-    way = np.sign(speed) * (size * rolling - 0.5 * BRAKING * rolling**2)
-    return way, np.sign(speed) * (size - BRAKING * rolling)
+    magnitude = np.abs(speed)
+    braking_time = np.clip(time, 0.0, magnitude / BRAKING)
+    travelled = np.sign(speed) * (magnitude * braking_time - 0.5 * BRAKING * braking_time**2)
+    return travelled, np.sign(speed) * (magnitude - BRAKING * braking_time)
 
 
 def stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
     """Rows [T, 4] of time, x, y and yaw, and after them a stop straight ahead, until a time s."""
-    end, before = rows[-1], rows[-2]
-    heading = np.array([np.cos(end[3]), np.sin(end[3])])
-    speed = float((end[1:3] - before[1:3]) @ heading / (end[0] - before[0]))
+    last_row, previous_row = rows[-1], rows[-2]
+    heading = np.array([np.cos(last_row[3]), np.sin(last_row[3])])
+    speed = float((last_row[1:3] - previous_row[1:3]) @ heading / (last_row[0] - previous_row[0]))
     braking = np.arange(1, int(abs(speed) / BRAKING / step) + 2) * step
-    time = np.append(braking, max(until - float(end[0]), braking[-1]) + 1.0)
-    way, _ = braked(np.asarray(speed), time)
-    more = np.stack([end[0] + time, *(end[1:3, None] + heading[:, None] * way), np.full(len(time), end[3])], 1)
-    return np.concatenate([rows, more])
+    # One row beyond the end keeps the agent present until the last step.
+    time = np.append(braking, max(until - float(last_row[0]), braking[-1]) + 1.0)
+    travelled, _ = braked(np.asarray(speed), time)
+    stop_rows = np.stack(
+        [last_row[0] + time, *(last_row[1:3, None] + heading[:, None] * travelled), np.full(len(time), last_row[3])], 1
+    )
+    return np.concatenate([rows, stop_rows])

@@ -1,4 +1,4 @@
-"""Generators by name, and the loop that runs one: it owns the budget of rollouts, the seeds, and what is known."""
+"""Generators by name, and the search loop, which owns the budget of rollouts, the seeds and the outcomes."""
 
 from __future__ import annotations
 
@@ -46,46 +46,46 @@ SCENIC = "scenic:"
 _PROGRAMS = {SCENIC: "ssad.interchange.scenic_programs:ScenicSearch"}
 BATCH = 8  # rollouts of a base side by side
 SCENES = 256  # episodes of one world
-_STILL = 0.05  # m; who moves less in an episode is no adversary
+_STILL = 0.05  # m; an agent that moves less is no adversary
 
 
 def generator_factory(name: str) -> GeneratorFactory:
-    """What makes the generators of a name, an entry point or "module:object".
+    """Return the factory of a generator by name, entry point or "module:object".
 
     Raises:
-        UnknownNameError: There is none of that name; the message has the closest ones.
+        UnknownNameError: No generator has that name; the message lists the closest ones.
         ConfigError: It cannot be imported, or cannot be called.
     """
     if name.startswith(SCENIC):
         if find_spec("scenic") is None:
             raise MissingExtraError(f"generator '{name}'", "scenic")
         return partial(cast(Any, resolve("generator", _PROGRAMS, SCENIC)), name.removeprefix(SCENIC))
-    found = resolve("generator", GENERATORS, name)
-    if not callable(found):
+    resolved = resolve("generator", GENERATORS, name)
+    if not callable(resolved):
         raise ConfigError(f"generator '{name}': expected a class or function (bases, *, seeds, budget)")
-    return cast(GeneratorFactory, found)
+    return cast(GeneratorFactory, resolved)
 
 
 def generator_list() -> dict[str, str]:
-    """Name of each generator that can be asked for -> what it does, in a line."""
+    """Return the name of each available generator -> one line about it."""
     rows = {}
-    for name, where in names("generator", GENERATORS).items():
+    for name, reference in names("generator", GENERATORS).items():
         try:
-            about = (generator_factory(name).__doc__ or "").strip() if name in GENERATORS else ""
+            summary = (generator_factory(name).__doc__ or "").strip() if name in GENERATORS else ""
         except MissingExtraError as error:
-            about = f"needs the extra {error.extra}"
-        rows[name] = about.partition("\n")[0].rstrip(".") or where
+            summary = f"needs the extra {error.extra}"
+        rows[name] = summary.partition("\n")[0].rstrip(".") or reference
     return rows
 
 
 @dataclass(frozen=True)
 class Trials:
-    """Where proposals are driven: by which system, with what.
+    """Test bench of proposals: the driving system under test and its environment.
 
     Attributes:
-        ego: Makes the driving system under test, a new one at each call.
-        policies: Makes the drivers that scenarios name.
-        sensors: What drivers may ask for besides those of the world.
+        ego: Factory of the driving system under test, called once per batch.
+        policies: Factory of the drivers that scenarios name.
+        sensors: Sensors for drivers in addition to those of the world.
         device: cpu or cuda.
     """
 
@@ -95,82 +95,87 @@ class Trials:
     device: str = "cpu"
 
     def base(self, scenario: Scenario, graph: LaneGraph, *, seed: int) -> Base:
-        """A scenario as it is, driven once; see `bases`."""
+        """Drive an unchanged scenario once; see `bases`."""
         return self.bases([(scenario, graph, seed)])[0]
 
     def bases(self, scenarios: Sequence[tuple[Scenario, LaneGraph, int]]) -> list[Base]:
-        """Scenarios as they are, each in its town and with its seed, driven once, side by side.
+        """Drive unchanged scenarios once, each in its town and with its seed, side by side.
 
         Raises:
-            SSADError: One cannot be built or driven.
+            SSADError: A scenario cannot be built or driven.
         """
-        found: list[Base] = []
+        driven: list[Base] = []
         for start in range(0, len(scenarios), SCENES):
-            part = scenarios[start : start + SCENES]
-            episodes = [build_episode(scenario, graph, seed=seed) for scenario, graph, seed in part]
-            traces, _ = self._drive(episodes, {scenario.town: graph for scenario, graph, _ in part}, {})
-            rows = zip(episodes, part, traces, strict=True)
-            found += [Base(episode, graph, trace) for episode, (_, graph, _), trace in rows]
-        return found
+            chunk = scenarios[start : start + SCENES]
+            episodes = [build_episode(scenario, graph, seed=seed) for scenario, graph, seed in chunk]
+            traces, _ = self._drive(episodes, {scenario.town: graph for scenario, graph, _ in chunk}, {})
+            chunk_rows = zip(episodes, chunk, traces, strict=True)
+            driven += [Base(episode, graph, trace) for episode, (_, graph, _), trace in chunk_rows]
+        return driven
 
     def run(self, proposals: Sequence[tuple[Base, Proposal]]) -> list[Outcome]:
-        """Drive proposals, each in its base's town and with its seed; what cannot be built is a failed outcome."""
+        """Drive proposals, each in its base's town and with its seed; a proposal that cannot be built fails."""
         outcomes: dict[int, Outcome] = {}
-        groups: dict[int, list[tuple[int, Episode]]] = {}
-        for k, (base, proposal) in enumerate(proposals):
+        proposals_by_drivers: dict[int, list[tuple[int, Episode]]] = {}
+        for proposal_index, (base, proposal) in enumerate(proposals):
             try:
                 episode = build_episode(proposal.scenario, base.graph, seed=base.episode.seed)
             except SSADError as error:
-                outcomes[k] = Outcome(proposal, failure=str(error))
+                outcomes[proposal_index] = Outcome(proposal, failure=str(error))
                 continue
-            group = id(proposal.drivers) if proposal.drivers else 0
-            groups.setdefault(group, []).append((k, episode))
-        for members in groups.values():
+            # Scenes of one world share their drivers, so proposals are grouped by them.
+            group_key = id(proposal.drivers) if proposal.drivers else 0
+            proposals_by_drivers.setdefault(group_key, []).append((proposal_index, episode))
+        for members in proposals_by_drivers.values():
             for start in range(0, len(members), SCENES):
-                part = members[start : start + SCENES]
-                drivers = proposals[part[0][0]][1].drivers
-                graphs = {episode.town: proposals[k][0].graph for k, episode in part}
-                traces, taken = self._drive([episode for _, episode in part], graphs, drivers)
-                for (k, episode), trace, had in zip(part, traces, taken, strict=True):
-                    base, proposal = proposals[k]
-                    who = _adversaries(proposal, episode, trace, had)
-                    outcomes[k] = measure(proposal, trace, base.graph, who)
-        return [outcomes[k] for k in range(len(proposals))]
+                chunk = members[start : start + SCENES]
+                drivers = proposals[chunk[0][0]][1].drivers
+                graphs = {episode.town: proposals[proposal_index][0].graph for proposal_index, episode in chunk}
+                traces, takeovers = self._drive([episode for _, episode in chunk], graphs, drivers)
+                for (proposal_index, episode), trace, taken_over in zip(chunk, traces, takeovers, strict=True):
+                    base, proposal = proposals[proposal_index]
+                    adversary_indices = _adversaries(proposal, episode, trace, taken_over)
+                    outcomes[proposal_index] = measure(proposal, trace, base.graph, adversary_indices)
+        return [outcomes[proposal_index] for proposal_index in range(len(proposals))]
 
     def _drive(
         self, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], drivers: Mapping[Selector, Driver]
     ) -> tuple[list[EpisodeTrace], npt.NDArray[np.bool_]]:
-        """Traces of episodes, and [B, A] who was ever taken over by one of the drivers."""
+        """Return traces of episodes, and [B, A] the agents that one of the drivers ever took over."""
         from ssad.world.rollout import rollout
         from ssad.world.world import World
 
         world = World(episodes, graphs, device=self.device)
-        taken = np.zeros((world.batch, world.agents), bool)
+        taken_over = np.zeros((world.batch, world.agents), bool)
 
-        def watched(selector: Selector) -> Selector:
+        def recording_selector(selector: Selector) -> Selector:
             def choose(state: WorldState) -> Bool | Choice:
                 choice = selector(state)
-                chosen = choice.agents if isinstance(choice, Choice) else np.asarray(choice, bool)
-                np.logical_or(taken, chosen, out=taken)
+                selected = choice.agents if isinstance(choice, Choice) else np.asarray(choice, bool)
+                np.logical_or(taken_over, selected, out=taken_over)
                 return choice
 
             return choose
 
-        who: dict[int | Selector, Driver] = {0: self.ego()}
-        who |= {watched(selector): driver for selector, driver in drivers.items()}
-        return rollout(world, who, sensors=self.sensors, policies=self.policies), taken
+        driver_of: dict[int | Selector, Driver] = {0: self.ego()}
+        driver_of |= {recording_selector(selector): driver for selector, driver in drivers.items()}
+        return rollout(world, driver_of, sensors=self.sensors, policies=self.policies), taken_over
 
 
 def _adversaries(proposal: Proposal, episode: Episode, trace: EpisodeTrace, taken: Bool) -> list[int]:
     """Numbers of the agents that count as adversaries."""
-    found = {k for k in range(1, len(episode.agents)) if taken[k]}
-    found |= {k for k, agent in enumerate(episode.agents) if k and agent.name in proposal.adversaries}
+    adversaries = {agent_index for agent_index in range(1, len(episode.agents)) if taken[agent_index]}
+    adversaries |= {
+        agent_index
+        for agent_index, agent in enumerate(episode.agents)
+        if agent_index and agent.name in proposal.adversaries
+    }
     if not proposal.adversaries and not proposal.drivers:
-        span = np.hypot(np.ptp(trace.x, axis=0), np.ptp(trace.y, axis=0))
+        motion_extent = np.hypot(np.ptp(trace.x, axis=0), np.ptp(trace.y, axis=0))
         scripted = [agent.controller != Controller.NONE for agent in episode.agents]
-        mobile = (trace.kind != AgentKind.PROP) & (np.asarray(scripted) | (span > _STILL))
-        found |= set(np.flatnonzero(mobile).tolist()) - {0}
-    return sorted(found)
+        mobile = (trace.kind != AgentKind.PROP) & (np.asarray(scripted) | (motion_extent > _STILL))
+        adversaries |= set(np.flatnonzero(mobile).tolist()) - {0}
+    return sorted(adversaries)
 
 
 def search(
@@ -183,66 +188,76 @@ def search(
     known: Sequence[Sequence[Outcome]] = (),
     after: Callable[[int], None] = lambda asked: None,
 ) -> list[list[Outcome]]:
-    """Run a generator until each base has used its budget, or nothing more is proposed.
+    """Run a generator until each base has used its budget or no more proposals come.
 
     Args:
-        generator: The generator, not asked before.
-        bases: The B bases that it was made for.
-        trials: Where its proposals are driven.
+        generator: A new generator.
+        bases: The B bases of the generator.
+        trials: Test bench that drives the proposals.
         budget: Rollouts of each base.
-        batch: Rollouts of each base that it is asked for at once.
-        known: Outcomes of each base from a search that was cut short; these are told and not driven again.
-        after: Called after each round with the rollouts that each base has been asked for so far.
+        batch: Rollouts of each base per round.
+        known: Outcomes of each base from an interrupted search; these are not driven again.
+        after: Called after each round with the number of rollouts requested for each base so far.
 
     Returns:
         For each base its outcomes, in the order in which they were proposed.
 
     Raises:
-        ConfigError: The generator proposes something else than what is known, or more than it may, or not for each
-            base.
+        ConfigError: The generator deviates from the known outcomes, exceeds the batch, or omits a base.
     """
-    found: list[list[Outcome]] = [[] for _ in bases]
+    collected: list[list[Outcome]] = [[] for _ in bases]
     known = known or [[] for _ in bases]
-    asked = 0
-    while asked < budget:
-        count = min(batch, budget - asked)
-        asked += count
-        proposals = [list(row) for row in generator.ask(count)]
-        if len(proposals) != len(bases) or any(len(row) > count for row in proposals):
+    requested = 0
+    while requested < budget:
+        batch_size = min(batch, budget - requested)
+        requested += batch_size
+        proposals = [list(base_proposals) for base_proposals in generator.ask(batch_size)]
+        if len(proposals) != len(bases) or any(len(base_proposals) > batch_size for base_proposals in proposals):
             raise ConfigError(
-                f"generator {generator.name}: expected up to {count} proposals for each of {len(bases)} bases, "
-                f"not {[len(row) for row in proposals]}"
+                f"generator {generator.name}: expected up to {batch_size} proposals for each of {len(bases)} bases, "
+                f"not {[len(base_proposals) for base_proposals in proposals]}"
             )
         if not any(proposals):
             break
-        told = [list(known[b][len(found[b]) : len(found[b]) + len(row)]) for b, row in enumerate(proposals)]
-        for b, row in enumerate(proposals):
-            for outcome, proposal in zip(told[b], row, strict=False):
+        # A resumed search replays known outcomes, so the generator reaches the same state.
+        batch_outcomes = [
+            list(known[base_index][len(collected[base_index]) : len(collected[base_index]) + len(base_proposals)])
+            for base_index, base_proposals in enumerate(proposals)
+        ]
+        for base_index, base_proposals in enumerate(proposals):
+            for outcome, proposal in zip(batch_outcomes[base_index], base_proposals, strict=False):
                 if outcome.proposal.scenario != proposal.scenario:
                     raise ConfigError(
-                        f"generator {generator.name}: what is known of {bases[b].scenario.name} is of another search; "
+                        f"generator {generator.name}: what is known of "
+                        f"{bases[base_index].scenario.name} is of another search; "
                         "start anew"
                     )
-        missing = [(b, p) for b, row in enumerate(proposals) for p in row[len(told[b]) :]]
-        for (b, _), outcome in zip(missing, trials.run([(bases[b], p) for b, p in missing]), strict=True):
-            told[b].append(outcome)
-        generator.tell(told)
-        for b, outcomes in enumerate(told):
-            found[b] += outcomes
-        after(asked)
-    return found
+        missing = [
+            (base_index, pending)
+            for base_index, base_proposals in enumerate(proposals)
+            for pending in base_proposals[len(batch_outcomes[base_index]) :]
+        ]
+        for (base_index, _), outcome in zip(
+            missing, trials.run([(bases[base_index], pending) for base_index, pending in missing]), strict=True
+        ):
+            batch_outcomes[base_index].append(outcome)
+        generator.tell(batch_outcomes)
+        for base_index, outcomes in enumerate(batch_outcomes):
+            collected[base_index] += outcomes
+        after(requested)
+    return collected
 
 
 def scenario_of(outcome: Outcome, base: Base, *, name: str) -> Scenario:
-    """What a proposal has come to, as a scenario that can be saved and replays without the generator.
+    """Return the outcome of a proposal as a scenario that replays without the generator.
 
-    A proposal of parameters stays one. With random traffic, or with drivers that take agents over, everybody but the
-    ego repeats what happened.
+    A proposal of parameters is returned unchanged. With random traffic, or with drivers that take agents over, all
+    agents but the ego repeat the recording.
 
     Args:
-        outcome: Of a proposal that was driven.
+        outcome: Outcome of a driven proposal.
         base: Its base.
-        name: Of the scenario.
+        name: Name of the new scenario.
 
     Returns:
         The scenario.

@@ -4,10 +4,9 @@ SafeBench and FREA: `scenario_type/*.json` lists episodes (scenario id, route id
 `route/scenario_XX_routes/scenario_XX_route_YY.xml`, triggers and actors in
 `route/scenarios/scenario_XX.json`. Leaderboard: XML files of routes beside JSON files of triggers; every
 trigger on a route gives a scenario. In a whole checkout of SafeBench or FREA the two folders lie deeper
-(`config/scenario_type`, `scenario_data/route`) and are found. CARLA's frame (x forward, y right, yaw clockwise
-in degrees) becomes ours here and nowhere else. The town is not needed, but helps: a trigger is looked for beside
-the straight lines between key points, and if there is none, beside the route through an imported town.
-Nothing of CARLA's weather is read.
+(`config/scenario_type`, `scenario_data/route`) and are searched. CARLA's frame (x forward, y right, yaw clockwise
+in degrees) is converted here and nowhere else. The town is optional: a trigger is matched with the straight lines
+between key points first, then with the route through the town if it is imported. CARLA's weather is ignored.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ _SIDES = ("front", "left", "right")  # the order in which the leaderboard reads 
 
 @dataclass(frozen=True)
 class _Entry:
-    """One episode of a list: scenario id, route id, and the parameters that it gives."""
+    """One episode of a list: scenario id, route id, and explicit parameters."""
 
     number: int
     route: int
@@ -95,60 +94,60 @@ class _Road:
 
 
 def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[Scenario, ...]:
-    """All scenarios of a folder, in its order; of several lists in `scenario_type` the longest without parameters.
+    """Import all scenarios of a folder, in its order; of several lists the longest one without parameters.
 
     Args:
         folder: A SafeBench, FREA or leaderboard folder, a checkout of the first two, or one list in `scenario_type`,
             such as SafeBench's human.json or random.json, whose entries have parameters of their own.
-        left_out: Gets a line for each entry of a list that is broken, and the rest comes in; None: the first of them is
-            an error.
+        left_out: Collects a line for each broken entry of a list, which is skipped; None: the first broken entry
+            raises.
 
     Raises:
-        FormatError: The message says what is broken and where; or nothing is left.
+        FormatError: An entry is broken (the message names it and its place), or no entry is left.
     """
     folder = Path(folder)
     if folder.is_file() and folder.parent.name == "scenario_type":
         return _listed(_routes_of(folder.parent), _read_list(folder, left_out), folder, left_out)
     if not folder.is_dir():
         raise FormatError(f"{folder}: no such folder")
-    lists = sorted(path for place in _scenario_types(folder) for path in place.glob("*.json"))
+    lists = sorted(path for list_folder in _scenario_types(folder) for path in list_folder.glob("*.json"))
     if lists:
-        found: dict[Path, tuple[list[_Entry], list[str]]] = {}
+        entries_by_list: dict[Path, tuple[list[_Entry], list[str]]] = {}
         for path in lists:
-            missing: list[str] = []
-            found[path] = _read_list(path, None if left_out is None else missing), missing
-        longest = max(lists, key=lambda path: _preferred(found[path][0]))
-        entries, missing = found[longest]
+            list_errors: list[str] = []
+            entries_by_list[path] = _read_list(path, None if left_out is None else list_errors), list_errors
+        preferred_list = max(lists, key=lambda path: _preferred(entries_by_list[path][0]))
+        entries, list_errors = entries_by_list[preferred_list]
         if left_out is not None:
-            left_out += missing
-        return _listed(_routes_of(longest.parent), entries, longest, left_out)
+            left_out += list_errors
+        return _listed(_routes_of(preferred_list.parent), entries, preferred_list, left_out)
     return _leaderboard(folder)
 
 
 def _preferred(entries: Sequence[_Entry]) -> tuple[bool, int]:
-    """How much a list is what one expects: first one that leaves the parameters to the scenarios, then a long one."""
+    """Return a sort key of lists: lists without parameters first, then longer ones."""
     return bool(entries) and not any(entry.parameters for entry in entries), len(entries)
 
 
 def _scenario_types(folder: Path) -> list[Path]:
-    """The folder of lists: in the folder itself, else the nearest below it (a checkout)."""
-    own = folder / "scenario_type"
-    if own.is_dir():
-        return [own]
-    deeper = [path for path in folder.rglob("scenario_type") if path.is_dir() and any(path.glob("*.json"))]
-    return sorted(deeper, key=lambda path: (len(path.parts), path))[:1]
+    """Return the folder of lists: in the folder itself, else the nearest below it (a checkout)."""
+    direct = folder / "scenario_type"
+    if direct.is_dir():
+        return [direct]
+    nested = [path for path in folder.rglob("scenario_type") if path.is_dir() and any(path.glob("*.json"))]
+    return sorted(nested, key=lambda path: (len(path.parts), path))[:1]
 
 
 def _routes_of(lists: Path) -> Path:
-    """The folder of routes that belongs to a folder of lists: beside it, else the nearest beside one of its parents.
+    """Return the folder of routes of a folder of lists: beside it, else the nearest beside one of its parents.
 
     Raises:
-        FormatError: There is none.
+        FormatError: There is no such folder.
     """
-    for place in (lists.parent, lists.parent.parent):
-        near = [path for path in (place / "route", *place.glob("*/route")) if (path / "scenarios").is_dir()]
-        if near:
-            return near[0]
+    for parent in (lists.parent, lists.parent.parent):
+        route_folders = [path for path in (parent / "route", *parent.glob("*/route")) if (path / "scenarios").is_dir()]
+        if route_folders:
+            return route_folders[0]
     raise FormatError(
         f"{lists.parent}: no folder route with a folder scenarios in it, here or in scenario_data beside it"
     )
@@ -158,50 +157,52 @@ def _routes_of(lists: Path) -> Path:
 
 
 def _read_list(path: Path, left_out: list[str] | None) -> list[_Entry]:
-    """The entries in the order of data_id; what is no scenario of ours is left out."""
-    data = read_json(path)
-    if not isinstance(data, list):
+    """Read the entries of a list in the order of data_id; entries of other scenarios are skipped."""
+    entries = read_json(path)
+    if not isinstance(entries, list):
         raise FormatError(f"{path}: expected a list of episodes")
-    if not data:
+    if not entries:
         raise FormatError(f"{path}: the list of episodes is empty")
-    rows: list[tuple[int, _Entry]] = []
-    for i, entry in enumerate(data):
+    numbered_entries: list[tuple[int, _Entry]] = []
+    for index, entry in enumerate(entries):
         if not isinstance(entry, dict):
-            raise FormatError(f"{path}: entry {i}: expected an object with scenario_id and route_id")
-        ids = []
+            raise FormatError(f"{path}: entry {index}: expected an object with scenario_id and route_id")
+        identifiers = []
         for key in ("data_id", "scenario_id", "route_id"):
             value = entry.get(key)
             if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-                raise FormatError(f"{path}: entry {i}: {key} should be a whole number, not {value!r}")
-            ids.append(value)
+                raise FormatError(f"{path}: entry {index}: {key} should be a whole number, not {value!r}")
+            identifiers.append(value)
         try:
-            rows.append((ids[0], _Entry(ids[1], ids[2], _values(entry, ids[1]))))
+            numbered_entries.append(
+                (identifiers[0], _Entry(identifiers[1], identifiers[2], _values(entry, identifiers[1])))
+            )
         except FormatError as error:
-            trouble = f"{path}: entry {i}: {error}"
+            message = f"{path}: entry {index}: {error}"
             if left_out is None:
-                raise FormatError(trouble) from None
-            left_out.append(trouble)
-    rows.sort(key=lambda row: row[0])
-    return [row[1] for row in rows]
+                raise FormatError(message) from None
+            left_out.append(message)
+    numbered_entries.sort(key=lambda row: row[0])
+    return [row[1] for row in numbered_entries]
 
 
 def _values(entry: Mapping[str, Any], number: int) -> dict[str, float]:
-    """The parameters of an entry by name. FormatError: it is no scenario of ours, or they are unknown or not valid."""
+    """Return the parameters of an entry by name. FormatError if the scenario or a parameter is not valid."""
     if number not in _TYPES:
         raise FormatError(f"unknown scenario_id {number}; known: 1 to {max(_TYPES)}")
-    given = entry.get("parameters")
-    if given is None:
+    raw_values = entry.get("parameters")
+    if raw_values is None:
         return {}
     names = _PARAMETERS.get(number, ())
     if entry.get("scenario_folder") not in ("human", "random") or not names:
         raise FormatError("parameters are read in lists human and random only; set them to null")
     if (
-        not isinstance(given, list)
-        or len(given) != len(names)
-        or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in given)
+        not isinstance(raw_values, list)
+        or len(raw_values) != len(names)
+        or not all(isinstance(raw_value, int | float) and not isinstance(raw_value, bool) for raw_value in raw_values)
     ):
-        raise FormatError(f"parameters should be the numbers {', '.join(names)}, not {given!r}")
-    values = {name: float(one) for name, one in zip(names, given, strict=True)}
+        raise FormatError(f"parameters should be the numbers {', '.join(names)}, not {raw_values!r}")
+    values = {name: float(raw_value) for name, raw_value in zip(names, raw_values, strict=True)}
     try:
         scenario_type(_TYPES[number]).values(values)
     except ConfigError as error:
@@ -210,65 +211,67 @@ def _values(entry: Mapping[str, Any], number: int) -> dict[str, float]:
 
 
 def _listed(routes: Path, entries: Sequence[_Entry], listing: Path, left_out: list[str] | None) -> tuple[Scenario, ...]:
-    """The scenarios of a list; repetitions of a route get seeds 0, 1, ..."""
+    """Build the scenarios of a list; repetitions of a route get seeds 0, 1, ..."""
     if not entries:
         raise FormatError(f"{listing}: no entry of it can be read{f'; the first: {left_out[0]}' if left_out else ''}")
     suite = "frea" if all(entry.number == NATURAL_ID for entry in entries) else "safebench"
     title = {"frea": "FREA", "safebench": "SafeBench"}[suite]
-    total = Counter((entry.number, entry.route) for entry in entries)
-    done: Counter[tuple[int, int]] = Counter()
-    cache: dict[tuple[int, int], Scenario | None] = {}
-    events: dict[int, list[_Event]] = {}
-    result = []
+    # Only routes that occur several times get a repetition number in their names.
+    repetition_counts = Counter((entry.number, entry.route) for entry in entries)
+    built_counts: Counter[tuple[int, int]] = Counter()
+    scenario_cache: dict[tuple[int, int], Scenario | None] = {}
+    events_by_number: dict[int, list[_Event]] = {}
+    scenarios = []
     for entry in entries:
-        key = number, route_id = entry.number, entry.route
-        if key not in cache:
+        route_key = number, route_id = entry.number, entry.route
+        if route_key not in scenario_cache:
             try:
-                if number not in events:
-                    events[number] = _read_events(routes / "scenarios" / f"scenario_{number:02d}.json")
+                if number not in events_by_number:
+                    events_by_number[number] = _read_events(routes / "scenarios" / f"scenario_{number:02d}.json")
                 path = routes / f"scenario_{number:02d}_routes" / f"scenario_{number:02d}_route_{route_id:02d}.xml"
                 if not path.is_file():
                     raise FormatError(f"{path}: no such route file; {listing.name} asks for it")
-                cache[key] = _scenario(path, _TYPES[number], events[number])
+                scenario_cache[route_key] = _scenario(path, _TYPES[number], events_by_number[number])
             except FormatError as error:
                 if left_out is None:
                     raise
                 left_out.append(str(error))
-                cache[key] = None
-        base, repetition = cache[key], done[key]
+                scenario_cache[route_key] = None
+        base, repetition = scenario_cache[route_key], built_counts[route_key]
         if base is None:
             continue
-        done[key] += 1
+        built_counts[route_key] += 1
         if number == NATURAL_ID:
             name, group = f"{suite}/{base.town}_{route_id:02d}", base.town
         else:
             name, group = f"{suite}/{base.type}/{route_id:02d}", base.type
-        if total[key] > 1:
+        if repetition_counts[route_key] > 1:
             name += f"/{repetition:02d}"
         source = f"{title} scenario {number} route {route_id:02d}"
         parameters = {**base.parameters, **entry.parameters}
-        result.append(replace(base, name=name, group=group, seed=repetition, source=source, parameters=parameters))
-    if not result:
+        scenarios.append(replace(base, name=name, group=group, seed=repetition, source=source, parameters=parameters))
+    if not scenarios:
         assert left_out
         raise FormatError(f"{listing}: none of its routes can be read; the first: {left_out[0]}")
-    return tuple(result)
+    return tuple(scenarios)
 
 
 def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
     """The scenario of one route file with the first trigger along it."""
-    roads = _read_roads(path)
-    if len(roads) != 1:
-        raise FormatError(f"{path}: expected one route, found {len(roads)}")
-    road = roads[0]
-    found = _triggers(road, events) or _triggers(_through_town(road), events)
-    if not found and kind != "NaturalJunction":
-        raise FormatError(f"{path}: no trigger of {kind} in {road.town} lies on the route (2 m, 10 degrees)")
-    event = events[found[0][1]] if found else None
+    routes = _read_roads(path)
+    if len(routes) != 1:
+        raise FormatError(f"{path}: expected one route, found {len(routes)}")
+    route = routes[0]
+    # Key points are sparse: a trigger in a bend can be far from the straight line between two of them.
+    triggers = _triggers(route, events) or _triggers(_through_town(route), events)
+    if not triggers and kind != "NaturalJunction":
+        raise FormatError(f"{path}: no trigger of {kind} in {route.town} lies on the route (2 m, 10 degrees)")
+    event = events[triggers[0][1]] if triggers else None
     scenario = Scenario(
         name="imported",
         type=kind,
-        town=road.town,
-        route=road.points,
+        town=route.town,
+        route=route.points,
         trigger=event.trigger if event else None,
         placements=event.placements if event and kind in _PLACED else (),
     )
@@ -279,8 +282,8 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
 
 def _triggers(road: _Road, events: Sequence[_Event]) -> list[tuple[float, int]]:
     """How far along a route its triggers are, and their numbers, in order."""
-    rows = ((_along(road, e.trigger), i) for i, e in enumerate(events) if e.town == road.town)
-    return sorted((at, i) for at, i in rows if at is not None)
+    positions = ((_along(road, event.trigger), index) for index, event in enumerate(events) if event.town == road.town)
+    return sorted((position, index) for position, index in positions if position is not None)
 
 
 def _through_town(road: _Road) -> _Road:
@@ -292,7 +295,7 @@ def _through_town(road: _Road) -> _Road:
         route = route_along(load_town(road.town), road.points)
     except SSADError:  # a town that is not imported, or a route that leaves its lanes
         return road
-    points = tuple(Pose(*map(float, row)) for row in np.column_stack([route.xy, route.yaw]))
+    points = tuple(Pose(*map(float, point)) for point in np.column_stack([route.xy, route.yaw]))
     return replace(road, points=points)
 
 
@@ -304,16 +307,16 @@ def _checked(scenario: Scenario, path: Path) -> Scenario:
 
 def _along(road: _Road, trigger: Pose) -> float | None:
     """How far along the key points the trigger is, counted in key points; None beyond 2 m or 10 degrees from them."""
-    for k, (a, b) in enumerate(pairwise(road.points)):
-        dx, dy = b.x - a.x, b.y - a.y
+    for index, (start, end) in enumerate(pairwise(road.points)):
+        dx, dy = end.x - start.x, end.y - start.y
         length = math.hypot(dx, dy)
         if length > 1e-6:
-            t = ((trigger.x - a.x) * dx + (trigger.y - a.y) * dy) / length**2
+            t = ((trigger.x - start.x) * dx + (trigger.y - start.y) * dy) / length**2
             t = min(max(t, 0.0), 1.0)
-            near = math.hypot(a.x + t * dx - trigger.x, a.y + t * dy - trigger.y) <= _NEAR
+            is_near = math.hypot(start.x + t * dx - trigger.x, start.y + t * dy - trigger.y) <= _NEAR
             turn = math.remainder(math.atan2(dy, dx) - trigger.yaw, 2.0 * math.pi)
-            if near and abs(turn) <= _ALIGNED:
-                return k + t
+            if is_near and abs(turn) <= _ALIGNED:
+                return index + t
     return None
 
 
@@ -325,33 +328,33 @@ def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
     tables = sorted(folder.rglob("*.json"))
     if not routes:
         raise FormatError(f"{folder}: no scenario_type/*.json and no route files (*.xml) in it")
-    events = [e for path in tables for e in _read_events(path, strict=False)]
+    events = [trigger_event for path in tables for trigger_event in _read_events(path, strict=False)]
     if not events:
         raise FormatError(f"{folder}: no JSON file with available_scenarios; put the scenarios beside the routes")
-    result: list[Scenario] = []
+    scenarios: list[Scenario] = []
     for path in routes:
-        for road in _read_roads(path):
-            found = _triggers(road, events)
+        for route in _read_roads(path):
+            triggers = _triggers(route, events)
             count: Counter[str] = Counter()
-            for _, i in found:
-                event = events[i]
+            for _, event_index in triggers:
+                event = events[event_index]
                 if event.type in _PLACED and not event.placements:
                     continue
                 scenario = Scenario(
-                    name=f"leaderboard/{path.stem}_{road.ident}/{event.type}_{count[event.type]:02d}",
+                    name=f"leaderboard/{path.stem}_{route.ident}/{event.type}_{count[event.type]:02d}",
                     type=event.type,
-                    town=road.town,
-                    route=road.points,
+                    town=route.town,
+                    route=route.points,
                     trigger=event.trigger,
                     placements=event.placements if event.type in _PLACED else (),
                     group=event.type,
-                    source=f"leaderboard route {road.ident} of {path.name}",
+                    source=f"leaderboard route {route.ident} of {path.name}",
                 )
                 count[event.type] += 1
-                result.append(_checked(scenario, path))
-    if not result:
+                scenarios.append(_checked(scenario, path))
+    if not scenarios:
         raise FormatError(f"{folder}: no trigger lies on any route (2 m, 10 degrees)")
-    return tuple(result)
+    return tuple(scenarios)
 
 
 # ---------------------------------------------------------------- files
@@ -359,27 +362,27 @@ def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
 
 def _read_roads(path: Path) -> list[_Road]:
     root = read_xml(path)
-    roads: list[_Road] = []
+    imported_routes: list[_Road] = []
     for element in root.iter("route"):
-        ident, town = element.get("id", ""), element.get("town")
+        route_id, town = element.get("id", ""), element.get("town")
         if not town:
-            raise FormatError(f"{path}: route {ident or '?'} names no town")
-        where = f"{path}: route {ident or '?'}"
+            raise FormatError(f"{path}: route {route_id or '?'} names no town")
+        location = f"{path}: route {route_id or '?'}"
         points = tuple(
-            _pose(point.attrib, f"{where}: waypoint {i}") for i, point in enumerate(element.iter("waypoint"))
+            _pose(point.attrib, f"{location}: waypoint {index}") for index, point in enumerate(element.iter("waypoint"))
         )
         if len(points) < 2:
-            raise FormatError(f"{where}: needs at least two waypoints, has {len(points)}")
-        roads.append(_Road(ident or str(len(roads)), town, points))
-    if not roads:
+            raise FormatError(f"{location}: needs at least two waypoints, has {len(points)}")
+        imported_routes.append(_Road(route_id or str(len(imported_routes)), town, points))
+    if not imported_routes:
         raise FormatError(f"{path}: no <route> in it")
-    return roads
+    return imported_routes
 
 
 def _read_events(path: Path, *, strict: bool = True) -> list[_Event]:
-    """Triggers of a JSON file; strict: a file of another kind, or an unknown scenario in it, is an error."""
-    data = read_json(path)
-    blocks = data.get("available_scenarios") if isinstance(data, dict) else None
+    """Read the triggers of a JSON file; `strict`: another file format or an unknown scenario is an error."""
+    document = read_json(path)
+    blocks = document.get("available_scenarios") if isinstance(document, dict) else None
     if not isinstance(blocks, list):
         if strict:
             raise FormatError(f"{path}: expected an object with the list available_scenarios")
@@ -394,32 +397,32 @@ def _block_events(path: Path, block: Any, strict: bool) -> Iterator[_Event]:
         for scenario in _list(scenarios, f"{path}: {town}"):
             if not isinstance(scenario, dict):
                 raise FormatError(f"{path}: {town}: expected objects with available_event_configurations")
-            name = str(scenario.get("scenario_name", scenario.get("scenario_type")))
-            if name not in _NAMES:
+            scenario_name = str(scenario.get("scenario_name", scenario.get("scenario_type")))
+            if scenario_name not in _NAMES:
                 if strict:
-                    raise FormatError(f"{path}: {town}: unknown scenario '{name}'; known: {', '.join(_NAMES)}")
+                    raise FormatError(f"{path}: {town}: unknown scenario '{scenario_name}'; known: {', '.join(_NAMES)}")
                 continue
             configurations = scenario.get("available_event_configurations")
-            for i, event in enumerate(_list(configurations, f"{path}: {town}: {name}")):
-                where = f"{path}: {town}: {name}: event {i}"
+            for index, event in enumerate(_list(configurations, f"{path}: {town}: {scenario_name}")):
+                location = f"{path}: {town}: {scenario_name}: event {index}"
                 if not isinstance(event, dict):
-                    raise FormatError(f"{where}: expected an object with a transform")
+                    raise FormatError(f"{location}: expected an object with a transform")
                 yield _Event(
-                    _NAMES[name],
+                    _NAMES[scenario_name],
                     town,
-                    _pose(event.get("transform"), f"{where}: transform"),
-                    _others(event, where),
+                    _pose(event.get("transform"), f"{location}: transform"),
+                    _others(event, location),
                 )
 
 
 def _others(event: Mapping[str, Any], where: str) -> tuple[Pose, ...]:
-    groups = event.get("other_actors") or {}
-    if not isinstance(groups, dict):
+    actors_by_side = event.get("other_actors") or {}
+    if not isinstance(actors_by_side, dict):
         raise FormatError(f"{where}: other_actors should map front, left, right to lists")
     return tuple(
-        _pose(actor, f"{where}: other_actors: {side} {i}")
+        _pose(actor, f"{where}: other_actors: {side} {index}")
         for side in _SIDES
-        for i, actor in enumerate(_list(groups.get(side, []), f"{where}: other_actors: {side}"))
+        for index, actor in enumerate(_list(actors_by_side.get(side, []), f"{where}: other_actors: {side}"))
     )
 
 
@@ -433,7 +436,7 @@ def _pose(data: Any, where: str) -> Pose:
     """CARLA's x, y, yaw (numbers or text, yaw in degrees) as a pose of ours."""
     if not isinstance(data, Mapping):
         raise FormatError(f"{where}: expected x, y and yaw")
-    numbers = []
+    coordinates = []
     for key in ("x", "y", "yaw"):
         try:
             value = float(data[key])
@@ -443,6 +446,7 @@ def _pose(data: Any, where: str) -> Pose:
             raise FormatError(f"{where}: {key} is {data[key]!r}, not a number") from None
         if not math.isfinite(value):
             raise FormatError(f"{where}: {key} is {data[key]!r}, not a finite number")
-        numbers.append(value)
-    x, y, yaw = numbers
+        coordinates.append(value)
+    x, y, yaw = coordinates
+    # 0.0 - y instead of -y avoids negative zeros in saved scenarios.
     return Pose(x, 0.0 - y, 0.0 - math.radians(math.remainder(yaw, 360.0)))

@@ -1,4 +1,4 @@
-"""Draws of a scenario: its parameters, its ego's start and target speed, within a box around its own values."""
+"""Random draws of a scenario: its parameters, ego start and target speed, within a box around the nominal values."""
 
 from __future__ import annotations
 
@@ -19,46 +19,49 @@ _LEAST_SPEED = 0.1  # of the target speed: no spread makes an ego crawl
 
 
 def sampling_ranges(scenario: Scenario, *, spread: float = 1.0) -> dict[str, tuple[float, float]]:
-    """The box that draws of a scenario come from.
+    """Return the box that draws of a scenario come from.
 
-    Its centre is the scenario itself: the parameters that it gives, the defaults of the others, its target speed.
+    The box is centred on the scenario: its explicit parameters, the defaults of the others, its target speed.
 
     Args:
         scenario: The nominal scenario.
         spread: Size of the box: 1 is the natural spread that `Parameter.spread` declares, 2 twice that, 0 a point.
 
     Returns:
-        Name -> (least, greatest) of all that is drawn, in the unit of the parameter, and of `target_speed` in m/s;
-        never beyond the range of the parameter or the scenario's own value.
+        Name -> (minimum, maximum) of every sampled value, in the unit of the parameter, and of `target_speed` in
+        m/s; clipped to the range of the parameter, extended to the scenario's own value if that lies outside.
 
     Raises:
         ConfigError: The spread is negative or not finite, or a parameter of the scenario is not valid.
     """
     if not (math.isfinite(spread) and spread >= 0.0):
         raise ConfigError(f"spread {spread:g} is not valid; give 0 (the nominal case) or more (1: the natural spread)")
-    kind = scenario_type(scenario.type)
-    value = kind.values(scenario.parameters)
+    scenario_kind = scenario_type(scenario.type)
+    nominal_values = scenario_kind.values(scenario.parameters)
     ranges = {
         name: (
-            max(min(parameter.low, value[name]), value[name] - reach),
-            min(max(parameter.high, value[name]), value[name] + reach),
+            # A nominal value outside the search range stays reachable: spread 0 must reproduce it.
+            max(min(parameter.low, nominal_values[name]), nominal_values[name] - reach),
+            min(max(parameter.high, nominal_values[name]), nominal_values[name] + reach),
         )
-        for name, parameter in kind.box.items()
+        for name, parameter in scenario_kind.box.items()
         if (reach := spread * parameter.spread) > 0.0
     }
-    target, share = scenario.target_speed, spread * TARGET_SPEED_SPREAD
-    if share > 0.0:
-        ranges[TARGET_SPEED] = target * max(1.0 - share, _LEAST_SPEED), min(target * (1.0 + share), MAX_SPEED)
+    target_speed, speed_share = scenario.target_speed, spread * TARGET_SPEED_SPREAD
+    if speed_share > 0.0:
+        ranges[TARGET_SPEED] = (
+            target_speed * max(1.0 - speed_share, _LEAST_SPEED),
+            min(target_speed * (1.0 + speed_share), MAX_SPEED),
+        )
     return ranges
 
 
 def sample_parameters(scenario: Scenario, generator: np.random.Generator, *, spread: float = 1.0) -> Scenario:
-    """A scenario drawn evenly from the box of `sampling_ranges`.
+    """Draw a scenario uniformly from the box of `sampling_ranges`.
 
     The draw is an ordinary scenario: it can be saved, and `build_episode` without spread makes the episode of just
-    these values. It takes as many numbers from the generator as there are ranges, in their order. Whether its actors
-    have room at the start is known only on a lane graph: `build_episode` finds out. Traffic is not drawn here; it
-    depends on the seeds.
+    these values. It consumes one random number per range, in order. `build_episode` checks on the lane graph that the
+    actors have room at the start. Traffic is not drawn here; it depends on the seeds.
 
     Args:
         scenario: The nominal scenario.
@@ -74,8 +77,8 @@ def sample_parameters(scenario: Scenario, generator: np.random.Generator, *, spr
     ranges = sampling_ranges(scenario, spread=spread)
     shares = generator.random(len(ranges)).tolist()
     values = {
-        name: min(max(low + shares[k] * (high - low), low), high)
-        for k, (name, (low, high)) in enumerate(ranges.items())
+        name: min(max(low + shares[index] * (high - low), low), high)
+        for index, (name, (low, high)) in enumerate(ranges.items())
     }
     target_speed = values.pop(TARGET_SPEED, scenario.target_speed)
     return dataclasses.replace(scenario, parameters={**scenario.parameters, **values}, target_speed=target_speed)

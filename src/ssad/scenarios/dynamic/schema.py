@@ -1,4 +1,4 @@
-"""Scenarios as plain data: strict reading with the place of every mistake, and short writing."""
+"""Scenarios as plain data: strict reading that locates every error, and compact writing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _DATA = (Scenario, Pose, Actor, Phase, Condition, SignalPlan, TrafficPlan, Limits)
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+\-]*(/[A-Za-z0-9][A-Za-z0-9_.:@+\-]*)*$")
-# Bounds that no scenario needs to leave; they keep a slip of the pen from running for hours.
+# Generous bounds: they keep a typing error from starting a run of hours.
 MAX_SPEED = 60.0
 _MAX_COORDINATE = 1.0e5
 _MAX_STEPS = 100_000
@@ -33,47 +33,47 @@ _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
 def _adapter() -> TypeAdapter[Scenario]:
     from pydantic import ConfigDict, TypeAdapter
 
-    for kind in _DATA:
+    for dataclass_type in _DATA:
         # pydantic reads this attribute of a plain dataclass; set here so that ssad.core.types needs no pydantic
-        setattr(kind, "__pydantic_config__", ConfigDict(extra="forbid", allow_inf_nan=False))  # noqa: B010
+        setattr(dataclass_type, "__pydantic_config__", ConfigDict(extra="forbid", allow_inf_nan=False))  # noqa: B010
     return TypeAdapter(Scenario)
 
 
 def scenario_from(data: Any, document: Document | None = None, place: Location = ()) -> Scenario:
-    """A checked scenario from plain data.
+    """Validate plain data and return the scenario.
 
     Args:
         data: The data as YAML or JSON gives it.
-        document: The document that it stands in, for messages.
-        place: Where in the document it stands.
+        document: The document that contains the data, for messages.
+        place: Location of the data in the document.
 
     Returns:
         The scenario.
 
     Raises:
-        ConfigError: Something is missing, unknown or out of range; names file, line, key and what is allowed.
+        ConfigError: A value is missing, unknown or out of range; the message names file, line, key and valid values.
     """
     from pydantic import ValidationError
 
-    where = document or Document("scenario", data)
+    source_document = document or Document("scenario", data)
     if not isinstance(data, Mapping):
-        raise where.error(place, f"a scenario is a mapping of keys, not {_shown(data)}")
+        raise source_document.error(place, f"a scenario is a mapping of keys, not {_shown(data)}")
     try:
         # JSON mode is the strict one that still takes lists for tuples and words for literals
         text = json.dumps(data, default=str)
         scenario = _adapter().validate_json(text, strict=True)
     except ValidationError as error:
         location, message = _explain(error)
-        raise where.error((*place, *location), message) from None
+        raise source_document.error((*place, *location), message) from None
     except (ValueError, TypeError) as error:
-        raise where.error(place, f"not plain data: {error}") from None
+        raise source_document.error(place, f"not plain data: {error}") from None
     for location, message in problems(scenario):
-        raise where.error((*place, *location), message)
+        raise source_document.error((*place, *location), message)
     return scenario
 
 
 def check(scenario: Scenario) -> None:
-    """Checks the values of a scenario.
+    """Validate a scenario.
 
     Args:
         scenario: The scenario.
@@ -87,25 +87,25 @@ def check(scenario: Scenario) -> None:
 
 def _explain(error: ValidationError) -> tuple[tuple[str | int, ...], str]:
     errors = error.errors(include_url=False)
-    # a misspelt key also leaves another one missing: the misspelling is the one to show
-    first = min(errors, key=lambda e: e["type"] not in _UNKNOWN_KEY)
-    location = tuple(first["loc"])
-    kind = first["type"]
-    if kind in _UNKNOWN_KEY:
+    # a misspelt key also makes another key missing: report the misspelling
+    first_error = min(errors, key=lambda e: e["type"] not in _UNKNOWN_KEY)
+    location = tuple(first_error["loc"])
+    error_type = first_error["type"]
+    if error_type in _UNKNOWN_KEY:
         fields = _fields_at(location[:-1])
         return location, f"unknown key; known: {', '.join(fields)}"
-    if kind in ("missing", "missing_argument"):
+    if error_type in ("missing", "missing_argument"):
         return location[:-1], f"key '{location[-1]}' is missing"
-    if kind == "literal_error":
-        return location, f"{_shown(first['input'])} is not one of {first['ctx']['expected']}"
-    message = first["msg"].replace("Input should be", "should be")
-    return location, f"{message}, not {_shown(first['input'])}"
+    if error_type == "literal_error":
+        return location, f"{_shown(first_error['input'])} is not one of {first_error['ctx']['expected']}"
+    message = first_error["msg"].replace("Input should be", "should be")
+    return location, f"{message}, not {_shown(first_error['input'])}"
 
 
 def _fields_at(location: Location) -> list[str]:
-    """Names of the fields of the dataclass at a location of a scenario."""
-    kind: type = Scenario
-    inner: dict[str, type] = {
+    """Return the field names of the dataclass at a location of a scenario."""
+    dataclass_type: type = Scenario
+    type_of_key: dict[str, type] = {
         "route": Pose,
         "placements": Pose,
         "trigger": Pose,
@@ -118,8 +118,8 @@ def _fields_at(location: Location) -> list[str]:
         "limits": Limits,
     }
     for part in location:
-        kind = inner.get(str(part), kind) if isinstance(part, str) else kind
-    return [f.name for f in dataclasses.fields(kind)]
+        dataclass_type = type_of_key.get(str(part), dataclass_type) if isinstance(part, str) else dataclass_type
+    return [dataclass_field.name for dataclass_field in dataclasses.fields(dataclass_type)]
 
 
 def _shown(value: Any) -> str:
@@ -128,13 +128,13 @@ def _shown(value: Any) -> str:
 
 
 def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """What is wrong with the values of a scenario.
+    """Yield the problems of the values of a scenario.
 
     Args:
         scenario: The scenario.
 
     Yields:
-        Place of the value among the scenario's keys, and a message.
+        Location of the value among the scenario's keys, and a message.
     """
     if not _NAME.match(scenario.name):
         yield ("name",), f"'{scenario.name}' is not a name; use letters, digits, and -_.:@+/ between them"
@@ -166,9 +166,9 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
 
 def _poses(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
     for key in ("route", "placements"):
-        for i, pose in enumerate(getattr(scenario, key)):
+        for index, pose in enumerate(getattr(scenario, key)):
             if not _finite(pose):
-                yield (key, i), f"beyond {_MAX_COORDINATE:g} m or not a number"
+                yield (key, index), f"beyond {_MAX_COORDINATE:g} m or not a number"
     if scenario.trigger is not None and not _finite(scenario.trigger):
         yield ("trigger",), f"beyond {_MAX_COORDINATE:g} m or not a number"
 
@@ -203,47 +203,53 @@ def _plans(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
 
 
 def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    for i, actor in enumerate(scenario.actors):
-        place = ("actors", i)
+    for actor_index, actor in enumerate(scenario.actors):
+        location = ("actors", actor_index)
         try:
-            fastest = model(actor.model).max_speed
+            max_speed = model(actor.model).max_speed
         except ConfigError as error:
-            yield (*place, "model"), str(error)
+            yield (*location, "model"), str(error)
             continue
         if not _finite(actor.pose):
-            yield (*place, "pose"), f"beyond {_MAX_COORDINATE:g} m or not a number"
+            yield (*location, "pose"), f"beyond {_MAX_COORDINATE:g} m or not a number"
         if len(actor.path) == 1:
-            yield (*place, "path"), "a path needs at least two points"
-        yield from _trajectory(actor, place)
-        yield from _policy(actor, place, fastest)
-        for j, phase in enumerate(actor.phases):
-            here = (*place, "phases", j)
-            if not 0.0 <= phase.speed <= fastest:
-                yield (*here, "speed"), f"{phase.speed:g} is outside 0 to {fastest:g} m/s ({actor.model})"
+            yield (*location, "path"), "a path needs at least two points"
+        yield from _trajectory(actor, location)
+        yield from _policy(actor, location, max_speed)
+        for phase_index, phase in enumerate(actor.phases):
+            phase_location = (*location, "phases", phase_index)
+            if not 0.0 <= phase.speed <= max_speed:
+                yield (*phase_location, "speed"), f"{phase.speed:g} is outside 0 to {max_speed:g} m/s ({actor.model})"
             if not 0 <= phase.when.actor < len(scenario.actors):
-                yield (*here, "when", "actor"), f"there are actors 0 to {len(scenario.actors) - 1}"
+                yield (*phase_location, "when", "actor"), f"there are actors 0 to {len(scenario.actors) - 1}"
             if phase.when.value < 0.0:
-                yield (*here, "when", "value"), "must not be negative"
+                yield (*phase_location, "when", "value"), "must not be negative"
 
 
 def _trajectory(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:
     rows = actor.trajectory
     if not rows:
         return
-    here = (*place, "trajectory")
+    trajectory_location = (*place, "trajectory")
     if len(rows) < 2:
-        yield here, "a trajectory needs at least two rows: time, x, y, yaw"
+        yield trajectory_location, "a trajectory needs at least two rows: time, x, y, yaw"
     if actor.phases or actor.path:
-        yield here, "an actor with a trajectory has neither phases nor a path"
-    if max(abs(a - b) for a, b in zip(rows[0][1:], dataclasses.astuple(actor.pose), strict=True)) > 0.01:
+        yield trajectory_location, "an actor with a trajectory has neither phases nor a path"
+    if (
+        max(
+            abs(coordinate - expected)
+            for coordinate, expected in zip(rows[0][1:], dataclasses.astuple(actor.pose), strict=True)
+        )
+        > 0.01
+    ):
         yield (*place, "pose"), "differs from the first row of the trajectory"
     values = np.array(rows, np.float64)
-    time = values[:, 0]
-    # false for what is no number
-    for j in np.flatnonzero(~(np.abs(values[:, 1:]) <= _MAX_COORDINATE).all(1)).tolist():
-        yield (*here, j), f"beyond {_MAX_COORDINATE:g} m or not a number"
-    for j in np.flatnonzero(~((time > np.append(-1.0e6, time[:-1])) & (time < 1.0e6))).tolist():
-        yield (*here, j, 0), "times must increase from row to row"
+    times = values[:, 0]
+    # NaN fails both comparisons
+    for row_index in np.flatnonzero(~(np.abs(values[:, 1:]) <= _MAX_COORDINATE).all(1)).tolist():
+        yield (*trajectory_location, row_index), f"beyond {_MAX_COORDINATE:g} m or not a number"
+    for row_index in np.flatnonzero(~((times > np.append(-1.0e6, times[:-1])) & (times < 1.0e6))).tolist():
+        yield (*trajectory_location, row_index, 0), "times must increase from row to row"
 
 
 def _policy(actor: Actor, place: Location, fastest: float) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -260,13 +266,13 @@ def _policy(actor: Actor, place: Location, fastest: float) -> Iterator[tuple[tup
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:
-    """Plain data of a scenario.
+    """Return the plain data of a scenario.
 
     Args:
         scenario: The scenario.
 
     Returns:
-        Data for YAML or JSON, defaults left out; `scenario_from` gives the scenario back.
+        Data for YAML or JSON without defaults; `scenario_from` restores the scenario.
     """
     data: dict[str, Any] = _plain(scenario)
     return data
@@ -276,20 +282,23 @@ _AS_THEY_ARE = (float, int, str, bool, type(None))
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):  # nearly all of a scenario with trajectories are rows of numbers
-        return [v if type(v) in _AS_THEY_ARE else _plain(v) for v in value]
+    if isinstance(value, tuple):  # fast path: scenarios with trajectories consist mostly of rows of numbers
+        return [element if type(element) in _AS_THEY_ARE else _plain(element) for element in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        result = {}
-        for f in dataclasses.fields(value):
-            item = getattr(value, f.name)
-            if f.default is not dataclasses.MISSING and item == f.default:
+        mapping = {}
+        for dataclass_field in dataclasses.fields(value):
+            field_value = getattr(value, dataclass_field.name)
+            if dataclass_field.default is not dataclasses.MISSING and field_value == dataclass_field.default:
                 continue
-            if f.default_factory is not dataclasses.MISSING and item == f.default_factory():
+            if (
+                dataclass_field.default_factory is not dataclasses.MISSING
+                and field_value == dataclass_field.default_factory()
+            ):
                 continue
-            result[f.name] = _plain(item)
-        return result
+            mapping[dataclass_field.name] = _plain(field_value)
+        return mapping
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(key): _plain(element) for key, element in value.items()}
     if isinstance(value, float):
         return float(value)  # a numpy scalar would not be written as a plain number
     return value

@@ -1,4 +1,4 @@
-"""Which scenarios a name means: shipped sets, imported sets, single scenarios, types, files and folders."""
+"""Resolution of scenario references: shipped sets, imported sets, single scenarios, types, files and folders."""
 
 from __future__ import annotations
 
@@ -36,34 +36,34 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
         return _from_path(Path(ref))
     if ref in _TOWN_SETS:
         name, town = _TOWN_SETS[ref]
-        return tuple(s for s in _cached(DATA / f"{name}.yaml") if s.town == town)
+        return tuple(scenario for scenario in _cached(DATA / f"{name}.yaml") if scenario.town == town)
     files = set_files()
     if ref in files:
         return _cached(files[ref])
-    shipped = [s for name in SHIPPED for s in _cached(files[name])]
+    shipped = [scenario for name in SHIPPED for scenario in _cached(files[name])]
     if ref in SCENARIOS:
-        return tuple(s for s in shipped if s.type == ref)
-    everything = {s.name: s for s in shipped}
-    if ref not in everything:
+        return tuple(scenario for scenario in shipped if scenario.type == ref)
+    scenarios_by_name = {scenario.name: scenario for scenario in shipped}
+    if ref not in scenarios_by_name:
         for file in files.values():
-            everything.update((s.name, s) for s in _cached(file))
-    if ref in everything:
-        return (everything[ref],)
+            scenarios_by_name.update((scenario.name, scenario) for scenario in _cached(file))
+    if ref in scenarios_by_name:
+        return (scenarios_by_name[ref],)
     if Path(ref).is_dir():  # last: a results folder called like a set must not hide it
         return _from_path(Path(ref))
     if ref.partition("/")[0] in IMPORTED:
         raise ConfigError(f"scenario '{ref}' is not in {home() / 'scenarios'}; import it: ssad import routes FOLDER")
-    raise unknown_name("scenario", ref, [*set_names(), *SCENARIOS, *everything])
+    raise unknown_name("scenario", ref, [*set_names(), *SCENARIOS, *scenarios_by_name])
 
 
 def set_files() -> dict[str, Path]:
-    """Set name -> YAML file: the shipped sets, then the imported ones."""
-    found = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
-    return found | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *UNSELECTED, *TRAINING)}
+    """Return set name -> YAML file: the imported sets, then the shipped ones."""
+    imported_files = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
+    return imported_files | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *UNSELECTED, *TRAINING)}
 
 
 def set_names() -> tuple[str, ...]:
-    """Names of all sets that can be loaded now."""
+    """Return the names of all sets that can be loaded."""
     return tuple(sorted({*set_files(), *_TOWN_SETS}))
 
 
@@ -73,24 +73,26 @@ def _from_path(path: Path) -> tuple[Scenario, ...]:
     files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
     if not files:
         raise ConfigError(f"{path}: no scenario files (*.yaml) in this folder")
-    result: list[Scenario] = []
-    names: dict[str, Path] = {}
+    scenarios: list[Scenario] = []
+    file_of_name: dict[str, Path] = {}
     for file in files:
         for scenario in read_scenarios(file):
-            if scenario.name in names:
-                raise ConfigError(f"{file}: scenario name '{scenario.name}' is in {names[scenario.name].name} too")
-            names[scenario.name] = file
-            result.append(scenario)
-    return tuple(result)
+            if scenario.name in file_of_name:
+                raise ConfigError(
+                    f"{file}: scenario name '{scenario.name}' is in {file_of_name[scenario.name].name} too"
+                )
+            file_of_name[scenario.name] = file
+            scenarios.append(scenario)
+    return tuple(scenarios)
 
 
 def _cached(path: Path) -> tuple[Scenario, ...]:
-    """Scenarios of a set's file; parsed once while the file stays the same."""
+    """Load the scenarios of a file, parsed again only when the file has changed."""
     try:
-        state = os.stat(path)
+        file_status = os.stat(path)
     except OSError:
         return read_scenarios(path)
-    return _parsed(str(path), state.st_mtime_ns, state.st_size)
+    return _parsed(str(path), file_status.st_mtime_ns, file_status.st_size)
 
 
 @lru_cache(maxsize=16)

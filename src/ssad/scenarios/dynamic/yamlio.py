@@ -12,7 +12,7 @@ from ssad.scenarios.dynamic.schema import check, scenario_data, scenario_from
 
 
 def read_scenarios(path: str | Path) -> tuple[Scenario, ...]:
-    """Scenarios of one YAML file, in its order. ConfigError and FormatError name file, line and key."""
+    """Read the scenarios of one YAML file, in file order. ConfigError and FormatError name file, line and key."""
     document = read_yaml_document(path)
     if isinstance(document.data, dict):
         return (scenario_from(document.data, document),)
@@ -20,31 +20,31 @@ def read_scenarios(path: str | Path) -> tuple[Scenario, ...]:
         raise document.error((), "expected one scenario (a mapping) or a list of scenarios")
     if not document.data:
         raise document.error((), "the list of scenarios is empty")
-    scenarios = tuple(scenario_from(item, document, (i,)) for i, item in enumerate(document.data))
-    first: dict[str, int] = {}
-    for i, scenario in enumerate(scenarios):
-        if scenario.name in first:
-            line = document.line((first[scenario.name],))
-            raise document.error((i, "name"), f"'{scenario.name}' is the name of the scenario in line {line} too")
-        first[scenario.name] = i
+    scenarios = tuple(scenario_from(entry, document, (index,)) for index, entry in enumerate(document.data))
+    first_index: dict[str, int] = {}
+    for index, scenario in enumerate(scenarios):
+        if scenario.name in first_index:
+            line = document.line((first_index[scenario.name],))
+            raise document.error((index, "name"), f"'{scenario.name}' is the name of the scenario in line {line} too")
+        first_index[scenario.name] = index
     return scenarios
 
 
 def scenario_text(scenarios: Scenario | Iterable[Scenario]) -> str:
-    """YAML text: one mapping for one scenario, a list for several. ConfigError if one is not valid."""
+    """Return YAML text: one mapping for one scenario, a list for several. ConfigError if one is not valid."""
     if isinstance(scenarios, Scenario):
         check(scenarios)
         return dump_yaml(scenario_data(scenarios))
-    several = tuple(scenarios)
-    if not several:
+    scenario_tuple = tuple(scenarios)
+    if not scenario_tuple:
         raise ConfigError("there is no scenario to save")
-    for scenario in several:
+    for scenario in scenario_tuple:
         check(scenario)
-    return dump_yaml([scenario_data(scenario) for scenario in several])
+    return dump_yaml([scenario_data(scenario) for scenario in scenario_tuple])
 
 
 def save_scenarios(path: str | Path, scenarios: Scenario | Iterable[Scenario]) -> None:
-    """Write scenarios as YAML, atomically; `read_scenarios` reads equal ones.
+    """Write scenarios as YAML, atomically, such that `read_scenarios` reads them back unchanged.
 
     Raises:
         ConfigError: A scenario is not valid.

@@ -1,1 +1,1 @@
-"""Static safety-critical scenarios: what changes in an image or a sweep, not in the traffic."""
+"""Static safety-critical scenarios: changes of an image or a LiDAR sweep, not of the traffic."""

@@ -1,4 +1,4 @@
-"""The models of the world, as CARLA and OpenSCENARIO name them, and the model that is most like a foreign body."""
+"""Names of the world's models in CARLA and OpenSCENARIO, and the model nearest to a foreign body."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ CATEGORY: Final[dict[AgentKind, str]] = {
 
 
 def nearest_model(category: str, size: Sequence[float]) -> str | None:
-    """The model that may play a body.
+    """Return the model that represents a body best.
 
     Args:
-        category: Of OpenSCENARIO (`car`, `truck`, ..., `pedestrian`), or `prop`.
-        size: Length, width and, where it is known, height, m.
+        category: OpenSCENARIO category (`car`, `truck`, ..., `pedestrian`), or `prop`.
+        size: Length, width and, if it is known, height, m.
 
     Returns:
-        Of the models of that category the one whose size differs least; None where nothing is like it.
+        The model of that category whose size differs least; None if the category has none.
     """
     kinds = _CATEGORIES.get(category, ())
-    models = [m for m in MODELS.values() if m.kind in kinds]
+    candidates = [candidate for candidate in MODELS.values() if candidate.kind in kinds]
 
-    def differs(name: str) -> float:
+    def size_difference(name: str) -> float:
         body = MODELS[name]
-        own = (body.length, body.width, body.height)
-        return sum(abs(a - b) for a, b in zip(own, size, strict=False))
+        model_size = (body.length, body.width, body.height)
+        return sum(abs(model_extent - extent) for model_extent, extent in zip(model_size, size, strict=False))
 
-    return min((m.name for m in models), key=differs, default=None)
+    return min((candidate.name for candidate in candidates), key=size_difference, default=None)

@@ -1,7 +1,7 @@
-"""What CARLA's own event sensors tell of the ego: whom it has touched, and which lane markings it has crossed.
+"""Events from CARLA's own sensors on the ego: collisions and crossed lane markings.
 
-Facts: carla.readthedocs.io, 0.9.16, sensors reference. Both sensors speak only when something happens. The lane sensor
-tells which markings the corners of the body have crossed in a frame; in junctions it tells nothing.
+Facts: carla.readthedocs.io, 0.9.16, sensors reference. Both sensors report only when something happens. The lane
+sensor reports the markings that the corners of the body crossed in a frame; in junctions it reports nothing.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ LANES: Final = "sensor.other.lane_invasion"
 
 @dataclass
 class Events:
-    """The sensors of events that the ego of an episode carries.
+    """The event sensors on the ego of an episode.
 
     Attributes:
-        where: Which server, for messages.
-        hits: Whom it has touched since `begin` or since they were taken: id and type of each body.
-        crossed: Frame and types of the markings of each event of the lane sensor, by CARLA's names.
+        where: Name of the server, for messages.
+        hits: Bodies that the ego has touched since `begin`, or since they were last collected: id and type of
+            each.
+        crossed: Frame and marking types, by CARLA's names, of each event of the lane sensor.
     """
 
     where: str
@@ -37,46 +38,46 @@ class Events:
     _began: int = 0
 
     def attach(self, world: carla.World, body: carla.Actor) -> None:
-        """Spawn them on a body."""
+        """Spawn the sensors on a body."""
         import carla
 
-        def hit(event: carla.CollisionEvent) -> None:
+        def on_collision(event: carla.CollisionEvent) -> None:
             self.hits.append((event.other_actor.id, event.other_actor.type_id))
 
-        def cross(event: carla.LaneInvasionEvent) -> None:
+        def on_crossing(event: carla.LaneInvasionEvent) -> None:
             self.crossed.append((event.frame, tuple(str(marking.type) for marking in event.crossed_lane_markings)))
 
         library = world.get_blueprint_library()
-        told: dict[str, Callable[[Any], None]] = {COLLISION: hit, LANES: cross}
-        for name, callback in told.items():
+        callbacks: dict[str, Callable[[Any], None]] = {COLLISION: on_collision, LANES: on_crossing}
+        for name, callback in callbacks.items():
             sensor = cast("carla.Sensor", world.spawn_actor(library.find(name), carla.Transform(), attach_to=body))
             self._sensors[name] = sensor
             sensor.listen(callback)
 
     def begin(self, frame: int) -> None:
-        """The episode begins: what came up to this frame was the drop onto the road."""
+        """Start an episode: events up to this frame are discarded, as they stem from the drop onto the road."""
         self.hits.clear()
         self.crossed.clear()
         self._began = frame
 
     def check(self) -> None:
-        """ConfigError where one of them is gone: what it has not told would pass for what has not been."""
+        """Raise ConfigError if a sensor no longer exists: its missing events would pass for a clean drive."""
         for name, sensor in self._sensors.items():
             if not sensor.is_alive:
                 raise ConfigError(f"{self.where}: the ego's {name} is gone: somebody has destroyed it")
 
     @property
     def measured(self) -> dict[str, Any]:
-        """`lane_crossings`: events of the lane sensor so far; `lane_markings`: how many of each type were crossed."""
-        own = [markings for frame, markings in self.crossed if frame > self._began]
-        kinds = Counter(kind for markings in own for kind in markings)
-        return {"lane_crossings": len(own), "lane_markings": dict(sorted(kinds.items()))}
+        """`lane_crossings`: events of the lane sensor so far; `lane_markings`: number of crossings of each type."""
+        crossings = [markings for frame, markings in self.crossed if frame > self._began]
+        marking_counts = Counter(marking for markings in crossings for marking in markings)
+        return {"lane_crossings": len(crossings), "lane_markings": dict(sorted(marking_counts.items()))}
 
     def detach(self) -> None:
-        """Take them out."""
+        """Remove the sensors."""
         sensors, self._sensors = self._sensors, {}
         self.hits.clear()
         for sensor in sensors.values():
-            stop: Callable[[], object] = sensor.stop  # the stubs do not say what it gives
+            stop: Callable[[], object] = sensor.stop  # the stubs do not declare its return type
             stop()
             sensor.destroy()

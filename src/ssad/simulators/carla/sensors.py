@@ -1,7 +1,7 @@
-"""CARLA's own cameras, LiDARs and radars on the ego, with the readings that drivers get from SSAD's.
+"""CARLA's own cameras, LiDARs and radars on the ego, with readings in the format of SSAD's sensors.
 
-A camera of CARLA is a pinhole whose axis meets the middle of the picture: of one that is not so, a larger picture is
-taken and cut out. Frames: those of a `Camera` and of a `Lidar` here; CARLA's are left-handed, its angles degrees.
+A camera of CARLA is a pinhole whose axis meets the centre of the image; for any other camera a larger image is taken
+and cropped. Frames: those of a `Camera` and of a `Lidar` here; CARLA's are left-handed, its angles in degrees.
 Facts: carla.readthedocs.io, 0.9.16, sensors reference.
 """
 
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
     import carla
 
 T = TypeVar("T")
-SQUARE: Final = 1e-3  # share by which the focal lengths of a camera may differ
-EVEN: Final = 1e-6  # rad by which the steps between beams may differ
+SQUARE: Final = 1e-3  # relative difference of a camera's focal lengths
+EVEN: Final = 1e-6  # rad, difference between the steps of beams
 _CAMERA_AXES: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x right, y down
 _LIDAR_AXES: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x right, y forward
 
 
 @dataclass(frozen=True)
 class Eye:
-    """A sensor that CARLA is asked for.
+    """A sensor to be spawned in CARLA.
 
     Attributes:
-        kind: Its blueprint.
-        attributes: What the blueprint is set to.
-        place: Sensor to car [4, 4], its frame x forward, y left, z up.
+        kind: Name of its blueprint.
+        attributes: Attributes of the blueprint.
+        place: Sensor to car [4, 4]; its frame is x forward, y left, z up.
         read: Bytes of a measurement -> the reading of one agent.
-        empty: The reading where the episode has ended.
+        empty: The reading once the episode has ended.
     """
 
     kind: str
@@ -50,47 +50,58 @@ class Eye:
 
 
 def camera_eye(camera: Camera) -> Eye:
-    """A camera. ConfigError where its pixels are not square."""
+    """Describe a camera. ConfigError if its pixels are not square."""
     (fx, skew, cx), (_, fy, cy), _ = np.asarray(camera.intrinsic, np.float64).tolist()
     if abs(fx - fy) > SQUARE * fx or skew:
         raise ConfigError(f"camera '{camera.channel}': CARLA has no camera whose pixels are not square")
-    half = max(cx, camera.width - cx), max(cy, camera.height - cy)
-    wide, high = (2 * math.ceil(one - 1e-9) for one in half)
-    left, top = round(0.5 * wide - cx), round(0.5 * high - cy)
+    # The smallest centred image that contains the wanted one; even, so that its centre is a pixel corner.
+    half_extents = max(cx, camera.width - cx), max(cy, camera.height - cy)
+    full_width, full_height = (2 * math.ceil(extent - 1e-9) for extent in half_extents)
+    left, top = round(0.5 * full_width - cx), round(0.5 * full_height - cy)
     shape = (3, camera.height, camera.width)
 
     def read(raw: bytes) -> U8:
-        whole = np.frombuffer(raw, np.uint8).reshape(high, wide, 4)
-        part = whole[top : top + camera.height, left : left + camera.width, 2::-1]
-        return np.ascontiguousarray(part.transpose(2, 0, 1))
+        full_image = np.frombuffer(raw, np.uint8).reshape(full_height, full_width, 4)
+        cropped = full_image[top : top + camera.height, left : left + camera.width, 2::-1]
+        return np.ascontiguousarray(cropped.transpose(2, 0, 1))
 
-    told = {"image_size_x": wide, "image_size_y": high, "fov": math.degrees(2.0 * math.atan(0.5 * wide / fx))}
-    return Eye("sensor.camera.rgb", _words(told), _place(camera.to_ego, _CAMERA_AXES), read, np.zeros(shape, np.uint8))
+    attributes = {
+        "image_size_x": full_width,
+        "image_size_y": full_height,
+        "fov": math.degrees(2.0 * math.atan(0.5 * full_width / fx)),
+    }
+    return Eye(
+        "sensor.camera.rgb", _words(attributes), _place(camera.to_ego, _CAMERA_AXES), read, np.zeros(shape, np.uint8)
+    )
 
 
 def lidar_eye(lidar: Lidar, dt: float) -> Eye:
-    """A LiDAR that turns once a step. ConfigError where its beams are not evenly spaced."""
+    """Describe a LiDAR that turns once per step. ConfigError if its beams are not evenly spaced."""
     beams = np.asarray(lidar.beams, np.float64)
-    step = float(np.diff(beams).mean()) if len(beams) > 1 else 1.0
-    if len(beams) > 1 and np.abs(np.diff(beams) - step).max() > EVEN:
+    beam_step = float(np.diff(beams).mean()) if len(beams) > 1 else 1.0
+    if len(beams) > 1 and np.abs(np.diff(beams) - beam_step).max() > EVEN:
         raise ConfigError("CARLA has no LiDAR whose beams are not evenly spaced")
-    room = len(beams) * lidar.azimuths
-    empty = np.zeros((room, 5), np.float32)
+    point_count = len(beams) * lidar.azimuths
+    empty = np.zeros((point_count, 5), np.float32)
     empty[:, 4] = -1.0
 
     def read(raw: bytes) -> F32:
-        seen = np.frombuffer(raw, np.float32).reshape(-1, 4)[:room]
-        out = empty.copy()
-        out[: len(seen), 0], out[: len(seen), 1], out[: len(seen), 2] = seen[:, 1], seen[:, 0], seen[:, 2]
-        up = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
-        out[: len(seen), 3] = np.rint(255.0 * seen[:, 3])
-        out[: len(seen), 4] = np.clip(np.rint((up - beams[0]) / step), 0, len(beams) - 1)
-        return out
+        returns = np.frombuffer(raw, np.float32).reshape(-1, 4)[:point_count]
+        reading = empty.copy()
+        reading[: len(returns), 0], reading[: len(returns), 1], reading[: len(returns), 2] = (
+            returns[:, 1],
+            returns[:, 0],
+            returns[:, 2],
+        )
+        elevation = np.arctan2(returns[:, 2], np.hypot(returns[:, 0], returns[:, 1]))
+        reading[: len(returns), 3] = np.rint(255.0 * returns[:, 3])
+        reading[: len(returns), 4] = np.clip(np.rint((elevation - beams[0]) / beam_step), 0, len(beams) - 1)
+        return reading
 
-    told = {
+    attributes = {
         "channels": len(beams),
         "range": lidar.reach,
-        "points_per_second": round(room / dt),
+        "points_per_second": round(point_count / dt),
         "rotation_frequency": 1 / dt,
         "upper_fov": math.degrees(beams[-1]),
         "lower_fov": math.degrees(beams[0]),
@@ -98,28 +109,30 @@ def lidar_eye(lidar: Lidar, dt: float) -> Eye:
         "noise_stddev": lidar.noise,
         "dropoff_general_rate": lidar.lost,
     }
-    return Eye("sensor.lidar.ray_cast", _words(told), _place(lidar.to_ego, _LIDAR_AXES), read, empty)
+    return Eye("sensor.lidar.ray_cast", _words(attributes), _place(lidar.to_ego, _LIDAR_AXES), read, empty)
 
 
 def radar_eye(radar: Lidar, dt: float) -> Eye:
-    """A radar, of rays as `ssad.rendering.radar` has them."""
-    room = len(radar.beams) * radar.azimuths
-    high = float(np.ptp(radar.beams)) * (1.0 + 1.0 / max(len(radar.beams) - 1, 1))
-    empty = np.zeros((room, 4), np.float32)
+    """Describe a radar with the rays of `ssad.recording.loop_radar`."""
+    point_count = len(radar.beams) * radar.azimuths
+    vertical_angle = float(np.ptp(radar.beams)) * (1.0 + 1.0 / max(len(radar.beams) - 1, 1))
+    empty = np.zeros((point_count, 4), np.float32)
 
     def read(raw: bytes) -> F32:
-        seen = np.frombuffer(raw, np.float32).reshape(-1, 4)[:room, ::-1]  # velocity, azimuth, altitude, depth
-        out = empty.copy()
-        out[: len(seen)] = seen
-        return out
+        returns = np.frombuffer(raw, np.float32).reshape(-1, 4)[
+            :point_count, ::-1
+        ]  # velocity, azimuth, altitude, depth
+        reading = empty.copy()
+        reading[: len(returns)] = returns
+        return reading
 
-    told = {
+    attributes = {
         "horizontal_fov": math.degrees(radar.width),
-        "vertical_fov": math.degrees(high),
+        "vertical_fov": math.degrees(vertical_angle),
         "range": radar.reach,
-        "points_per_second": round(room / dt),
+        "points_per_second": round(point_count / dt),
     }
-    return Eye("sensor.other.radar", _words(told), _place(radar.to_ego, _LIDAR_AXES), read, empty)
+    return Eye("sensor.other.radar", _words(attributes), _place(radar.to_ego, _LIDAR_AXES), read, empty)
 
 
 def _words(told: Mapping[str, float]) -> dict[str, str]:
@@ -127,14 +140,14 @@ def _words(told: Mapping[str, float]) -> dict[str, str]:
 
 
 def _place(to_ego: F64, axes: F64) -> F64:
-    """Sensor to car of a frame of x forward, y left, z up, from one of these axes."""
-    place = np.array(to_ego, np.float64)
-    place[:3, :3] = place[:3, :3] @ axes.T
-    return place
+    """Return sensor to car of a frame of x forward, y left, z up, given the sensor's own axes."""
+    pose = np.array(to_ego, np.float64)
+    pose[:3, :3] = pose[:3, :3] @ axes.T
+    return pose
 
 
 def angles_of(place: F64) -> tuple[float, float, float]:
-    """CARLA's roll, pitch and yaw, degrees, of a rotation of x forward, y left, z up."""
+    """Return CARLA's roll, pitch and yaw, degrees, of a rotation in a frame of x forward, y left, z up."""
     forward, right, up = place[:3, 0], -place[:3, 1], place[:3, 2]
     yaw = math.atan2(-forward[1], forward[0])
     pitch = math.atan2(forward[2], math.hypot(forward[0], forward[1]))
@@ -143,12 +156,12 @@ def angles_of(place: F64) -> tuple[float, float, float]:
 
 @dataclass
 class Carried:
-    """The sensors that the ego of an episode carries.
+    """The sensors on the ego of an episode.
 
     Attributes:
-        eyes: By name.
-        timeout: s that a reading may take.
-        where: Which server, for messages.
+        eyes: Sensors by name.
+        timeout: Time limit of a reading, s.
+        where: Name of the server, for messages.
     """
 
     eyes: Mapping[str, Eye]
@@ -163,44 +176,45 @@ class Carried:
         import carla
 
         library = world.get_blueprint_library()
-        for name, eye in self.eyes.items():
-            blueprint = library.find(eye.kind)
-            for key, value in eye.attributes.items():
+        for name, description in self.eyes.items():
+            blueprint = library.find(description.kind)
+            for key, value in description.attributes.items():
                 blueprint.set_attribute(key, value)
-            roll, pitch, yaw = angles_of(eye.place)
-            x, y, z = eye.place[:3, 3].tolist()
-            place = carla.Transform(
+            roll, pitch, yaw = angles_of(description.place)
+            x, y, z = description.place[:3, 3].tolist()
+            transform = carla.Transform(
                 carla.Location(x=x + middle, y=0.0 - y, z=z), carla.Rotation(pitch=pitch, yaw=yaw, roll=roll)
             )
-            sensor = cast("carla.Sensor", world.spawn_actor(blueprint, place, attach_to=body))
-            came: Queue[tuple[int, bytes]] = Queue()
-            self._came[name] = came
-            sensor.listen(_into(came))
+            sensor = cast("carla.Sensor", world.spawn_actor(blueprint, transform, attach_to=body))
+            measurements: Queue[tuple[int, bytes]] = Queue()
+            self._came[name] = measurements
+            sensor.listen(_into(measurements))
             self._sensors.append(sensor)
 
     def detach(self) -> None:
-        """Take them out."""
+        """Remove the sensors."""
         sensors, self._sensors = self._sensors, []
         self._came, self._seen = {}, {}
         for sensor in sensors:
-            stop: Callable[[], object] = sensor.stop  # the stubs do not say what it gives
+            stop: Callable[[], object] = sensor.stop  # the stubs do not declare its return type
             stop()
             sensor.destroy()
 
     def reading(self, name: str, frame: int) -> F32 | U8:
-        """What a sensor saw in a frame. ConfigError where CARLA does not send it in time."""
-        seen = self._seen.get(name)
-        if seen is not None and seen[0] == frame:
-            return seen[1]
+        """Return the reading of a sensor in a frame. ConfigError if CARLA does not send it in time."""
+        cached = self._seen.get(name)
+        if cached is not None and cached[0] == frame:
+            return cached[1]
         while True:
             try:
-                at, raw = self._came[name].get(timeout=self.timeout)
+                # Measurements of earlier frames that were never read are skipped.
+                measured_frame, encoded = self._came[name].get(timeout=self.timeout)
             except (Empty, KeyError):
                 raise ConfigError(f"{self.where}: its sensor '{name}' sends nothing of frame {frame}") from None
-            if at == frame:
+            if measured_frame == frame:
                 break
         try:
-            value = self.eyes[name].read(raw)
+            value = self.eyes[name].read(encoded)
         except ValueError as error:
             raise ConfigError(f"{self.where}: its sensor '{name}' sends something else: {error}") from None
         self._seen[name] = frame, value
@@ -208,21 +222,21 @@ class Carried:
 
 
 def _into(came: Queue[tuple[int, bytes]]) -> Callable[[carla.Image | carla.LidarMeasurement], None]:
-    def take(data: carla.Image | carla.LidarMeasurement) -> None:
+    def enqueue(data: carla.Image | carla.LidarMeasurement) -> None:
         came.put((data.frame, bytes(data.raw_data)))
 
-    return take
+    return enqueue
 
 
 def eyes_of(sensors: Mapping[str, Camera | tuple[str, Lidar]], dt: float) -> dict[str, Eye]:
-    """CARLA's sensors for cameras, and for LiDARs and radars beside the word "lidar" or "radar", by name."""
-    found = {}
-    for name, one in sensors.items():
-        if isinstance(one, Camera):
-            found[name] = camera_eye(one)
+    """Return CARLA's sensors by name, for cameras, and for LiDARs and radars paired with "lidar" or "radar"."""
+    descriptions = {}
+    for name, sensor in sensors.items():
+        if isinstance(sensor, Camera):
+            descriptions[name] = camera_eye(sensor)
         else:
-            found[name] = lidar_eye(one[1], dt) if one[0] == "lidar" else radar_eye(one[1], dt)
-    return found
+            descriptions[name] = lidar_eye(sensor[1], dt) if sensor[0] == "lidar" else radar_eye(sensor[1], dt)
+    return descriptions
 
 
 class Own:
@@ -232,6 +246,6 @@ class Own:
         self.name = name
 
     def __call__(self, simulator: object, agents: I32) -> F32 | U8:
-        """Readings [N, ...] of egos [N, 2]."""
-        found = [simulator.seen(self.name, row) for row in agents.tolist()]  # type: ignore[attr-defined]
-        return np.stack(found)
+        """Return the readings [N, ...] of egos [N, 2]."""
+        readings = [simulator.seen(self.name, row) for row in agents.tolist()]  # type: ignore[attr-defined]
+        return np.stack(readings)

@@ -1,4 +1,4 @@
-"""Where a CARLA server listens, and whether it answers."""
+"""Address of a CARLA server, and the connection to it."""
 
 from __future__ import annotations
 
@@ -61,31 +61,31 @@ class Server:
 
     @staticmethod
     def of(address: str) -> Server:
-        """The server of an address such as carla://HOST:PORT?sensors=carla&traffic=manager&weather=HardRainNoon.
+        """Parse an address such as carla://HOST:PORT?sensors=carla&traffic=manager&weather=HardRainNoon.
 
         Raises:
-            ConfigError: It is none.
+            ConfigError: The address or an option is invalid.
         """
-        found = _ADDRESS.match(address)
-        port = int(found["port"] or PORT) if found else 0
-        if found is None or not 0 < port < 65535:
+        parsed = _ADDRESS.match(address)
+        port = int(parsed["port"] or PORT) if parsed else 0
+        if parsed is None or not 0 < port < 65535:
             raise ConfigError(f"simulator '{address}': expected carla://HOST or carla://HOST:PORT")
-        told = [part.partition("=")[::2] for part in (found["more"] or "").split("&") if part]
-        for name, value in told:
+        options = [part.partition("=")[::2] for part in (parsed["more"] or "").split("&") if part]
+        for name, value in options:
             if value not in _CHOICES.get(name, ()):
-                known = "; ".join(f"{key}={' or '.join(values)}" for key, values in _CHOICES.items())
-                raise ConfigError(f"simulator '{address}': there is no {name}={value}; there are {known}")
-        return Server(found["host"].strip("[]"), port, **dict(told))
+                choices = "; ".join(f"{key}={' or '.join(values)}" for key, values in _CHOICES.items())
+                raise ConfigError(f"simulator '{address}': there is no {name}={value}; there are {choices}")
+        return Server(parsed["host"].strip("[]"), port, **dict(options))
 
     def __str__(self) -> str:
         return f"CARLA at {self.host}:{self.port}"
 
 
 def connect(server: Server) -> carla.Client:
-    """A client of a server that answers and is of the client's version.
+    """Connect to a server that answers and has the client's version.
 
     Raises:
-        ConfigError: The package is missing, nobody answers, or the versions differ.
+        ConfigError: The package is missing, the server does not answer, or the versions differ.
     """
     try:
         import carla
@@ -93,10 +93,13 @@ def connect(server: Server) -> carla.Client:
         raise ConfigError(f"carla is not installed ({error}); {install_extra('carla')}") from None
     client = carla.Client(server.host, server.port)
     client.set_timeout(server.timeout)
-    there = asked(server, "connect", client.get_server_version)
-    here = client.get_client_version()
-    if there != here:
-        raise ConfigError(f"{server}: the server is version {there}, the package carla {here}; both must be {VERSION}")
+    server_version = asked(server, "connect", client.get_server_version)
+    client_version = client.get_client_version()
+    if server_version != client_version:
+        raise ConfigError(
+            f"{server}: the server is version {server_version}, the package carla "
+            f"{client_version}; both must be {VERSION}"
+        )
     return client
 
 
@@ -105,19 +108,19 @@ def asked(server: Server, doing: str, call: Callable[[], T]) -> T:
     try:
         return call()
     except RuntimeError as error:
-        why = " ".join(str(error).split())[:200]
-        raise ConfigError(f"{server}: cannot {doing}: {why}; is the server running, and is it still?") from None
+        reason = " ".join(str(error).split())[:200]
+        raise ConfigError(f"{server}: cannot {doing}: {reason}; is the server running, and is it still?") from None
 
 
 def probe(server: Server) -> None:
-    """Ask a server for its version, in a process of its own: the package's C++ may abort where it meets another server.
+    """Ask a server for its version in a separate process: the C++ library may abort on another server.
 
     Raises:
-        ConfigError: It does not answer, is of another version, or the package is missing or dies.
+        ConfigError: The server does not answer, has another version, or the package is missing or crashes.
     """
     code = "import sys; from ssad.simulators.carla.server import main; main(*sys.argv[1:])"
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", code, server.host, str(server.port)],
             capture_output=True,
             text=True,
@@ -126,14 +129,16 @@ def probe(server: Server) -> None:
         )
     except subprocess.TimeoutExpired:
         raise ConfigError(f"{server}: no answer in {3.0 * server.timeout:g} s") from None
-    if done.returncode == 2:
-        raise ConfigError(done.stdout.strip())
-    if done.returncode != 0:
-        raise ConfigError(f"{server}: the package carla ended with code {done.returncode} while it asked for a version")
+    if process.returncode == 2:
+        raise ConfigError(process.stdout.strip())
+    if process.returncode != 0:
+        raise ConfigError(
+            f"{server}: the package carla ended with code {process.returncode} while it asked for a version"
+        )
 
 
 def main(host: str, port: str) -> None:
-    """What `probe` runs: exit code 2 and a line where `connect` fails."""
+    """Run the check of `probe`: exit code 2 and one line of output if `connect` fails."""
     try:
         connect(Server(host, int(port)))
     except ConfigError as error:

@@ -52,14 +52,14 @@ if TYPE_CHECKING:
     import carla
 
 ABOVE: Final = 0.3  # m above the road at which bodies are spawned, so that none sticks in it; they drop at once
-SAME: Final = 0.05  # m by which the length of a road may differ between two copies of a map
+SAME: Final = 0.05  # m, difference of a road's length between two copies of a map
 GROUND: Final = ("static.road", "static.sidewalk", "static.ground", "static.terrain", "static.roadline")
-_FREE = (Controller.TRAJECTORY, Controller.PLACED, Controller.NONE)  # those that CARLA's physics do not move
+_FREE = (Controller.TRAJECTORY, Controller.PLACED, Controller.NONE)  # agents that CARLA's physics do not move
 
 
 @dataclass(frozen=True)
 class _Kept:
-    """A connection that stays open from one simulator of this process to the next, so that no map is loaded twice."""
+    """A connection that outlives a simulator of this process, so that the next one need not load the map again."""
 
     client: carla.Client
     world: carla.World
@@ -91,12 +91,13 @@ class Carla(Mirrored):
         self.dt, self.batch, self.agents = self.mirror.dt, self.mirror.batch, self.mirror.agents
         self.episodes, self.graphs = self.mirror.episodes, self.mirror.graphs
         self.server = server
-        kept = _KEPT.pop(server, None)
-        self.client = connect(server) if kept is None else kept.client
+        connection = _KEPT.pop(server, None)
+        self.client = connect(server) if connection is None else connection.client
         self.world: carla.World = self._ask("get its world", self.client.get_world)
-        if kept is None or self.world.id != kept.world.id:
-            kept = _Kept(self.client, self.world)
-        self.town, self._lights = kept.town, kept.lights
+        # Another client may have loaded another world since; then our map and lights are outdated.
+        if connection is None or self.world.id != connection.world.id:
+            connection = _Kept(self.client, self.world)
+        self.town, self._lights = connection.town, connection.lights
         self._found: carla.WorldSettings = self._ask("get its settings", self.world.get_settings)
         self._bodies: dict[int, carla.Actor] = {}
         self._middle: dict[int, float] = {}  # m from an actor's origin forward to the centre of its body
@@ -117,7 +118,7 @@ class Carla(Mirrored):
 
     @property
     def assigned(self) -> I32:
-        """[B] number of the episode that each scene runs."""
+        """[B] number of the episode of each scene."""
         return self.mirror.assigned
 
     @property
@@ -135,7 +136,7 @@ class Carla(Mirrored):
     # ------------------------------------------------------------ the start
 
     def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
-        """Start the scene again, with another episode if given; the map is loaded only where the town is another."""
+        """Restart the scene, with another episode if given; the map is loaded only if the town changes."""
         if scenes is not None and not len(scenes):
             return
         self.mirror.reset(scenes, episodes=episodes)
@@ -148,29 +149,29 @@ class Carla(Mirrored):
         self._ask("change its settings", self._synchronise)
         self._ask("set the weather", self._weather)
         active = self.mirror.array("active")[0]
-        for i, agent in enumerate(episode.agents):
-            if active[i] != Presence.ABSENT:
-                self._spawn(i, agent.pose)
+        for agent_index, agent in enumerate(episode.agents):
+            if active[agent_index] != Presence.ABSENT:
+                self._spawn(agent_index, agent.pose)
         self._ask("attach its collision and lane sensors", lambda: self._events.attach(self.world, self._bodies[0]))
         self._ask("attach its sensors", lambda: self._carried.attach(self.world, self._bodies[0], self._middle[0]))
         if self._traffic is not None:
             self._ask("begin with its Traffic Manager", partial(self._traffic.begin, episode))
-        self._tick()  # everybody drops onto the road
-        for i, agent in enumerate(episode.agents):
-            if agent.speed != 0.0 and i in self._bodies and agent.controller not in _FREE:
-                self._ask(f"set the speed of {agent.name}", partial(self._speed, i, agent.pose, agent.speed))
+        self._tick()  # all bodies drop onto the road
+        for agent_index, agent in enumerate(episode.agents):
+            if agent.speed != 0.0 and agent_index in self._bodies and agent.controller not in _FREE:
+                self._ask(f"set the speed of {agent.name}", partial(self._speed, agent_index, agent.pose, agent.speed))
         self._events.begin(self._frame)
 
     def _load(self, town: str) -> None:
         import carla
 
-        text = town_xodr(town)
+        map_text = town_xodr(town)
         self.client.set_timeout(5.0 * self.server.timeout)
-        known = [name.rsplit("/", 1)[-1] for name in self._ask("list its maps", self.client.get_available_maps)]
-        if town in known:
+        server_maps = [name.rsplit("/", 1)[-1] for name in self._ask("list its maps", self.client.get_available_maps)]
+        if town in server_maps:
             self.world = self._ask(f"load the map {town}", lambda: self.client.load_world(town))
         else:
-            rules = carla.OpendriveGenerationParameters(
+            generation = carla.OpendriveGenerationParameters(
                 vertex_distance=2.0,
                 max_road_length=50.0,
                 wall_height=0.0,
@@ -179,11 +180,11 @@ class Carla(Mirrored):
                 enable_mesh_visibility=True,
             )
             self.world = self._ask(
-                f"make a world of the map of {town}", lambda: self.client.generate_opendrive_world(text, rules)
+                f"make a world of the map of {town}", lambda: self.client.generate_opendrive_world(map_text, generation)
             )
         self.client.set_timeout(self.server.timeout)
-        told = self._ask("get its map", lambda: self.world.get_map().to_opendrive())
-        if not _same_roads(text, told, str(self.server)):
+        server_map_text = self._ask("get its map", lambda: self.world.get_map().to_opendrive())
+        if not _same_roads(map_text, server_map_text, str(self.server)):
             raise ConfigError(
                 f"{self.server}: its map {town} has other roads than the town here; import the server's map under "
                 "that name (ssad import map)"
@@ -224,7 +225,7 @@ class Carla(Mirrored):
 
         try:
             body = self._ask(f"spawn {agent.name}", spawn)
-        except IndexError:  # what the library raises for a name that it does not have
+        except IndexError:  # the library raises this for an unknown blueprint
             raise ConfigError(f"{self.server}: it has no blueprint {BLUEPRINTS.get(agent.model)}") from None
         if body is None:
             raise ConfigError(
@@ -241,20 +242,20 @@ class Carla(Mirrored):
     def _transform(self, pose: Pose, i: int = -1) -> carla.Transform:
         import carla
 
-        back = self._middle.get(i, 0.0)
-        x, y = pose.x - back * math.cos(pose.yaw), pose.y - back * math.sin(pose.yaw)
+        centre_offset = self._middle.get(i, 0.0)
+        x, y = pose.x - centre_offset * math.cos(pose.yaw), pose.y - centre_offset * math.sin(pose.yaw)
         return carla.Transform(carla.Location(x, -y, ABOVE), carla.Rotation(yaw=-math.degrees(pose.yaw)))
 
     def _speed(self, i: int, pose: Pose, speed: float) -> None:
         import carla
 
-        ahead = carla.Vector3D(speed * math.cos(pose.yaw), -speed * math.sin(pose.yaw), 0.0)
-        self._bodies[i].set_target_velocity(ahead)
+        velocity = carla.Vector3D(speed * math.cos(pose.yaw), -speed * math.sin(pose.yaw), 0.0)
+        self._bodies[i].set_target_velocity(velocity)
 
     # ------------------------------------------------------------ a step
 
     def step(self, controls: npt.ArrayLike | None = None) -> None:
-        """Advance a running scene by 0.1 s: plan in the mirror, act in CARLA, tick, mirror what it made of it."""
+        """Advance a running scene by 0.1 s: plan in the mirror, act in CARLA, tick, and mirror the result."""
         world = self.mirror
         if controls is not None:
             world.set_controls(controls)
@@ -262,71 +263,88 @@ class Carla(Mirrored):
         if world.ended()[0] != End.RUNNING:
             return
         world.plan()
-        said: I32 = world.array("controller").copy()
-        control = np.where((said == Controller.EXTERNAL)[..., None], self._controls, world.array("control"))
+        controllers: I32 = world.array("controller").copy()
+        control = np.where((controllers == Controller.EXTERNAL)[..., None], self._controls, world.array("control"))
         active = world.array("active").copy()
         time = (int(world.array("step")[0]) + 1) * self.dt
         self._ask("show its traffic lights", self._signals)
-        self._drive(said[0], control[0], active[0], time)
+        self._drive(controllers[0], control[0], active[0], time)
         self._tick()
-        places = self._places(time)
+        placements = self._places(time)
         world.put("control", control.astype(np.float32))
         world.put("active", active)
-        world.place(places)
-        world.put("controller", np.full_like(said, Controller.PLACED))
+        world.place(placements)
+        # While the mirror advances, all agents are placed where CARLA has them; the controllers are restored below.
+        world.put("controller", np.full_like(controllers, Controller.PLACED))
         world.advance()
-        removed = (active != Presence.ABSENT) & (world.array("active") == Presence.ABSENT)  # whom the ego has touched
-        world.put("controller", np.where(removed, int(Controller.NONE), said).astype(said.dtype))
-        self._leave(said[0], active[0])
+        touched = (active != Presence.ABSENT) & (world.array("active") == Presence.ABSENT)  # whom the ego has touched
+        world.put("controller", np.where(touched, int(Controller.NONE), controllers).astype(controllers.dtype))
+        self._leave(controllers[0], active[0])
         self._felt()
 
     def _signals(self) -> None:
         import carla
 
-        lamp = carla.TrafficLightState
-        shows = {
-            SignalState.RED: lamp.Red,
-            SignalState.YELLOW: lamp.Yellow,
-            SignalState.GREEN: lamp.Green,
-            SignalState.OFF: lamp.Off,
+        light_state = carla.TrafficLightState
+        light_states = {
+            SignalState.RED: light_state.Red,
+            SignalState.YELLOW: light_state.Yellow,
+            SignalState.GREEN: light_state.Green,
+            SignalState.OFF: light_state.Off,
         }
         states = self.mirror.state().signal[0]
         for signal, light in self._lights.items():
             state = int(states[signal])
             if self._shown.get(signal) != state:
-                light.set_state(shows[SignalState(state)])
+                light.set_state(light_states[SignalState(state)])
                 self._shown[signal] = state
 
     def _drive(self, said: I32, control: F32, active: I32, time: float) -> None:
         """Hand everybody their controls; who follows a trajectory appears, is put, and goes."""
         poses = self.mirror.array("pose")[0]
-        for i, agent in enumerate(self._episode.agents):
-            if said[i] == Controller.TRAJECTORY:
+        for agent_index, agent in enumerate(self._episode.agents):
+            if said[agent_index] == Controller.TRAJECTORY:
                 pose = _on(agent.trajectory, time)
-                active[i] = Presence.ABSENT if pose is None else Presence.AWAKE
+                active[agent_index] = Presence.ABSENT if pose is None else Presence.AWAKE
                 if pose is None:
-                    self._destroy(i)
-                elif i in self._bodies:
-                    self._ask(f"place {agent.name}", partial(self._bodies[i].set_transform, self._transform(pose, i)))
+                    self._destroy(agent_index)
+                elif agent_index in self._bodies:
+                    self._ask(
+                        f"place {agent.name}",
+                        partial(self._bodies[agent_index].set_transform, self._transform(pose, agent_index)),
+                    )
                 else:
-                    self._spawn(i, pose)
-            elif i in self._bodies and active[i] != Presence.ABSENT and MODELS[agent.model].max_speed > 0.0:
-                if said[i] in _FREE and i > 0:
+                    self._spawn(agent_index, pose)
+            elif (
+                agent_index in self._bodies
+                and active[agent_index] != Presence.ABSENT
+                and MODELS[agent.model].max_speed > 0.0
+            ):
+                if said[agent_index] in _FREE and agent_index > 0:
                     continue
-                walks = MODELS[agent.model].kind == AgentKind.WALKER
-                if self._traffic is not None and i > 0 and said[i] == Controller.AUTOPILOT and not walks:
-                    if active[i] == Presence.AWAKE and i not in self._traffic.driven:
-                        told = partial(self._traffic.take, i, self._bodies[i], self._episode)
-                        self._ask(f"hand {agent.name} to its Traffic Manager", told)
+                is_walker = MODELS[agent.model].kind == AgentKind.WALKER
+                if (
+                    self._traffic is not None
+                    and agent_index > 0
+                    and said[agent_index] == Controller.AUTOPILOT
+                    and not is_walker
+                ):
+                    if active[agent_index] == Presence.AWAKE and agent_index not in self._traffic.driven:
+                        command = partial(self._traffic.take, agent_index, self._bodies[agent_index], self._episode)
+                        self._ask(f"hand {agent.name} to its Traffic Manager", command)
                     continue
-                order = self._walk if walks else self._control
-                yaw, told, who = float(poses[i, 2]), control[i], Controller(int(said[i]))
-                self._ask(f"control {agent.name}", partial(order, i, told, yaw, who))
+                apply = self._walk if is_walker else self._control
+                yaw, command, controller = (
+                    float(poses[agent_index, 2]),
+                    control[agent_index],
+                    Controller(int(said[agent_index])),
+                )
+                self._ask(f"control {agent.name}", partial(apply, agent_index, command, yaw, controller))
 
     def _control(self, i: int, control: F32, yaw: float, who: Controller) -> None:
         import carla
 
-        throttle, brake, steer, reverse = (float(v) for v in control)
+        throttle, brake, steer, reverse = (float(value) for value in control)
         cast("carla.Vehicle", self._bodies[i]).apply_control(
             carla.VehicleControl(
                 throttle=min(max(throttle, 0.0), 1.0),
@@ -342,10 +360,10 @@ class Carla(Mirrored):
 
         agent = self._episode.agents[i]
         turn = float(control[2]) * WALKER_RATE * self.dt if who == Controller.EXTERNAL else 0.0
-        ahead = carla.Vector3D(math.cos(yaw + turn), -math.sin(yaw + turn), 0.0)
+        direction = carla.Vector3D(math.cos(yaw + turn), -math.sin(yaw + turn), 0.0)
         speed = min(max(float(control[0]), 0.0), 1.0) * MODELS[agent.model].max_speed
         walker = cast("carla.Walker", self._bodies[i])
-        walker.apply_control(carla.WalkerControl(direction=ahead, speed=speed, jump=False))
+        walker.apply_control(carla.WalkerControl(direction=direction, speed=speed, jump=False))
 
     def _tick(self) -> None:
         self._frame = self._ask("advance", lambda: self.world.tick(self.server.timeout))
@@ -359,59 +377,66 @@ class Carla(Mirrored):
         return self._carried.reading(name, self._frame)
 
     def _places(self, time: float) -> F32:
-        """[1, A, 4] x, y, yaw, speed of the bodies' centres after the tick; who is not there stays where it was."""
+        """Return [1, A, 4] x, y, yaw, speed of the bodies' centres after the tick; absent agents keep their place."""
         world = self.mirror
-        places = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
+        placements = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
         snapshot = self._ask("tell where everybody is", self.world.get_snapshot)
-        for i, body in self._bodies.items():
-            seen = snapshot.find(body.id)
-            if seen is None:
-                name = self._episode.agents[i].name
+        for agent_index, body in self._bodies.items():
+            actor_state = snapshot.find(body.id)
+            if actor_state is None:
+                name = self._episode.agents[agent_index].name
                 raise ConfigError(f"{self.server}: {name} is gone: somebody has destroyed it")
-            place, velocity = seen.get_transform(), seen.get_velocity()
-            yaw = -math.radians(place.rotation.yaw)
-            x = place.location.x + self._middle[i] * math.cos(yaw)
-            y = -place.location.y + self._middle[i] * math.sin(yaw)
-            agent = self._episode.agents[i]
+            transform, velocity = actor_state.get_transform(), actor_state.get_velocity()
+            yaw = -math.radians(transform.rotation.yaw)
+            x = transform.location.x + self._middle[agent_index] * math.cos(yaw)
+            y = -transform.location.y + self._middle[agent_index] * math.sin(yaw)
+            agent = self._episode.agents[agent_index]
             speed = velocity.x * math.cos(yaw) - velocity.y * math.sin(yaw)
-            if agent.controller == Controller.TRAJECTORY:  # it is put, and CARLA knows no speed of it
+            if agent.controller == Controller.TRAJECTORY:  # it is placed, so CARLA knows no speed of it
                 speed = _speed_on(agent.trajectory, time, yaw)
-            places[0, i] = x, y, yaw, speed
-        if not np.isfinite(places).all():
+            placements[0, agent_index] = x, y, yaw, speed
+        if not np.isfinite(placements).all():
             raise ConfigError(f"{self.server}: it tells places that are no numbers")
-        return places.astype(np.float32)
+        return placements.astype(np.float32)
 
     def _leave(self, said: I32, before: I32) -> None:
         """Background traffic leaves at the end of its route; who was taken out of the mirror leaves CARLA too."""
         world = self.mirror
-        gone = np.zeros((1, self.agents), bool)
+        removed = np.zeros((1, self.agents), bool)
         route = world.state().route[0]
         at_end = world.array("progress")[0] >= route[:, 1] - 3
-        gone[0] = at_end & (said == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
-        if gone.any():
-            world.remove(gone)
-        for i in list(self._bodies):
-            if world.array("active")[0, i] == Presence.ABSENT:
-                self._destroy(i)
+        removed[0] = at_end & (said == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
+        if removed.any():
+            world.remove(removed)
+        for agent_index in list(self._bodies):
+            if world.array("active")[0, agent_index] == Presence.ABSENT:
+                self._destroy(agent_index)
 
     def _felt(self) -> None:
-        """What the collision sensor felt and the mirror did not see: bodies of another shape, things of the town."""
+        """Add contacts that only the collision sensor reported: other body shapes, objects of the town."""
         self._ask("look after its sensors", self._events.check)
-        hits, self._events.hits = self._events.hits, []
-        number = {body.id: i for i, body in self._bodies.items()}
-        felt = {number.get(who, -1 - abs(who)) for who, kind in hits if not kind.startswith(GROUND)} - {0}
-        fresh = felt - self._touching
-        self._touching = felt
+        collisions, self._events.hits = self._events.hits, []
+        agent_by_body = {body.id: agent_index for agent_index, body in self._bodies.items()}
+        touching = {
+            agent_by_body.get(body_id, -1 - abs(body_id))
+            for body_id, body_type in collisions
+            if not body_type.startswith(GROUND)
+        } - {0}
+        new_contacts = touching - self._touching
+        self._touching = touching
         world = self.mirror
         touched = int(world.array("touch")[0, 0])
-        for i in sorted(fresh):
-            if i >= 0 and touched >> i & 1:
+        for agent_index in sorted(new_contacts):
+            if agent_index >= 0 and touched >> agent_index & 1:
                 continue
             episode = self._episode
-            bit = _bit(MODELS[episode.agents[i].model].kind) if i >= 0 else Contact.STATIC
-            world.put("ego.contact", world.array("ego.contact") | int(bit))
+            contact = _bit(MODELS[episode.agents[agent_index].model].kind) if agent_index >= 0 else Contact.STATIC
+            world.put("ego.contact", world.array("ego.contact") | int(contact))
             if int(world.array("ego.contact_agent")[0]) == -1:
-                world.put("ego.contact_agent", np.full_like(world.array("ego.contact_agent"), i if i >= 0 else -2))
+                world.put(
+                    "ego.contact_agent",
+                    np.full_like(world.array("ego.contact_agent"), agent_index if agent_index >= 0 else -2),
+                )
             if episode.limits.contact == "end" and world.ended()[0] in (End.RUNNING, End.COMPLETE):
                 world.put("end", np.full_like(world.array("end"), int(End.COLLISION)))
 
@@ -423,15 +448,15 @@ class Carla(Mirrored):
             self._ask("take somebody out", body.destroy)
 
     def _clear(self) -> None:
-        """Take out all that was spawned."""
+        """Remove all spawned bodies and sensors."""
         self._touching = set()
         self._ask("take its collision and lane sensors out", self._events.detach)
         self._ask("take its sensors out", self._carried.detach)
-        for i in list(self._bodies):
-            self._destroy(i)
+        for agent_index in list(self._bodies):
+            self._destroy(agent_index)
 
     def close(self) -> None:
-        """Take out all that was spawned and give the server its settings back; a dead server is left alone."""
+        """Remove all that was spawned and restore the settings; a server that does not answer is left alone."""
         with suppress(ConfigError):
             self._clear()
             if self._traffic is not None:
@@ -444,15 +469,17 @@ def _same_roads(ours: str, theirs: str, where: str) -> bool:
     """Whether two OpenDRIVE texts have the same roads, of the same lengths."""
 
     def roads(text: str, name: str) -> dict[str, float]:
-        found = parse_xml(text.encode(), name).findall("road")
-        return {road.get("id", ""): float(road.get("length", "nan")) for road in found}
+        elements = parse_xml(text.encode(), name).findall("road")
+        return {road.get("id", ""): float(road.get("length", "nan")) for road in elements}
 
-    one, other = roads(ours, "the town here"), roads(theirs, f"the map of {where}")
-    return one.keys() == other.keys() and all(abs(one[name] - other[name]) <= SAME for name in one)
+    town_roads, server_roads = roads(ours, "the town here"), roads(theirs, f"the map of {where}")
+    return town_roads.keys() == server_roads.keys() and all(
+        abs(town_roads[name] - server_roads[name]) <= SAME for name in town_roads
+    )
 
 
 def _on(rows: Sequence[tuple[float, float, float, float]], time: float) -> Pose | None:
-    """Where a trajectory is at a time; None before its first and after its last row."""
+    """Return the pose of a trajectory at a time; None before its first and after its last row."""
     table = np.array(rows)
     if not table[0, 0] - 1e-6 <= time <= table[-1, 0] + 1e-6:
         return None
@@ -461,13 +488,13 @@ def _on(rows: Sequence[tuple[float, float, float, float]], time: float) -> Pose 
 
 
 def _speed_on(rows: Sequence[tuple[float, float, float, float]], time: float, yaw: float) -> float:
-    """Speed along the heading of a trajectory in the piece that a time is in, m/s."""
+    """Return the speed of a trajectory along its heading in the segment that contains a time, m/s."""
     table = np.array(rows)
-    k = int(np.clip(np.searchsorted(table[:, 0], time, side="left") - 1, 0, len(table) - 2))
-    dt, dx, dy, _ = (table[k + 1] - table[k]).tolist()
+    segment = int(np.clip(np.searchsorted(table[:, 0], time, side="left") - 1, 0, len(table) - 2))
+    dt, dx, dy, _ = (table[segment + 1] - table[segment]).tolist()
     return float((dx * math.cos(yaw) + dy * math.sin(yaw)) / dt)
 
 
 def _bit(kind: AgentKind) -> Contact:
-    known = {AgentKind.WALKER: Contact.WALKER, AgentKind.BICYCLE: Contact.CYCLIST, AgentKind.PROP: Contact.STATIC}
-    return known.get(kind, Contact.VEHICLE)
+    contacts = {AgentKind.WALKER: Contact.WALKER, AgentKind.BICYCLE: Contact.CYCLIST, AgentKind.PROP: Contact.STATIC}
+    return contacts.get(kind, Contact.VEHICLE)

@@ -1,7 +1,7 @@
-"""Background traffic in the hands of CARLA's Traffic Manager, along the routes that the episode has for it.
+"""Background traffic driven by CARLA's Traffic Manager, along the routes that the episode defines.
 
-Facts: carla.readthedocs.io, 0.9.16, Traffic Manager: its ways through `set_path`, its speed through
-`set_desired_speed` in km/h, one random stream a manager.
+Facts: carla.readthedocs.io, 0.9.16, Traffic Manager: its paths through `set_path`, its speed through
+`set_desired_speed` in km/h, one random stream per manager.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from ssad.core.types import Episode
 if TYPE_CHECKING:
     import carla
 
-EVERY: Final = 5  # points of a route between the places that the manager is given
-OFFSET: Final = 6000  # its port beyond that of the server: 8000 beside 2000
+EVERY: Final = 5  # every fifth point of a route is passed to the manager
+OFFSET: Final = 6000  # from the server's port to the manager's: 8000 for the default 2000
 KMH: Final = 3.6
 
 
@@ -34,7 +34,7 @@ class Traffic:
         self.driven: set[int] = set()
 
     def begin(self, episode: Episode) -> None:
-        """A new episode: nobody is driven, and what the manager draws depends on the episode alone."""
+        """Start an episode without any driven vehicle; the manager's random stream depends on the episode alone."""
         self.driven = set()
         self._manager.set_random_device_seed(int(digest("traffic manager", episode.key)[:7], 16))
 
@@ -49,9 +49,10 @@ class Traffic:
         self._manager.auto_lane_change(vehicle, False)
         if agent.route is not None:
             points = agent.route.xy[EVERY::EVERY].tolist()
+            # CARLA's frame is left-handed: y changes its sign.
             self._manager.set_path(vehicle, [carla.Location(x, -y, 0.0) for x, y in points])
         self.driven.add(number)
 
     def end(self) -> None:
-        """Leave the manager as it was found."""
+        """Restore the manager's asynchronous mode."""
         self._manager.set_synchronous_mode(False)

@@ -1,8 +1,8 @@
-"""What can be known of everybody at the start of a step: the rows of `Seen` that hold the truth.
+"""Observable state of all agents at the start of a step: the rows of `Seen` that hold the truth.
 
-Nobody knows where anybody wants to go, the ego included. Who keeps to its route shows by its turn signal how it leaves
-the next junction, and from there its lane leads it to the junction after; beyond, it is expected to go straight on.
-Walkers and who has left its route have only their pose, speed and rate of turn.
+No agent knows the intention of another, the ego's included. An agent that follows its route shows by its turn signal
+how it leaves the next junction, and from there its lane leads to the junction after; beyond, it is expected to go
+straight. Walkers and agents that have left their route have only their pose, speed and rate of turn.
 """
 
 import warp as wp
@@ -37,7 +37,7 @@ LARGEST_TURN = wp.constant(1.57)  # rad that one who has left its route is expec
 def light(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, index: int, dt: float
 ) -> int:
-    """State of a signal as i sees it."""
+    """Return the state of a signal as agent i perceives it."""
     if i == 0 and seen.believes[b] == 1 and seen.light[b, index] != AS_IT_IS:
         return seen.light[b, index]
     return signal_state(bank, roads, e, index, float(state.step[b]) * dt)
@@ -45,19 +45,23 @@ def light(
 
 @wp.func
 def keeps_route(roads: Roads, route: wp.vec2i, shift: wp.vec4, at: int, pose: wp.vec3) -> bool:
-    """Whether somebody is where its route is, and goes its way."""
+    """Return whether an agent is on its route and heads along it."""
     point = row(roads.path, route[0] + at)
-    p = wp.vec3(point[0], point[1], point[2])
+    expected_pose = wp.vec3(point[0], point[1], point[2])
     if changes(shift):
-        p = way_at(roads, route[0], route[1], shift, float(at))
-    dx = pose[0] - p[0]
-    dy = pose[1] - p[1]
-    return dx * dx + dy * dy < KEEPS * KEEPS and wp.abs(wrap(pose[2] - p[2])) < ALONG
+        expected_pose = way_at(roads, route[0], route[1], shift, float(at))
+    dx = pose[0] - expected_pose[0]
+    dy = pose[1] - expected_pose[1]
+    return dx * dx + dy * dy < KEEPS * KEEPS and wp.abs(wrap(pose[2] - expected_pose[2])) < ALONG
 
 
 @wp.func
 def shown(roads: Roads, route: wp.vec2i, at: int) -> float:
-    """Place along a route (m) up to which one who keeps to it shows where it goes: the second junction ahead."""
+    """Return the distance along a route (m) up to which an agent that follows it shows its direction.
+
+    That is the second junction ahead: the turn signal announces the next one, and its exit lane leads to the one
+    after.
+    """
     last = route[1] - 1
     end = float(at) + roads.ahead[route[0] + at][2]
     if end < float(last):
@@ -67,7 +71,7 @@ def shown(roads: Roads, route: wp.vec2i, at: int) -> float:
 
 @wp.func
 def turned(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
-    """Pose after `distance` metres at a constant curvature, which ends after a quarter of a turn."""
+    """Return the pose after `distance` metres at a constant curvature, which ends after a quarter of a turn."""
     angle = wp.clamp(curvature * distance, -LARGEST_TURN, LARGEST_TURN)
     arc = distance
     rest = float(0.0)
@@ -112,44 +116,46 @@ def ahead_at(
     curvature: float,
     ahead: float,
 ) -> wp.vec3:
-    """Where somebody is after `ahead` metres."""
-    q = pose
+    """Return the predicted pose of an agent after `ahead` metres."""
+    predicted = pose
     if not follows:
-        q = turned(pose, ahead, curvature)
+        predicted = turned(pose, ahead, curvature)
     else:
-        q = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, known))
-        over = float(at) + ahead - known
-        if over > 0.0:
-            q = wp.vec3(q[0] + over * wp.cos(q[2]), q[1] + over * wp.sin(q[2]), q[2])
-    return q
+        predicted = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, known))
+        excess = float(at) + ahead - known
+        if excess > 0.0:
+            predicted = wp.vec3(
+                predicted[0] + excess * wp.cos(predicted[2]), predicted[1] + excess * wp.sin(predicted[2]), predicted[2]
+            )
+    return predicted
 
 
 @wp.func
 def around(box: wp.vec4, q: wp.vec3) -> wp.vec4:
-    """A box that holds a place, too."""
+    """Extend a box to contain a point."""
     return wp.vec4(wp.min(box[0], q[0]), wp.min(box[1], q[1]), wp.max(box[2], q[0]), wp.max(box[3], q[1]))
 
 
 @wp.func
 def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, dt: float):
-    """Fill an agent's own row."""
+    """Fill the row of an agent."""
     if state.active[b, i] == Presence.ABSENT:
         seen.kind[b, i] = AgentKind.NONE
         return
     e = state.episode[b]
-    m = bank.model[e, i]
-    body = bank.body[m]
-    seen.kind[b, i] = bank.kind[m]
+    model = bank.model[e, i]
+    body = bank.body[model]
+    seen.kind[b, i] = bank.kind[model]
     pose = state.pose[b, i]
     speed = state.speed[b, i]
     seen.pose[b, i] = pose
     seen.speed[b, i] = speed
     seen.half[b, i] = wp.vec2(body[0], body[1])
     # traffic does not know who is under test: the ego is relied on like anybody, whoever drives it
-    relied = int(0)
+    reliable = int(0)
     if i == 0 or (state.controller[b, i] == Controller.AUTOPILOT and state.active[b, i] == Presence.AWAKE):
-        relied = 1
-    seen.gives_way[b, i] = relied
+        reliable = 1
+    seen.gives_way[b, i] = reliable
     seen.waited[b, i] = state.waited[b, i]
     way = wp.vec4(FAR, FAR, float(TurnRank.STRAIGHT), 0.0)
     signal = int(-1)
@@ -160,45 +166,46 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     height = float(wp.nan)
     if route[1] > 1:
         height = roads.height[route[0] + at]
+    # NaN without a route: an unknown height never counts as another level.
     seen.height[b, i] = height
-    follows = route[1] > 1 and bank.kind[m] != AgentKind.WALKER
+    follows = route[1] > 1 and bank.kind[model] != AgentKind.WALKER
     if follows:
         follows = keeps_route(roads, route, shift, at, pose)
     if follows:
-        point = route[0] + at
-        rule = row(roads.rule, point)
-        way = wp.vec4(wp.min(rule[1], rule[2]), rule[2], rule[3], roads.bend[point] + 0.5)
-        signal = roads.path_signal[point]
+        route_point = route[0] + at
+        rule = row(roads.rule, route_point)
+        way = wp.vec4(wp.min(rule[1], rule[2]), rule[2], rule[3], roads.bend[route_point] + 0.5)
+        signal = roads.path_signal[route_point]
         if changes(shift) and state.controller[b, i] == Controller.AUTOPILOT:
             change[0] = indicates(shift, state.aim[b, i][0])
-            if on_oncoming_lane(roads, point, shift):
+            if on_oncoming_lane(roads, route_point, shift):
                 change[1] = 1
             way[3] = way[3] + ASIDE
-    goes = speed
-    if follows and relied == 1 and way[1] < body[0] - 1.0:
-        goes = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
+    expected_speed = speed
+    if follows and reliable == 1 and way[1] < body[0] - 1.0:
+        expected_speed = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
     box = wp.vec4(pose[0], pose[1], pose[0], pose[1])
-    place = (b * seen.forecast.shape[1] + i) * HORIZON
-    if wp.abs(goes) > 0.1:
-        known = float(0.0)
+    flat_index = (b * seen.forecast.shape[1] + i) * HORIZON
+    if wp.abs(expected_speed) > 0.1:
+        shown_until = float(0.0)
         curvature = float(0.0)
         if follows:
-            known = shown(roads, route, at)
+            shown_until = shown(roads, route, at)
         elif wp.abs(speed) > 1.0:
             curvature = wrap(pose[2] - state.previous[b, i][2]) / (speed * dt)
             if wp.abs(curvature) > STRAIGHT_TURN:
-                way[3] = 0.36 * wp.abs(goes) * STRIDE * float(HORIZON)  # no quarter of a turn leaves its chord further
+                way[3] = 0.36 * wp.abs(expected_speed) * STRIDE * float(HORIZON)  # bound of a quarter turn
         for k in range(0, HORIZON, 4):
-            d = goes * STRIDE
-            p = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 1))
-            q = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 2))
-            r = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 3))
-            s = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 4))
-            put_four(seen.forecast, place + k, p, q, r, s)
-            box = around(around(around(around(box, p), q), r), s)
+            stride = expected_speed * STRIDE
+            first = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 1))
+            second = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 2))
+            third = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 3))
+            fourth = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 4))
+            put_four(seen.forecast, flat_index + k, first, second, third, fourth)
+            box = around(around(around(around(box, first), second), third), fourth)
     else:
         for k in range(0, HORIZON, 4):
-            put_four(seen.forecast, place + k, pose, pose, pose, pose)
+            put_four(seen.forecast, flat_index + k, pose, pose, pose, pose)
     seen.span[b, i] = box
     seen.way[b, i] = way
     seen.signal[b, i] = signal
@@ -207,8 +214,8 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
 
 @wp.kernel(enable_backward=False)
 def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, threads: int, dt: float):
-    """Fill every agent's own row."""
-    b, first = wp.tid()
+    """Fill the row of every agent."""
+    b, first_agent = wp.tid()
     if state.end[b] == End.RUNNING:
-        for i in range(first, agents, threads):
+        for i in range(first_agent, agents, threads):
             look_at(bank, roads, state, seen, b, i, dt)

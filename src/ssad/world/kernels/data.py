@@ -25,7 +25,7 @@ BLOCK = 128
 
 
 class When(IntEnum):
-    """What starts a phase: the kinds of `ssad.core.types.Condition`."""
+    """Start condition of a phase: the kinds of `ssad.core.types.Condition`."""
 
     ALWAYS = 0
     EGO_DISTANCE = 1
@@ -36,7 +36,7 @@ class When(IntEnum):
 
 
 class Presence(IntEnum):
-    """Whether an agent is there; asleep: until the ego comes near."""
+    """Presence of an agent; it sleeps until the ego comes near."""
 
     ABSENT = 0
     ASLEEP = 1
@@ -44,7 +44,7 @@ class Presence(IntEnum):
 
 
 class ContactPolicy(IntEnum):
-    """What a contact of the ego does: the words of `ssad.core.types.Limits.contact`."""
+    """Effect of a contact of the ego: the words of `ssad.core.types.Limits.contact`."""
 
     END = 0
     COUNT = 1
@@ -52,7 +52,7 @@ class ContactPolicy(IntEnum):
 
 
 class TurnRank(IntEnum):
-    """Where a route turns at a junction, in the order of who goes first."""
+    """Turn of a route at a junction, in the order of priority."""
 
     STRAIGHT = 0
     RIGHT = 1
@@ -62,7 +62,7 @@ class TurnRank(IntEnum):
 
 @wp.struct
 class EpisodeArrays:
-    """What does not change while an episode runs; scenes refer to it by episode number."""
+    """Arrays that do not change while an episode runs; scenes refer to them by episode number."""
 
     model: wp.array2d(dtype=wp.int32)  # [E, A] row of `body`, -1 empty slot
     controller: wp.array2d(dtype=wp.int32)  # [E, A] Controller at the start
@@ -109,7 +109,7 @@ class Roads:
 
 @wp.struct
 class State:
-    """What changes: one row a scene. `pose` is x, y, yaw; `previous` is the pose one step before."""
+    """Changing state, one row per scene. `pose` is x, y, yaw; `previous` is the pose one step before."""
 
     episode: wp.array(dtype=wp.int32)  # [B]
     step: wp.array(dtype=wp.int32)  # [B]
@@ -144,10 +144,10 @@ class State:
 
 @wp.struct
 class Seen:
-    """What can be known of agents, the same for all who look; all that an Autopilot knows of others stands here.
+    """Observable state of agents, the same for every observer: all that an Autopilot knows of others.
 
-    The rows from 0 to A - 1 hold the truth about each agent, those from A on what the scene's ego believes to be around
-    it.
+    The rows from 0 to A - 1 hold the truth about each agent; those from A on hold what the scene's ego believes to be
+    around it.
     """
 
     kind: wp.array2d(dtype=wp.int32)  # [B, rows] AgentKind, NONE: nobody
@@ -173,7 +173,7 @@ class Seen:
 
 @wp.struct
 class Ego:
-    """The record of each scene's ego in this step; all [B]."""
+    """Record of each scene's ego in this step; all [B]."""
 
     contact: wp.array(dtype=wp.int32)  # Contact bits of contacts that began
     contact_agent: wp.array(dtype=wp.int32)
@@ -202,5 +202,5 @@ class Work:
 
 
 def array_types(struct: Any) -> dict[str, Any]:
-    """Name -> array type (`dtype`, `ndim`) of the members of one of these structs, in their order."""
+    """Return the array type (`dtype`, `ndim`) of each member of a struct by name, in their order."""
     return dict(struct.cls.__annotations__)

@@ -1,4 +1,4 @@
-"""What learned drivers look at, for any agent: SafeBench's four numbers, FREA's 4 x 6 rows, and a view from above."""
+"""Observations of learned drivers: SafeBench's four numbers, FREA's 4 x 6 rows, and a view from above."""
 
 import warp as wp
 
@@ -24,7 +24,7 @@ def put(
     r: float,
     v: float,
 ):
-    """One row of six numbers."""
+    """Write one row of six numbers."""
     out[n, at + 0] = x
     out[n, at + 1] = y
     out[n, at + 2] = l
@@ -45,17 +45,17 @@ def put_agent(
     at: int,
     pose: wp.vec3,
 ):
-    """Row of agent j in the frame of who looks: x, y, length, width, relative yaw, speed; zeros for j < 0."""
+    """Write the row of agent j in the observer's frame: x, y, length, width, relative yaw, speed; zeros for j < 0."""
     if j < 0:
         put(out, n, at, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         return
-    q = state.pose[b, j]
+    other = state.pose[b, j]
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
-    dx = q[0] - pose[0]
-    dy = q[1] - pose[1]
+    dx = other[0] - pose[0]
+    dy = other[1] - pose[1]
     body = bank.body[bank.model[e, j]]
-    turn = wrap(q[2] - pose[2])
+    turn = wrap(other[2] - pose[2])
     put(out, n, at, c * dx + s * dy, -s * dx + c * dy, 2.0 * body[0], 2.0 * body[1], turn, state.speed[b, j])
 
 
@@ -87,27 +87,28 @@ def look(
     hazard = float(0.0)
     first = int(-1)
     second = int(-1)
-    d_first = float(625.0)
-    d_second = float(625.0)
+    first_distance2 = float(625.0)
+    second_distance2 = float(625.0)
     lane = state.lane[b, i]
     for j in range(agents):
         if j != i and state.active[b, j] != Presence.ABSENT:
-            q = state.pose[b, j]
-            dx = q[0] - pose[0]
-            dy = q[1] - pose[1]
-            d2 = dx * dx + dy * dy
+            other = state.pose[b, j]
+            dx = other[0] - pose[0]
+            dy = other[1] - pose[1]
+            distance2 = dx * dx + dy * dy
             kind = bank.kind[bank.model[e, j]]
-            if d2 < 625.0 and kind < AgentKind.WALKER:
-                if d2 < 225.0 and lane >= 0 and state.lane[b, j] == lane and dx * c + dy * s > 0.0:
+            # 25 m squared; the kinds below WALKER are the vehicles.
+            if distance2 < 625.0 and kind < AgentKind.WALKER:
+                if distance2 < 225.0 and lane >= 0 and state.lane[b, j] == lane and dx * c + dy * s > 0.0:
                     hazard = 1.0
-                if d2 < d_first:
+                if distance2 < first_distance2:
                     second = first
-                    d_second = d_first
+                    second_distance2 = first_distance2
                     first = j
-                    d_first = d2
-                elif d2 < d_second:
+                    first_distance2 = distance2
+                elif distance2 < second_distance2:
                     second = j
-                    d_second = d2
+                    second_distance2 = distance2
     out[n, 2] = state.speed[b, i]
     out[n, 3] = hazard
     put(out, n, 4, 0.0, 0.0, 2.0 * body[0], 2.0 * body[1], 0.0, state.speed[b, i])
@@ -121,32 +122,49 @@ def look(
         return
     at = state.progress[b, i]
     last = route[1] - 1
-    p = roads.path[route[0] + wp.min(at + 4, last)]
-    left = -wp.sin(p[2]) * (pose[0] - p[0]) + wp.cos(p[2]) * (pose[1] - p[1])
-    out[n, 0] = left
-    out[n, 1] = wrap(pose[2] - p[2])
-    a = roads.path[route[0] + wp.min(at + 2, last)]
+    point = roads.path[route[0] + wp.min(at + 4, last)]
+    lateral = -wp.sin(point[2]) * (pose[0] - point[0]) + wp.cos(point[2]) * (pose[1] - point[1])
+    out[n, 0] = lateral
+    out[n, 1] = wrap(pose[2] - point[2])
+    chord_start = roads.path[route[0] + wp.min(at + 2, last)]
     reach = int(11)
-    found = int(0)
-    z = roads.path[route[0] + wp.min(at + 2 + reach, last)]
-    while reach > 1 and found == 0:
-        z = roads.path[route[0] + wp.min(at + 2 + reach, last)]
-        zx = z[0] - a[0]
-        zy = z[1] - a[1]
-        norm = wp.max(wp.sqrt(zx * zx + zy * zy), 1.0e-6)
+    chord_found = int(0)
+    chord_end = roads.path[route[0] + wp.min(at + 2 + reach, last)]
+    while reach > 1 and chord_found == 0:
+        chord_end = roads.path[route[0] + wp.min(at + 2 + reach, last)]
+        chord_x = chord_end[0] - chord_start[0]
+        chord_y = chord_end[1] - chord_start[1]
+        chord_norm = wp.max(wp.sqrt(chord_x * chord_x + chord_y * chord_y), 1.0e-6)
         worst = float(0.0)
-        for k in range(1, reach):
-            m = roads.path[route[0] + wp.min(at + 2 + k, last)]
-            worst = wp.max(worst, wp.abs(zx * (m[1] - a[1]) - zy * (m[0] - a[0])) / norm)
+        for step in range(1, reach):
+            middle_point = roads.path[route[0] + wp.min(at + 2 + step, last)]
+            worst = wp.max(
+                worst,
+                wp.abs(chord_x * (middle_point[1] - chord_start[1]) - chord_y * (middle_point[0] - chord_start[0]))
+                / chord_norm,
+            )
         if worst <= 0.5:
-            found = 1
+            chord_found = 1
         else:
             reach = reach - 1
-    mx = 0.5 * (a[0] + z[0]) - pose[0]
-    my = 0.5 * (a[1] + z[1]) - pose[1]
-    span = wp.sqrt((z[0] - a[0]) * (z[0] - a[0]) + (z[1] - a[1]) * (z[1] - a[1]))
-    turn = wrap(wp.atan2(z[1] - a[1], z[0] - a[0]) - pose[2])
-    put(out, n, 22, c * mx + s * my, -s * mx + c * my, span, 2.0 * body[1], turn, wp.sqrt(mx * mx + my * my))
+    middle_x = 0.5 * (chord_start[0] + chord_end[0]) - pose[0]
+    middle_y = 0.5 * (chord_start[1] + chord_end[1]) - pose[1]
+    span = wp.sqrt(
+        (chord_end[0] - chord_start[0]) * (chord_end[0] - chord_start[0])
+        + (chord_end[1] - chord_start[1]) * (chord_end[1] - chord_start[1])
+    )
+    turn = wrap(wp.atan2(chord_end[1] - chord_start[1], chord_end[0] - chord_start[0]) - pose[2])
+    put(
+        out,
+        n,
+        22,
+        c * middle_x + s * middle_y,
+        -s * middle_x + c * middle_y,
+        span,
+        2.0 * body[1],
+        turn,
+        wp.sqrt(middle_x * middle_x + middle_y * middle_y),
+    )
 
 
 @wp.kernel(enable_backward=False)
@@ -168,28 +186,29 @@ def look_as_adversary(
     e = state.episode[b]
     pose = state.pose[b, i]
     nearest = int(-1)
-    least = float(625.0)
+    # 25 m squared.
+    min_distance2 = float(625.0)
     for j in range(1, agents):
         if j != i and state.active[b, j] != Presence.ABSENT and bank.kind[bank.model[e, j]] < AgentKind.WALKER:
-            q = state.pose[b, j]
-            d2 = (q[0] - pose[0]) * (q[0] - pose[0]) + (q[1] - pose[1]) * (q[1] - pose[1])
-            if d2 < least:
-                least = d2
+            other = state.pose[b, j]
+            distance2 = (other[0] - pose[0]) * (other[0] - pose[0]) + (other[1] - pose[1]) * (other[1] - pose[1])
+            if distance2 < min_distance2:
+                min_distance2 = distance2
                 nearest = j
     put_agent(bank, state, out, b, e, i, n, 0, pose)
     put_agent(bank, state, out, b, e, 0, n, 6, pose)
     put_agent(bank, state, out, b, e, nearest, n, 12, pose)
     route = bank.route[e, 0]
     ego = state.pose[b, 0]
-    p = roads.path[route[0] + state.progress[b, 0]]
-    part = (ego[0] - p[0]) * wp.cos(p[2]) + (ego[1] - p[1]) * wp.sin(p[2])
-    goal = route_at(roads, route[0], route[1], float(state.progress[b, 0]) + part + GOAL_AHEAD)
+    point = roads.path[route[0] + state.progress[b, 0]]
+    offset = (ego[0] - point[0]) * wp.cos(point[2]) + (ego[1] - point[1]) * wp.sin(point[2])
+    goal = route_at(roads, route[0], route[1], float(state.progress[b, 0]) + offset + GOAL_AHEAD)
     dx = goal[0] - pose[0]
     dy = goal[1] - pose[1]
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
-    far = wp.sqrt(dx * dx + dy * dy)
-    put(out, n, 18, c * dx + s * dy, -s * dx + c * dy, GOAL_RADIUS, GOAL_RADIUS, wrap(goal[2] - pose[2]), far)
+    goal_distance = wp.sqrt(dx * dx + dy * dy)
+    put(out, n, 18, c * dx + s * dy, -s * dx + c * dy, GOAL_RADIUS, GOAL_RADIUS, wrap(goal[2] - pose[2]), goal_distance)
 
 
 @wp.kernel(enable_backward=False)
@@ -228,25 +247,28 @@ def look_from_above(
     if route[1] > 1:
         at = state.progress[b, i]
         reach = int(float(side) / metre) + 1
-        for k in range(at, wp.min(at + reach, route[1])):
-            p = roads.path[route[0] + k]
-            if (p[0] - x) * (p[0] - x) + (p[1] - y) * (p[1] - y) < 1.0:
+        for index in range(at, wp.min(at + reach, route[1])):
+            point = roads.path[route[0] + index]
+            if (point[0] - x) * (point[0] - x) + (point[1] - y) * (point[1] - y) < 1.0:
                 path = 1.0
     out[n, 1, row, column] = path
-    there = float(0.0)
+    occupied = float(0.0)
     speed = float(0.0)
     for j in range(agents):
         if state.active[b, j] != Presence.ABSENT:
-            q = state.pose[b, j]
+            other = state.pose[b, j]
             body = bank.body[bank.model[e, j]]
-            dx = x - q[0]
-            dy = y - q[1]
-            cj = wp.cos(q[2])
-            sj = wp.sin(q[2])
-            if wp.abs(dx * cj + dy * sj) <= body[0] and wp.abs(dy * cj - dx * sj) <= body[1]:
+            dx = x - other[0]
+            dy = y - other[1]
+            other_cos = wp.cos(other[2])
+            other_sin = wp.sin(other[2])
+            if (
+                wp.abs(dx * other_cos + dy * other_sin) <= body[0]
+                and wp.abs(dy * other_cos - dx * other_sin) <= body[1]
+            ):
                 speed = state.speed[b, j] / 20.0
-                there = 1.0
+                occupied = 1.0
                 if j == i:
-                    there = 0.5
-    out[n, 2, row, column] = there
+                    occupied = 0.5
+    out[n, 2, row, column] = occupied
     out[n, 3, row, column] = speed

@@ -32,45 +32,45 @@ def bicycle(
     Throttle gives up to power[0], brake up to power[1] against the motion; the wheel turns at its limited rate to
     steer * body[3]; yaw rate is cut at lateral acceleration GRIP_LIMIT.
     """
-    h = dt / float(n)
+    substep = dt / float(n)
     x = pose[0]
     y = pose[1]
     yaw = pose[2]
-    v = speed
-    w = wheel
+    new_speed = speed
+    wheel_angle = wheel
     throttle = wp.clamp(control[0], 0.0, 1.0)
     brake = wp.clamp(control[1], 0.0, 1.0)
-    aim = wp.clamp(control[2], -1.0, 1.0) * body[3]
-    turn = body[3] * h / STEER_SECONDS
+    wheel_target = wp.clamp(control[2], -1.0, 1.0) * body[3]
+    turn = body[3] * substep / STEER_SECONDS
     for _ in range(n):
-        w = w + wp.clamp(aim - w, -turn, turn)
-        push = throttle * power[0]
+        wheel_angle = wheel_angle + wp.clamp(wheel_target - wheel_angle, -turn, turn)
+        acceleration = throttle * power[0]
         if control[3] > 0.5:
-            push = -push
-        before = v
-        v = v + push * h
-        drag = brake * power[1] * h
-        if v > 0.0:
-            v = wp.max(v - drag, 0.0)
+            acceleration = -acceleration
+        before = new_speed
+        new_speed = new_speed + acceleration * substep
+        brake_step = brake * power[1] * substep
+        if new_speed > 0.0:
+            new_speed = wp.max(new_speed - brake_step, 0.0)
         else:
-            v = wp.min(v + drag, 0.0)
-        v = wp.clamp(v, -REVERSE_LIMIT, power[2])
-        mean = 0.5 * (before + v)
-        slip = wp.atan(0.5 * wp.tan(w))
-        rate = mean * wp.sin(slip) * 2.0 / body[2]
-        cut = GRIP_LIMIT / wp.max(wp.abs(mean), 1.0e-3)
-        rate = wp.clamp(rate, -cut, cut)
-        heading = yaw + slip + 0.5 * rate * h
-        x = x + mean * wp.cos(heading) * h
-        y = y + mean * wp.sin(heading) * h
-        yaw = yaw + rate * h
-    out = vec5()
-    out[0] = x
-    out[1] = y
-    out[2] = wrap(yaw)
-    out[3] = v
-    out[4] = w
-    return out
+            new_speed = wp.min(new_speed + brake_step, 0.0)
+        new_speed = wp.clamp(new_speed, -REVERSE_LIMIT, power[2])
+        mean_speed = 0.5 * (before + new_speed)
+        slip = wp.atan(0.5 * wp.tan(wheel_angle))
+        yaw_rate = mean_speed * wp.sin(slip) * 2.0 / body[2]
+        rate_limit = GRIP_LIMIT / wp.max(wp.abs(mean_speed), 1.0e-3)
+        yaw_rate = wp.clamp(yaw_rate, -rate_limit, rate_limit)
+        heading = yaw + slip + 0.5 * yaw_rate * substep
+        x = x + mean_speed * wp.cos(heading) * substep
+        y = y + mean_speed * wp.sin(heading) * substep
+        yaw = yaw + yaw_rate * substep
+    result = vec5()
+    result[0] = x
+    result[1] = y
+    result[2] = wrap(yaw)
+    result[3] = new_speed
+    result[4] = wheel_angle
+    return result
 
 
 @wp.func
@@ -87,58 +87,58 @@ def move_one(
 ):
     """Advance an agent by dt; see `move`."""
     e = state.episode[b]
-    who = state.controller[b, i]
-    put = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    if who == Controller.TRAJECTORY:
+    controller = state.controller[b, i]
+    target_place = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if controller == Controller.TRAJECTORY:
         time = float(state.step[b] + 1) * dt
         track = bank.track[e, i]
         if on_track(roads, track, time):
-            put = track_at(roads, track, time)
+            target_place = track_at(roads, track, time)
             if state.active[b, i] == Presence.ABSENT:
-                state.pose[b, i] = wp.vec3(put[0], put[1], put[2])
+                state.pose[b, i] = wp.vec3(target_place[0], target_place[1], target_place[2])
             state.active[b, i] = Presence.AWAKE
         else:
             state.active[b, i] = Presence.ABSENT
     if state.active[b, i] == Presence.ABSENT:
         return
-    m = bank.model[e, i]
+    model = bank.model[e, i]
     pose = state.pose[b, i]
     state.previous[b, i] = pose
     control = state.control[b, i]
-    if who == Controller.EXTERNAL:
+    if controller == Controller.EXTERNAL:
         control = action[b, i]
         state.control[b, i] = control
     speed = state.speed[b, i]
-    kind = bank.kind[m]
-    power = bank.power[m]
-    if who == Controller.PLACED or who == Controller.TRAJECTORY:
-        if who == Controller.PLACED:
-            put = place[b, i]
-        d = wp.length(wp.vec2(put[0] - pose[0], put[1] - pose[1]))
-        state.travelled[b, i] = state.travelled[b, i] + d
-        pose = wp.vec3(put[0], put[1], wrap(put[2]))
-        speed = put[3]
+    kind = bank.kind[model]
+    power = bank.power[model]
+    if controller == Controller.PLACED or controller == Controller.TRAJECTORY:
+        if controller == Controller.PLACED:
+            target_place = place[b, i]
+        distance = wp.length(wp.vec2(target_place[0] - pose[0], target_place[1] - pose[1]))
+        state.travelled[b, i] = state.travelled[b, i] + distance
+        pose = wp.vec3(target_place[0], target_place[1], wrap(target_place[2]))
+        speed = target_place[3]
     elif kind == AgentKind.WALKER:
-        # throttle is the wanted speed over the model's top speed; a walker turns and stops at once
-        aim = wp.clamp(control[0], 0.0, 1.0) * power[2]
+        # The throttle is the desired speed over the model's top speed; a walker turns and stops at once.
+        desired_speed = wp.clamp(control[0], 0.0, 1.0) * power[2]
         change = power[0] * dt
-        after = speed + wp.clamp(aim - speed, -change, change)
-        go = 0.5 * (speed + after) * dt
-        if who == Controller.EXTERNAL:
+        new_speed = speed + wp.clamp(desired_speed - speed, -change, change)
+        step_length = 0.5 * (speed + new_speed) * dt
+        if controller == Controller.EXTERNAL:
             turned = pose[2] + wp.clamp(control[2], -1.0, 1.0) * WALKER_TURN * dt
             pose = wp.vec3(pose[0], pose[1], wrap(turned))
-        pose = wp.vec3(pose[0] + go * wp.cos(pose[2]), pose[1] + go * wp.sin(pose[2]), pose[2])
-        state.travelled[b, i] = state.travelled[b, i] + wp.abs(go)
-        speed = after
+        pose = wp.vec3(pose[0] + step_length * wp.cos(pose[2]), pose[1] + step_length * wp.sin(pose[2]), pose[2])
+        state.travelled[b, i] = state.travelled[b, i] + wp.abs(step_length)
+        speed = new_speed
     elif power[2] > 0.0:
         if speed != 0.0 or control[0] > 0.0:
-            out = bicycle(pose, speed, state.wheel[b, i], control, bank.body[m], power, dt, substeps)
-            moved = wp.vec3(out[0], out[1], out[2])
-            d = wp.length(wp.vec2(moved[0] - pose[0], moved[1] - pose[1]))
-            state.travelled[b, i] = state.travelled[b, i] + d
+            result = bicycle(pose, speed, state.wheel[b, i], control, bank.body[model], power, dt, substeps)
+            moved = wp.vec3(result[0], result[1], result[2])
+            distance = wp.length(wp.vec2(moved[0] - pose[0], moved[1] - pose[1]))
+            state.travelled[b, i] = state.travelled[b, i] + distance
             pose = moved
-            speed = out[3]
-            state.wheel[b, i] = out[4]
+            speed = result[3]
+            state.wheel[b, i] = result[4]
     state.pose[b, i] = pose
     state.accel[b, i] = (speed - state.speed[b, i]) / dt
     state.speed[b, i] = speed
@@ -147,31 +147,32 @@ def move_one(
     route = bank.route[e, i]
     at = state.progress[b, i]
     if route[1] > 1:
-        best = float(1.0e12)
-        found = at
+        best_distance2 = float(1.0e12)
+        nearest = at
         last = wp.min(at + 12, route[1] - 1)
-        k = at
-        while k <= last:
-            p = row(roads.path, route[0] + k)
-            dx = pose[0] - p[0]
-            dy = pose[1] - p[1]
-            d2 = dx * dx + dy * dy
-            if d2 < best:
-                best = d2
-                found = k
-            elif k > found + 3:
-                k = last
-            k = k + 1
-        at = found
+        candidate = at
+        while candidate <= last:
+            point = row(roads.path, route[0] + candidate)
+            dx = pose[0] - point[0]
+            dy = pose[1] - point[1]
+            distance2 = dx * dx + dy * dy
+            if distance2 < best_distance2:
+                best_distance2 = distance2
+                nearest = candidate
+            # The distance grows again, so the nearest point lies behind.
+            elif candidate > nearest + 3:
+                candidate = last
+            candidate = candidate + 1
+        at = nearest
         state.progress[b, i] = at
-        if wp.abs(speed) < STOPPED and roads.ahead[route[0] + at][0] < BEFORE_LINE + bank.body[m][0]:
+        if wp.abs(speed) < STOPPED and roads.ahead[route[0] + at][0] < BEFORE_LINE + bank.body[model][0]:
             state.halted[b, i] = sign_line(roads, route[0], at)
-        if i > 0 and who == Controller.AUTOPILOT and at >= route[1] - 3:
+        if i > 0 and controller == Controller.AUTOPILOT and at >= route[1] - 3:
             state.active[b, i] = Presence.ABSENT  # background traffic leaves at the end of its route
 
-    under = lane_under(roads, bank.town[e], pose[0], pose[1])
-    state.lane[b, i] = int(under[0])
-    state.lateral[b, i] = wp.vec2(under[1], under[2])
+    lane_info = lane_under(roads, bank.town[e], pose[0], pose[1])
+    state.lane[b, i] = int(lane_info[0])
+    state.lateral[b, i] = wp.vec2(lane_info[1], lane_info[2])
 
 
 @wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS_OF_MOTION)
@@ -186,9 +187,9 @@ def move(
     dt: float,
     substeps: int,
 ):
-    """Advance every agent by dt with its control (external ones with the action) and look where it is now.
+    """Advance every agent by dt with its control (external ones with the action) and find the lane under it.
 
-    Agents that are placed are put at `place`: x, y, yaw, speed; those with a trajectory where it has them.
+    Agents that are placed are put at `place`: x, y, yaw, speed; those with a trajectory follow it.
     """
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:

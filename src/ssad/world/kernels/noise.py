@@ -1,8 +1,8 @@
-"""Chance in traffic: how unevenly background traffic drives, its careless lane changes, and the lapses of a driver.
+"""Randomness in traffic: uneven acceleration, careless lane changes, and the lapses of a driver.
 
-All of it comes from standard normal numbers that depend on the scene's key, the step and the agent alone, so a scene
-restored with its key goes on to the bit, and with another key differently. Two processes an agent (Ornstein-Uhlenbeck,
-exact in discrete time) turn them into behaviour.
+All of it comes from standard normal numbers that depend only on the scene's key, the step and the agent. A scene
+restored with its key therefore continues bit-exactly, and differently with another key. Two processes per agent
+(Ornstein-Uhlenbeck, exact in discrete time) turn the numbers into behaviour.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ from ssad.world.kernels.overtake import RAMP_LEAST
 
 @wp.struct
 class NoiseRule:
-    """What the processes mean; see `ssad.world.noise.Noise`."""
+    """Parameters of the processes; see `ssad.world.noise.Noise`."""
 
     accel: wp.float32  # m/s^2, standard deviation
     keep: wp.vec2  # what is left of each process after a step
@@ -28,7 +28,7 @@ class NoiseRule:
 
 @wp.struct
 class NoiseState:
-    """What changes with them: one row a scene."""
+    """Changing state of the processes, one row per scene."""
 
     key: wp.array(dtype=wp.uint64)  # [B]
     drift: wp.array2d(dtype=wp.vec2)  # [B, A] the two processes
@@ -39,45 +39,48 @@ class NoiseState:
 
 @wp.func
 def scrambled(word: wp.uint64) -> wp.uint64:
-    """A whole number of 64 bits in which each bit hangs on all of `word` (the finaliser of SplitMix64)."""
-    z = word
-    z = (z ^ (z >> wp.uint64(30))) * wp.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> wp.uint64(27))) * wp.uint64(0x94D049BB133111EB)
-    return z ^ (z >> wp.uint64(31))
+    """Return 64 bits, each of which depends on all bits of `word` (the finaliser of SplitMix64)."""
+    mixed = word
+    mixed = (mixed ^ (mixed >> wp.uint64(30))) * wp.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> wp.uint64(27))) * wp.uint64(0x94D049BB133111EB)
+    return mixed ^ (mixed >> wp.uint64(31))
 
 
 @wp.func
 def normals(key: wp.uint64, step: int, agent: int) -> wp.vec2:
-    """Two independent standard normal numbers (Box and Muller)."""
-    place = wp.uint64(step * 64 + agent + 1) * wp.uint64(0x9E3779B97F4A7C15)
-    word = scrambled(scrambled(key + place) ^ place)
+    """Return two independent standard normal numbers (Box and Muller)."""
+    counter = wp.uint64(step * 64 + agent + 1) * wp.uint64(0x9E3779B97F4A7C15)
+    word = scrambled(scrambled(key + counter) ^ counter)
     scale = wp.float32(2.3283064365386963e-10)  # 2^-32
-    u = (wp.float32(wp.uint32(word >> wp.uint64(32))) + 0.5) * scale
-    w = (wp.float32(wp.uint32(word & wp.uint64(0xFFFFFFFF))) + 0.5) * scale
-    r = wp.sqrt(-2.0 * wp.log(wp.min(u, 1.0)))
-    return wp.vec2(r * wp.cos(6.283185307179586 * w), r * wp.sin(6.283185307179586 * w))
+    # The half keeps the argument of the logarithm above 0.
+    first_uniform = (wp.float32(wp.uint32(word >> wp.uint64(32))) + 0.5) * scale
+    second_uniform = (wp.float32(wp.uint32(word & wp.uint64(0xFFFFFFFF))) + 0.5) * scale
+    radius = wp.sqrt(-2.0 * wp.log(wp.min(first_uniform, 1.0)))
+    return wp.vec2(
+        radius * wp.cos(6.283185307179586 * second_uniform), radius * wp.sin(6.283185307179586 * second_uniform)
+    )
 
 
 @wp.func
 def act_on_chance(bank: EpisodeArrays, roads: Roads, state: State, rule: NoiseRule, noise: NoiseState, b: int, i: int):
-    """Turn the processes of an agent into what it does."""
-    who = state.controller[b, i]
+    """Turn the processes of an agent into behaviour."""
+    controller = state.controller[b, i]
     control = state.control[b, i]
     drift = noise.drift[b, i]
     if i == 0:
-        if who == Controller.AUTOPILOT or who == Controller.FOLLOW:
+        if controller == Controller.AUTOPILOT or controller == Controller.FOLLOW:
             if drift[1] > rule.lapse:
-                held = noise.held[b, i]
-                state.control[b, i] = wp.vec4(held[0], held[1], control[2], control[3])
+                held_pedals = noise.held[b, i]
+                state.control[b, i] = wp.vec4(held_pedals[0], held_pedals[1], control[2], control[3])
             else:
                 noise.held[b, i] = wp.vec2(control[0], control[1])
         return
-    if who != Controller.AUTOPILOT or state.active[b, i] != Presence.AWAKE or control[3] > 0.5:
+    if controller != Controller.AUTOPILOT or state.active[b, i] != Presence.AWAKE or control[3] > 0.5:
         return
     e = state.episode[b]
-    v = state.speed[b, i]
-    if v < 0.5 and control[1] > 0.0:
-        return  # who stands has no reason to creep
+    speed = state.speed[b, i]
+    if speed < 0.5 and control[1] > 0.0:
+        return  # A standing agent has no reason to creep.
     power = bank.power[bank.model[e, i]]
     accel = control[0] * power[0] - control[1] * power[1] + rule.accel * drift[0]
     throttle = wp.clamp(accel / wp.max(power[0], 0.1), 0.0, 1.0)
@@ -85,25 +88,25 @@ def act_on_chance(bank: EpisodeArrays, roads: Roads, state: State, rule: NoiseRu
     state.control[b, i] = wp.vec4(throttle, brake, control[2], control[3])
     route = bank.route[e, i]
     shift = state.shift[b, i]
-    u0 = state.aim[b, i][0]
-    if wp.abs(drift[1]) > rule.careless and route[1] > 1 and u0 >= shift[1] and shift[3] == 0.0:
-        at = state.progress[b, i]
-        room = roads.beside[route[0] + at]
-        ramp = wp.max(2.0 * RAMP_LEAST * bank.body[bank.model[e, i]][0], rule.ramp * v)
+    along = state.aim[b, i][0]
+    if wp.abs(drift[1]) > rule.careless and route[1] > 1 and along >= shift[1] and shift[3] == 0.0:
+        point = state.progress[b, i]
+        adjacent_lanes = roads.beside[route[0] + point]
+        change_length = wp.max(2.0 * RAMP_LEAST * bank.body[bank.model[e, i]][0], rule.ramp * speed)
         side = 1.0
-        leads_on = room[1]
+        leads_on = adjacent_lanes[1]
         if drift[1] < 0.0:
             side = -1.0
-            leads_on = room[3]
-        if leads_on - (u0 - float(at)) > ramp + 10.0:
-            state.shift[b, i] = wp.vec4(u0, u0 + ramp, lanes_left(shift, u0), side)
+            leads_on = adjacent_lanes[3]
+        if leads_on - (along - float(point)) > change_length + 10.0:
+            state.shift[b, i] = wp.vec4(along, along + change_length, lanes_left(shift, along), side)
 
 
 @wp.kernel(enable_backward=False)
 def chance(
     bank: EpisodeArrays, roads: Roads, state: State, rule: NoiseRule, noise: NoiseState, agents: int, threads: int
 ):
-    """Advance the processes of every agent and act on them; the last thing before a step's motion."""
+    """Advance the processes of every agent and apply them; runs last before a step's motion."""
     b, first = wp.tid()
     if state.end[b] != End.RUNNING:
         return
@@ -112,22 +115,22 @@ def chance(
     if step > 0:
         stretch = wp.min(1 + (step - 1) / rule.stretch, rule.stretches - 1)
     for i in range(first, agents, threads):
-        z = normals(noise.key[b], step, i) + noise.push[b, i, stretch]
-        drift = z
+        normal = normals(noise.key[b], step, i) + noise.push[b, i, stretch]
+        drift = normal
         if step > 0:
-            old = noise.drift[b, i]
+            previous = noise.drift[b, i]
             drift = wp.vec2(
-                rule.keep[0] * old[0] + wp.sqrt(1.0 - rule.keep[0] * rule.keep[0]) * z[0],
-                rule.keep[1] * old[1] + wp.sqrt(1.0 - rule.keep[1] * rule.keep[1]) * z[1],
+                rule.keep[0] * previous[0] + wp.sqrt(1.0 - rule.keep[0] * rule.keep[0]) * normal[0],
+                rule.keep[1] * previous[1] + wp.sqrt(1.0 - rule.keep[1] * rule.keep[1]) * normal[1],
             )
-        noise.total[b, i, stretch] = noise.total[b, i, stretch] + z
+        noise.total[b, i, stretch] = noise.total[b, i, stretch] + normal
         noise.drift[b, i] = drift
         act_on_chance(bank, roads, state, rule, noise, b, i)
 
 
 @wp.kernel(enable_backward=False)
 def calm(state: State, noise: NoiseState, mask: wp.array(dtype=wp.int32), ended_too: int, agents: int, stretches: int):
-    """Put the processes of scenes back to where they begin; who starts again by itself gets a new key. As `restart`."""
+    """Reset the processes of scenes; scenes that restart by themselves get a new key. Like `restart`."""
     b = wp.tid()
     again = ended_too == 1 and state.end[b] != End.RUNNING
     if again:
@@ -136,5 +139,5 @@ def calm(state: State, noise: NoiseState, mask: wp.array(dtype=wp.int32), ended_
         for i in range(agents):
             noise.drift[b, i] = wp.vec2(0.0, 0.0)
             noise.held[b, i] = wp.vec2(0.0, 0.0)
-            for k in range(stretches):
-                noise.total[b, i, k] = wp.vec2(0.0, 0.0)
+            for stretch in range(stretches):
+                noise.total[b, i, stretch] = wp.vec2(0.0, 0.0)

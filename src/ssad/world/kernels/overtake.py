@@ -1,9 +1,9 @@
-"""When the Autopilot changes lane: to pass whoever stands or creeps in its lane, and to come back.
+"""Lane changes of the Autopilot: to pass an agent that stands or creeps in its lane, and to return.
 
-The lane beside is taken where it is free: nobody on it would have to brake hard (the safety criterion of MOBIL,
-Kesting et al. 2007), and it leads on for as long as the manoeuvre takes. An oncoming lane is used only to pass who
-stands, where the line may be crossed and everybody who comes is far enough away; if somebody comes after all, it is
-left again while there is room behind who stands. A queue is not passed.
+The lane beside is taken where it is free: no agent on it would have to brake hard (the safety criterion of MOBIL,
+Kesting et al. 2007), and it continues for as long as the manoeuvre takes. An oncoming lane is used only to pass a
+standing agent, where the marking may be crossed and all oncoming traffic is far enough away. If oncoming traffic
+appears after all, the agent returns while there is room behind the obstacle. A queue is not passed.
 """
 
 import warp as wp
@@ -47,22 +47,22 @@ def place_beside(roads: Roads, route: wp.vec2i, u0: float, guess: float, q: wp.v
 
     rest: what is left of the search, m; where it is large the place is not known.
     """
-    u = guess
-    rest = float(0.0)
-    left = float(0.0)
-    at = wp.vec4(0.0, 0.0, 1.0, 0.0)
+    along = guess
+    residual = float(0.0)
+    lateral = float(0.0)
+    frame = wp.vec4(0.0, 0.0, 1.0, 0.0)
     for _ in range(5):
-        at = route_frame(roads, route[0], route[1], u0 + u)
+        frame = route_frame(roads, route[0], route[1], u0 + along)
         # before its start a route goes straight back
-        back = wp.min(u0 + u, 0.0)
-        dx = q[0] - at[0] - back * at[2]
-        dy = q[1] - at[1] - back * at[3]
-        rest = dx * at[2] + dy * at[3]
-        left = dy * at[2] - dx * at[3]
-        if wp.abs(rest) < 0.05:
+        before_start = wp.min(u0 + along, 0.0)
+        dx = q[0] - frame[0] - before_start * frame[2]
+        dy = q[1] - frame[1] - before_start * frame[3]
+        residual = dx * frame[2] + dy * frame[3]
+        lateral = dy * frame[2] - dx * frame[3]
+        if wp.abs(residual) < 0.05:
             break
-        u = wp.clamp(u + rest, -VIEW, VIEW)
-    return wp.vec4(u, left, wp.cos(q[2]) * at[2] + wp.sin(q[2]) * at[3], wp.abs(rest))
+        along = wp.clamp(along + residual, -VIEW, VIEW)
+    return wp.vec4(along, lateral, wp.cos(q[2]) * frame[2] + wp.sin(q[2]) * frame[3], wp.abs(residual))
 
 
 @wp.func
@@ -80,66 +80,74 @@ def gaps(
     horizon: float,
     goal: float,
 ) -> vec5:
-    """Who is on a lane `share` lanes left of i's route: whether i can go there.
+    """Examine a lane `share` lanes left of i's route: whether i can go there.
 
-    horizon: s that i would be there, goal: metres it would have gone by then.
-    Returns: gap in front m (FAR: nobody), speed of who is there, what the hardest-hit behind would have to brake,
-    whether i would touch anybody (1.0), whether somebody comes too near by then (1.0).
+    horizon: s that i would be there, goal: metres it would have travelled by then.
+    Returns: gap in front m (FAR: none), speed of the agent there, braking of the hardest-hit agent behind,
+    whether i would touch an agent (1.0), whether an agent comes too near by then (1.0).
     """
     route = bank.route[e, i]
     u0 = state.aim[b, i][0]
     pose = state.pose[b, i]
-    own = bank.body[bank.model[e, i]]
-    at = route_frame(roads, route[0], route[1], u0)
-    front = FAR
-    speed = float(0.0)
-    behind = float(0.0)
-    beside = float(0.0)
-    comes = float(0.0)
-    lane = wp.vec4(0.0, 1.0, share, share)
+    own_body = bank.body[bank.model[e, i]]
+    frame = route_frame(roads, route[0], route[1], u0)
+    front_gap = FAR
+    front_speed = float(0.0)
+    braking_behind = float(0.0)
+    blocked = float(0.0)
+    oncoming = float(0.0)
+    lane_shift = wp.vec4(0.0, 1.0, share, share)
     for j in range(rows[0], rows[1]):
         if j != i and seen.kind[b, j] != AgentKind.NONE:
-            q = seen.pose[b, j]
-            dx = q[0] - pose[0]
-            dy = q[1] - pose[1]
+            other_pose = seen.pose[b, j]
+            dx = other_pose[0] - pose[0]
+            dy = other_pose[1] - pose[1]
             if dx * dx + dy * dy < VIEW * VIEW:
-                place = place_beside(roads, route, u0, dx * at[2] + dy * at[3], q)
-                other = seen.half[b, j]
-                c = place[2]
-                s = wp.sqrt(wp.max(1.0 - c * c, 0.0))
-                along = other[0] * wp.abs(c) + other[1] * s
-                across = other[0] * s + other[1] * wp.abs(c)
-                vj = seen.speed[b, j] * c
-                off = place[1] - metres_left(roads, route[0], route[1], lane, u0 + place[0])
-                # on its way to that lane, too
-                meant = off
-                if seen.change[b, j][0] != 0 and place[3] < 1.0:
-                    then = seen.forecast[b, j, 3]
-                    later = place_beside(roads, route, u0, place[0] + 2.0 * vj, then)
-                    meant = later[1] - metres_left(roads, route[0], route[1], lane, u0 + later[0])
-                near = wp.min(wp.abs(off), wp.abs(meant)) < own[1] + across + 0.3 or off * meant < 0.0
-                if place[3] < 1.0 and near:
-                    ahead = place[0] - along - own[0]
-                    after = -place[0] - along - own[0]
-                    if ahead > 0.0:
-                        if ahead < front:
-                            front = ahead
-                            speed = vj
-                        if vj < -0.5:
+                position = place_beside(roads, route, u0, dx * frame[2] + dy * frame[3], other_pose)
+                other_half = seen.half[b, j]
+                cosine = position[2]
+                sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
+                half_along = other_half[0] * wp.abs(cosine) + other_half[1] * sine
+                half_across = other_half[0] * sine + other_half[1] * wp.abs(cosine)
+                other_speed = seen.speed[b, j] * cosine
+                lateral_offset = position[1] - metres_left(roads, route[0], route[1], lane_shift, u0 + position[0])
+                # An agent that is moving onto that lane counts, too.
+                intended_offset = lateral_offset
+                if seen.change[b, j][0] != 0 and position[3] < 1.0:
+                    later_pose = seen.forecast[b, j, 3]
+                    later_position = place_beside(roads, route, u0, position[0] + 2.0 * other_speed, later_pose)
+                    intended_offset = later_position[1] - metres_left(
+                        roads, route[0], route[1], lane_shift, u0 + later_position[0]
+                    )
+                on_lane = (
+                    wp.min(wp.abs(lateral_offset), wp.abs(intended_offset)) < own_body[1] + half_across + 0.3
+                    or lateral_offset * intended_offset < 0.0
+                )
+                if position[3] < 1.0 and on_lane:
+                    gap_ahead = position[0] - half_along - own_body[0]
+                    gap_behind = -position[0] - half_along - own_body[0]
+                    if gap_ahead > 0.0:
+                        if gap_ahead < front_gap:
+                            front_gap = gap_ahead
+                            front_speed = other_speed
+                        if other_speed < -0.5:
                             # it may get faster, by 1 m/s each second
-                            reach = wp.max(-vj, wp.min(-vj + 0.5 * horizon, 14.0)) * (horizon + 1.0)
-                            if place[0] - along - reach < goal + own[0] + 5.0:
-                                comes = 1.0
-                        elif c < -0.3 and place[0] - along < goal + own[0] + 5.0 + 0.5 * horizon * horizon:
-                            comes = 1.0  # stands, and may start
-                    elif after > 0.0:
-                        if vj > 0.0:
-                            behind = wp.min(behind, idm_gap(vj, wp.max(v, 0.0), after))
-                        if after < 1.0:
-                            beside = 1.0
+                            reach = wp.max(-other_speed, wp.min(-other_speed + 0.5 * horizon, 14.0)) * (horizon + 1.0)
+                            if position[0] - half_along - reach < goal + own_body[0] + 5.0:
+                                oncoming = 1.0
+                        elif (
+                            cosine < -0.3
+                            and position[0] - half_along < goal + own_body[0] + 5.0 + 0.5 * horizon * horizon
+                        ):
+                            oncoming = 1.0  # stands, and may start
+                    elif gap_behind > 0.0:
+                        if other_speed > 0.0:
+                            braking_behind = wp.min(braking_behind, idm_gap(other_speed, wp.max(v, 0.0), gap_behind))
+                        if gap_behind < 1.0:
+                            blocked = 1.0
                     else:
-                        beside = 1.0
-    return vec5(front, speed, behind, beside, comes)
+                        blocked = 1.0
+    return vec5(front_gap, front_speed, braking_behind, blocked, oncoming)
 
 
 @wp.func
@@ -162,30 +170,34 @@ def end_of_block(
     route = bank.route[e, i]
     u0 = state.aim[b, i][0]
     pose = state.pose[b, i]
-    own = bank.body[bank.model[e, i]]
-    at = route_frame(roads, route[0], route[1], u0)
+    own_body = bank.body[bank.model[e, i]]
+    frame = route_frame(roads, route[0], route[1], u0)
     rounds = int(0)
     grows = bool(True)
     while grows and beyond >= 0.0:
         grows = bool(False)
-        reach = beyond + 2.0 * own[0] + APART
+        reach = beyond + 2.0 * own_body[0] + APART
         for j in range(rows[0], rows[1]):
             if j != i and seen.kind[b, j] != AgentKind.NONE and beyond >= 0.0:
-                q = seen.pose[b, j]
-                dx = q[0] - pose[0]
-                dy = q[1] - pose[1]
+                other_pose = seen.pose[b, j]
+                dx = other_pose[0] - pose[0]
+                dy = other_pose[1] - pose[1]
                 if dx * dx + dy * dy < 1.3 * reach * reach:
-                    place = place_beside(roads, route, u0, dx * at[2] + dy * at[3], q)
-                    other = seen.half[b, j]
-                    c = wp.abs(place[2])
-                    s = wp.sqrt(wp.max(1.0 - c * c, 0.0))
-                    along = other[0] * c + other[1] * s
-                    within = place[0] - along < reach and place[0] + along > beyond + 0.5
-                    if place[3] < 1.0 and wp.abs(place[1]) < own[1] + other[0] * s + other[1] * c and within:
+                    position = place_beside(roads, route, u0, dx * frame[2] + dy * frame[3], other_pose)
+                    other_half = seen.half[b, j]
+                    cosine = wp.abs(position[2])
+                    sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
+                    half_along = other_half[0] * cosine + other_half[1] * sine
+                    within = position[0] - half_along < reach and position[0] + half_along > beyond + 0.5
+                    if (
+                        position[3] < 1.0
+                        and wp.abs(position[1]) < own_body[1] + other_half[0] * sine + other_half[1] * cosine
+                        and within
+                    ):
                         if wp.abs(seen.speed[b, j]) < 0.5:
-                            beyond = place[0] + along
+                            beyond = position[0] + half_along
                             grows = bool(True)
-                        elif place[0] - along < beyond + 12.0:
+                        elif position[0] - half_along < beyond + 12.0:
                             beyond = -1.0  # a queue that begins to move
         rounds = rounds + 1
         if rounds > 4 or beyond > line - QUEUE:
@@ -195,11 +207,11 @@ def end_of_block(
 
 @wp.func
 def passing_time(v: float, top: float, distance: float) -> float:
-    """Seconds that a distance takes from speed v, getting faster up to `top`."""
-    faster = wp.max(top * top - v * v, 0.0) / (2.0 * SPEED_UP)
+    """Return the time (s) for a distance from speed v, accelerating up to `top`."""
+    ramp_distance = wp.max(top * top - v * v, 0.0) / (2.0 * SPEED_UP)
     time = (wp.sqrt(v * v + 2.0 * SPEED_UP * distance) - v) / SPEED_UP
-    if distance > faster:
-        time = wp.max(top - v, 0.0) / SPEED_UP + (distance - faster) / wp.max(top, 1.0)
+    if distance > ramp_distance:
+        time = wp.max(top - v, 0.0) / SPEED_UP + (distance - ramp_distance) / wp.max(top, 1.0)
     return time
 
 
@@ -216,17 +228,17 @@ def way_is_clear(
     shift: wp.vec4,
     length: float,
 ) -> bool:
-    """Whether i passes j without touching it, on a way of `length` metres from where it is, driven along it."""
+    """Return whether i passes j without contact, on a path of `length` metres from its place, driven along it."""
     route = bank.route[e, i]
     u0 = state.aim[b, i][0]
-    own = bank.body[bank.model[e, i]]
-    other = seen.half[b, j]
-    q = seen.pose[b, j]
+    own_body = bank.body[bank.model[e, i]]
+    other_half = seen.half[b, j]
+    other_pose = seen.pose[b, j]
     clear = bool(True)
-    for k in range(int(length) + 1):
-        at = way_frame(roads, route[0], route[1], shift, u0 + float(k))
-        body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
-        if boxes_touch(body, own[0] + 0.2, own[1] + 0.3, q, other[0], other[1]):
+    for step in range(int(length) + 1):
+        frame = way_frame(roads, route[0], route[1], shift, u0 + float(step))
+        body = wp.vec3(frame[0], frame[1], wp.atan2(frame[3], frame[2]))
+        if boxes_touch(body, own_body[0] + 0.2, own_body[1] + 0.3, other_pose, other_half[0], other_half[1]):
             clear = bool(False)
             break
     return clear
@@ -236,30 +248,32 @@ def way_is_clear(
 def break_off(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, rows: wp.vec2i
 ) -> bool:
-    """Go back behind who was to be passed on the oncoming lane, if somebody comes and there is room to stop there."""
+    """Abort passing on the oncoming lane if traffic comes and there is room to stop behind the obstacle."""
     route = bank.route[e, i]
     shift = state.shift[b, i]
-    own = bank.body[bank.model[e, i]]
+    own_body = bank.body[bank.model[e, i]]
     u0 = state.aim[b, i][0]
-    v = wp.max(state.speed[b, i], 0.0)
+    speed = wp.max(state.speed[b, i], 0.0)
     top = state.aim[b, i][1]
-    shortest = 2.0 * RAMP_LEAST * own[0]
-    home = gaps(bank, roads, state, seen, b, i, e, rows, 0.0, v, 0.0, 0.0)
-    room = home[0] - wp.max(0.5 * v * v / -FIRM, shortest * lanes_left(shift, u0))
-    if home[3] != 0.0 or home[0] >= FAR or home[1] > 0.5 or room < 1.0:
+    shortest = 2.0 * RAMP_LEAST * own_body[0]
+    own_lane = gaps(bank, roads, state, seen, b, i, e, rows, 0.0, speed, 0.0, 0.0)
+    stopping_room = own_lane[0] - wp.max(0.5 * speed * speed / -FIRM, shortest * lanes_left(shift, u0))
+    if own_lane[3] != 0.0 or own_lane[0] >= FAR or own_lane[1] > 0.5 or stopping_room < 1.0:
         return False
     line = line_ahead(roads, route[0] + state.progress[b, i], u0 - float(state.progress[b, i]), 0.0)
-    beyond = end_of_block(bank, roads, state, seen, b, i, e, rows, own[0] + home[0], line)
+    beyond = end_of_block(bank, roads, state, seen, b, i, e, rows, own_body[0] + own_lane[0], line)
     if beyond < 0.0:
         return False
-    goal = beyond + own[0] + wp.max(shortest, RAMP_TIME * top)
-    time = passing_time(v, top, goal)
-    # less cautious than who has not begun yet, or it would give up what was allowed
-    found = gaps(bank, roads, state, seen, b, i, e, rows, 1.0, v, wp.max(time - 1.0, 0.0), goal - 5.0)
-    if found[4] == 0.0:
+    goal = beyond + own_body[0] + wp.max(shortest, RAMP_TIME * top)
+    duration = passing_time(speed, top, goal)
+    # Less cautious than before the manoeuvre begins, or it would abort what has just been allowed.
+    oncoming_lane = gaps(bank, roads, state, seen, b, i, e, rows, 1.0, speed, wp.max(duration - 1.0, 0.0), goal - 5.0)
+    if oncoming_lane[4] == 0.0:
         return False
-    ramp = wp.max(home[0] - PULL_OUT, shortest * lanes_left(shift, u0))
-    state.shift[b, i] = wp.vec4(u0, u0 + wp.min(ramp, RAMP_TIME * v + shortest), lanes_left(shift, u0), 0.0)
+    return_length = wp.max(own_lane[0] - PULL_OUT, shortest * lanes_left(shift, u0))
+    state.shift[b, i] = wp.vec4(
+        u0, u0 + wp.min(return_length, RAMP_TIME * speed + shortest), lanes_left(shift, u0), 0.0
+    )
     return True
 
 
@@ -275,7 +289,7 @@ def choose_lane(
     agents: int,
     all_rows: int,
 ):
-    """Begin a lane change if an Autopilot wants one and it is safe; wait where a lane is about to end."""
+    """Begin a lane change if an Autopilot needs one and it is safe; wait where a lane is about to end."""
     if state.active[b, i] != Presence.AWAKE:
         return
     e = state.episode[b]
@@ -296,49 +310,58 @@ def choose_lane(
             return
     if u0 < shift[1]:
         return  # changes lane already
-    first = route[0] + state.progress[b, i]
-    part = u0 - float(state.progress[b, i])
-    v = wp.max(state.speed[b, i], 0.0)
+    route_point = route[0] + state.progress[b, i]
+    offset = u0 - float(state.progress[b, i])
+    speed = wp.max(state.speed[b, i], 0.0)
     top = state.aim[b, i][1]
-    own = bank.body[bank.model[e, i]]
-    room = row(roads.beside, first)
-    shortest = 2.0 * RAMP_LEAST * own[0]
-    ramp = wp.max(shortest, RAMP_TIME * v)
-    back = wp.max(shortest, RAMP_TIME * top)
+    own_body = bank.body[bank.model[e, i]]
+    adjacent_lanes = row(roads.beside, route_point)
+    shortest = 2.0 * RAMP_LEAST * own_body[0]
+    change_length = wp.max(shortest, RAMP_TIME * speed)
+    return_length = wp.max(shortest, RAMP_TIME * top)
 
     if shift[3] != 0.0:
-        leads_on = wp.abs(room[1]) - part
+        leads_on = wp.abs(adjacent_lanes[1]) - offset
         if shift[3] < 0.0:
-            leads_on = room[3] - part
-        oncoming = shift[3] > 0.0 and room[1] < 0.0
-        found = gaps(bank, roads, state, seen, b, i, e, rows, 0.0, v, 0.0, 0.0)
-        must = oncoming or leads_on < ramp + 4.0 * v + 30.0
-        free = found[0] > 15.0 + 3.0 * v or found[1] > top - 1.0
-        safe = found[3] == 0.0 and found[2] > FIRM and idm_gap(v, wp.max(found[1], 0.0), found[0]) > FIRM
-        if safe and (must or free):
-            ramp = wp.clamp(leads_on - 2.0, shortest, ramp)
-            state.shift[b, i] = wp.vec4(u0, u0 + ramp, lanes_left(shift, u0), 0.0)
-        elif must and not oncoming:
-            stop = leads_on - own[0] - shortest
-            if stop < 4.0 * v + 20.0:
-                state.react[b, i] = wp.min(state.react[b, i], idm_gap(v, 0.0, stop))
+            leads_on = adjacent_lanes[3] - offset
+        oncoming = shift[3] > 0.0 and adjacent_lanes[1] < 0.0
+        lane_gaps = gaps(bank, roads, state, seen, b, i, e, rows, 0.0, speed, 0.0, 0.0)
+        must_return = oncoming or leads_on < change_length + 4.0 * speed + 30.0
+        free = lane_gaps[0] > 15.0 + 3.0 * speed or lane_gaps[1] > top - 1.0
+        safe = (
+            lane_gaps[3] == 0.0
+            and lane_gaps[2] > FIRM
+            and idm_gap(speed, wp.max(lane_gaps[1], 0.0), lane_gaps[0]) > FIRM
+        )
+        if safe and (must_return or free):
+            change_length = wp.clamp(leads_on - 2.0, shortest, change_length)
+            state.shift[b, i] = wp.vec4(u0, u0 + change_length, lanes_left(shift, u0), 0.0)
+        elif must_return and not oncoming:
+            stop = leads_on - own_body[0] - shortest
+            if stop < 4.0 * speed + 20.0:
+                state.react[b, i] = wp.min(state.react[b, i], idm_gap(speed, 0.0, stop))
         return
 
     j = leader % LEADERS
     gap = 0.01 * float(leader // LEADERS)
-    q = seen.pose[b, j]
+    other_pose = seen.pose[b, j]
     pose = state.pose[b, i]
-    facing = wp.cos(q[2] - pose[2])
-    vj = seen.speed[b, j] * facing
+    facing = wp.cos(other_pose[2] - pose[2])
+    other_speed = seen.speed[b, j] * facing
     stands = wp.abs(seen.speed[b, j]) < 0.5
     if seen.kind[b, j] == AgentKind.WALKER or (facing < 0.7 and not stands):
         return  # crosses
-    if gap > 12.0 + 2.5 * v or top - vj < wp.max(1.5, 0.08 * top) or vj < -0.5 or seen.change[b, j][0] != 0:
+    if (
+        gap > 12.0 + 2.5 * speed
+        or top - other_speed < wp.max(1.5, 0.08 * top)
+        or other_speed < -0.5
+        or seen.change[b, j][0] != 0
+    ):
         return
-    if room[0] == 0.0 and room[2] == 0.0:
+    if adjacent_lanes[0] == 0.0 and adjacent_lanes[2] == 0.0:
         return
-    line = line_ahead(roads, first, part, 0.0)
-    beyond = own[0] + gap + 2.0 * seen.half[b, j][0]
+    line = line_ahead(roads, route_point, offset, 0.0)
+    beyond = own_body[0] + gap + 2.0 * seen.half[b, j][0]
     if stands:
         if seen.waited[b, j] < PATIENCE or beyond > line - QUEUE:
             return
@@ -348,47 +371,47 @@ def choose_lane(
     elif shift[1] > 0.0 and u0 < shift[1] + 20.0:
         return  # has only just come back
     # until it is back in its lane: a distance that grows by what the other goes meanwhile
-    goal = beyond + own[0] + 3.0 + back
-    time = passing_time(v, top, goal)
+    goal = beyond + own_body[0] + 3.0 + return_length
+    time = passing_time(speed, top, goal)
     if not stands:
         for _ in range(3):
-            time = passing_time(v, top, goal + wp.max(vj, 0.0) * time)
+            time = passing_time(speed, top, goal + wp.max(other_speed, 0.0) * time)
             time = wp.min(time, 60.0)
-    goal = goal + wp.max(vj, 0.0) * time
-    done = bool(False)
+    goal = goal + wp.max(other_speed, 0.0) * time
+    decided = bool(False)
     wants = bool(False)
-    for k in range(3):
+    for option in range(3):
         share = float(1.0)
-        leads_on = room[1] - part
-        exists = room[0] > 0.0 and room[1] > 0.0
-        if k == 1:
+        leads_on = adjacent_lanes[1] - offset
+        exists = adjacent_lanes[0] > 0.0 and adjacent_lanes[1] > 0.0
+        if option == 1:
             share = -1.0
-            leads_on = room[3] - part
-            exists = room[2] > 0.0
-        if k == 2:
-            leads_on = -room[1] - part
-            exists = room[0] > 0.0 and room[1] < 0.0 and stands
-        if not done and exists and leads_on > goal + 10.0:
+            leads_on = adjacent_lanes[3] - offset
+            exists = adjacent_lanes[2] > 0.0
+        if option == 2:
+            leads_on = -adjacent_lanes[1] - offset
+            exists = adjacent_lanes[0] > 0.0 and adjacent_lanes[1] < 0.0 and stands
+        if not decided and exists and leads_on > goal + 10.0:
             wants = bool(True)
-            found = gaps(bank, roads, state, seen, b, i, e, rows, share, v, time, goal)
-            safe = found[3] == 0.0 and found[2] > FIRM
-            if k == 2:
-                safe = safe and found[4] == 0.0
-            # whoever is in front there must be worth it
-            worth = found[0] > gap + 20.0 or found[1] > vj + 2.0
-            if found[0] < FAR:
-                worth = worth and idm_gap(v, wp.max(found[1], 0.0), found[0]) > FIRM
+            lane_gaps = gaps(bank, roads, state, seen, b, i, e, rows, share, speed, time, goal)
+            safe = lane_gaps[3] == 0.0 and lane_gaps[2] > FIRM
+            if option == 2:
+                safe = safe and lane_gaps[4] == 0.0
+            # The lane's leader must leave enough advantage.
+            worth = lane_gaps[0] > gap + 20.0 or lane_gaps[1] > other_speed + 2.0
+            if lane_gaps[0] < FAR:
+                worth = worth and idm_gap(speed, wp.max(lane_gaps[1], 0.0), lane_gaps[0]) > FIRM
             if safe and worth:
-                way = wp.vec4(u0, u0 + ramp, 0.0, share)
-                if not way_is_clear(bank, roads, state, seen, b, i, j, e, way, beyond):
-                    way = wp.vec4(u0, u0 + wp.max(shortest, 2.0 * v), 0.0, share)
-                if way_is_clear(bank, roads, state, seen, b, i, j, e, way, beyond):
-                    state.shift[b, i] = way
-                    done = bool(True)
-                elif stands and v < 0.3:
+                shift_option = wp.vec4(u0, u0 + change_length, 0.0, share)
+                if not way_is_clear(bank, roads, state, seen, b, i, j, e, shift_option, beyond):
+                    shift_option = wp.vec4(u0, u0 + wp.max(shortest, 2.0 * speed), 0.0, share)
+                if way_is_clear(bank, roads, state, seen, b, i, j, e, shift_option, beyond):
+                    state.shift[b, i] = shift_option
+                    decided = bool(True)
+                elif stands and speed < 0.3:
                     state.stalled[b, i] = 1  # too near to pull out
-    if stands and wants and not done:
-        state.react[b, i] = wp.min(state.react[b, i], idm_gap(v, 0.0, wp.max(gap - PULL_OUT, 0.1)))
+    if stands and wants and not decided:
+        state.react[b, i] = wp.min(state.react[b, i], idm_gap(speed, 0.0, wp.max(gap - PULL_OUT, 0.1)))
 
 
 @wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
@@ -402,7 +425,7 @@ def change_lanes(
     all_rows: int,
     threads: int,
 ):
-    """Let every Autopilot begin a lane change that it wants, where that is safe."""
+    """Let every Autopilot begin a needed lane change where it is safe."""
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):

@@ -53,10 +53,10 @@ LONGEST = wp.constant(5.2)  # half length of the longest model, m
 
 @wp.func
 def idm_gap(v: float, lead: float, gap: float) -> float:
-    """IDM's interaction term, m/s^2 (negative): how hard to brake behind something `gap` metres ahead."""
-    close = v * (v - lead) / (2.0 * wp.sqrt(IDM_ACCEL * IDM_BRAKE))
-    wish = IDM_GAP + wp.max(0.0, v * IDM_HEADWAY + close)
-    ratio = wish / wp.max(gap, 0.1)
+    """Return IDM's interaction term, m/s^2 (negative): the braking behind an obstacle `gap` metres ahead."""
+    closing_term = v * (v - lead) / (2.0 * wp.sqrt(IDM_ACCEL * IDM_BRAKE))
+    desired_gap = IDM_GAP + wp.max(0.0, v * IDM_HEADWAY + closing_term)
+    ratio = desired_gap / wp.max(gap, 0.1)
     return -IDM_ACCEL * ratio * ratio
 
 
@@ -76,51 +76,51 @@ def lead_gap(
     margin: float,
     bend: float,
 ) -> wp.vec2:
-    """Where the agent of row j stands on a route that begins `u0` metres along: (gap of bumpers or FAR, its speed).
+    """Locate the agent of row j on a route that begins `u0` metres along: (gap of bumpers or FAR, its speed).
 
     lon: metres j is ahead in the follower's frame, the first guess of its place; heading: j's unit heading; bend:
     metres that the route ahead leaves its straight line.
     """
-    q = seen.pose[b, j]
+    other_pose = seen.pose[b, j]
     u = wp.clamp(lon, 0.0, SIGHT)
     lateral = float(0.0)
-    rest = float(0.0)
-    at = wp.vec4(0.0, 0.0, 1.0, 0.0)
+    residual = float(0.0)
+    frame = wp.vec4(0.0, 0.0, 1.0, 0.0)
     for _ in range(4):
-        at = way_frame(roads, route[0], route[1], shift, u0 + u)
-        rx = q[0] - at[0]
-        ry = q[1] - at[1]
-        rest = rx * at[2] + ry * at[3]
-        lateral = ry * at[2] - rx * at[3]
-        if wp.abs(rest) < 0.05:
+        frame = way_frame(roads, route[0], route[1], shift, u0 + u)
+        rel_x = other_pose[0] - frame[0]
+        rel_y = other_pose[1] - frame[1]
+        residual = rel_x * frame[2] + rel_y * frame[3]
+        lateral = rel_y * frame[2] - rel_x * frame[3]
+        if wp.abs(residual) < 0.05:
             break
-        u = wp.clamp(u + rest, 0.0, SIGHT)
-    c = heading[0] * at[2] + heading[1] * at[3]
-    s = wp.abs(heading[0] * at[3] - heading[1] * at[2])
-    along = other[0] * wp.abs(c) + other[1] * s
-    across = other[0] * s + other[1] * wp.abs(c)
+        u = wp.clamp(u + residual, 0.0, SIGHT)
+    cosine = heading[0] * frame[2] + heading[1] * frame[3]
+    sine = wp.abs(heading[0] * frame[3] - heading[1] * frame[2])
+    half_along = other[0] * wp.abs(cosine) + other[1] * sine
+    half_across = other[0] * sine + other[1] * wp.abs(cosine)
     result = wp.vec2(FAR, 0.0)
     # in a bend the corners sweep wider than the body
-    spot = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
-    sweep = wp.min(0.5 * wp.abs(roads.path[spot][3]) * own[0] * own[0], 1.0)
+    route_point = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
+    sweep = wp.min(0.5 * wp.abs(roads.path[route_point][3]) * own[0] * own[0], 1.0)
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
-    if u > 0.0 and u < SIGHT and wp.abs(rest) < 1.0 and wp.abs(lateral) < own[1] + across + margin + sweep:
-        result = wp.vec2(u - own[0] - along, seen.speed[b, j] * c)
+    if u > 0.0 and u < SIGHT and wp.abs(residual) < 1.0 and wp.abs(lateral) < own[1] + half_across + margin + sweep:
+        result = wp.vec2(u - own[0] - half_along, seen.speed[b, j] * cosine)
     if result[0] >= FAR and bend > 1.5 and lon < 20.0:
         # in a tight bend a projection need not converge, and a long body leaves its corridor: drive it along and see
         # 0.2 m of room to either side, checked every metre
-        for k in range(14):
-            u = float(k + 1)
-            at = way_frame(roads, route[0], route[1], shift, u0 + u)
-            dx = q[0] - at[0]
-            dy = q[1] - at[1]
+        for metre in range(14):
+            u = float(metre + 1)
+            frame = way_frame(roads, route[0], route[1], shift, u0 + u)
+            dx = other_pose[0] - frame[0]
+            dy = other_pose[1] - frame[1]
             # a centimetre more than is asked, so that it never misses what the exact test finds
             if frames_touch(
-                dx, dy, at[2], at[3], own[0] + 0.01, own[1] + 0.21, heading[0], heading[1], other[0], other[1]
+                dx, dy, frame[2], frame[3], own[0] + 0.01, own[1] + 0.21, heading[0], heading[1], other[0], other[1]
             ):
-                body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
-                if boxes_touch(body, own[0], own[1] + 0.2, q, other[0], other[1]):
-                    result = wp.vec2(u - 1.0, seen.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
+                body = wp.vec3(frame[0], frame[1], wp.atan2(frame[3], frame[2]))
+                if boxes_touch(body, own[0], own[1] + 0.2, other_pose, other[0], other[1]):
+                    result = wp.vec2(u - 1.0, seen.speed[b, j] * (heading[0] * frame[2] + heading[1] * frame[3]))
                     break
     return result
 
@@ -137,7 +137,7 @@ def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
 
 @wp.func
 def inside(seen: Seen, b: int, j: int) -> bool:
-    """Whether somebody's front has entered the junction."""
+    """Return whether an agent's front has entered the junction."""
     return seen.way[b, j][1] < seen.half[b, j][0] - 1.0
 
 
@@ -145,61 +145,61 @@ def inside(seen: Seen, b: int, j: int) -> bool:
 def waits(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, me: int, i: int, j: int, e: int, dt: float
 ) -> bool:
-    """Whether i, who is still before the junction, lets j go first, who is inside.
+    """Return whether i, still before the junction, lets j go first, which is inside.
 
-    Not if it can no longer stop with 4 m/s^2, nor on green (as `me` sees it) for someone who turns left from the other
-    side.
+    Not if it can no longer stop with 4 m/s^2, nor on green (as `me` perceives it) for an oncoming agent that turns
+    left.
     """
     way = seen.way[b, i]
-    v = seen.speed[b, i]
+    speed = seen.speed[b, i]
     line = way[0] - seen.half[b, i][0]
-    lets = v * v < 8.0 * (wp.max(line, 0.0) + 1.5)
+    yields = speed * speed < 8.0 * (wp.max(line, 0.0) + 1.5)
     index = seen.signal[b, i]
     turns = seen.way[b, j][2] > way[2]
     if turns and index >= 0 and wp.cos(seen.pose[b, i][2] - seen.pose[b, j][2]) < -0.5:
         if light(bank, roads, state, seen, b, me, e, index, dt) == SignalState.GREEN:
-            lets = False
-    return lets
+            yields = False
+    return yields
 
 
 @wp.func
 def clears(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, me: int, j: int, e: int, dt: float
 ) -> bool:
-    """Whether j can no longer stop before the junction though its signal, as `me` sees it, is not green any more."""
+    """Return whether j can no longer stop before the junction although its signal is not green for `me` any more."""
     index = seen.signal[b, j]
     line = seen.way[b, j][0] - seen.half[b, j][0]
-    v = seen.speed[b, j]
-    late = bool(False)
-    if index >= 0 and v * v >= 8.0 * (wp.max(line, 0.0) + 1.5):
-        lit = light(bank, roads, state, seen, b, me, e, index, dt)
-        late = lit == SignalState.YELLOW or lit == SignalState.RED
-    return late
+    speed = seen.speed[b, j]
+    too_late = bool(False)
+    if index >= 0 and speed * speed >= 8.0 * (wp.max(line, 0.0) + 1.5):
+        signal_now = light(bank, roads, state, seen, b, me, e, index, dt)
+        too_late = signal_now == SignalState.YELLOW or signal_now == SignalState.RED
+    return too_late
 
 
 @wp.func
 def first_there(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j: int) -> bool:
-    """Whether i is at a place sooner than j; the same bits whoever asks."""
-    mine = far_i * (wp.max(v_j, 0.0) + 1.0)
-    other = far_j * (wp.max(v_i, 0.0) + 1.0)
-    return mine < other or (mine == other and i < j)
+    """Return whether i reaches a place sooner than j; bit-identical for either observer."""
+    own_term = far_i * (wp.max(v_j, 0.0) + 1.0)
+    other_term = far_j * (wp.max(v_i, 0.0) + 1.0)
+    return own_term < other_term or (own_term == other_term and i < j)
 
 
 @wp.func
 def has_priority(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, j: int, e: int, dt: float
 ) -> bool:
-    """Whether i goes before j (rows of `seen`) where their paths cross; of each two exactly one goes first.
+    """Return whether i goes before j (rows of `seen`) where their paths cross; of each two exactly one goes first.
 
-    Another Autopilot is relied on to give way, and so is the ego, whoever drives it: traffic does not know who is under
-    test. Scripted actors and walkers are not. Whoever is inside the junction goes first (see `waits`), then who has got
-    there too late to stop at a signal (see `clears`), then whoever has no stop or yield sign, straight before right
-    before left, then whoever is nearer to it, then the lower number.
+    Another Autopilot is relied on to give way, and so is the ego under any driver: traffic does not know which agent
+    is under test. Scripted actors and walkers are not. Priority goes to the agent inside the junction (see `waits`),
+    then to the one that is too late to stop at a signal (see `clears`), then to the one without a stop or yield sign,
+    straight before right before left, then to the one nearer to it, then to the lower number.
     """
     if seen.gives_way[b, j] == 0:
         return False
-    a = seen.way[b, i]
-    c = seen.way[b, j]
+    own_way = seen.way[b, i]
+    other_way = seen.way[b, j]
     inside_i = inside(seen, b, i)
     inside_j = inside(seen, b, j)
     if inside_i and not inside_j and waits(bank, roads, state, seen, b, i, j, i, e, dt):
@@ -211,20 +211,20 @@ def has_priority(
         late_j = clears(bank, roads, state, seen, b, i, j, e, dt)
         if late_i != late_j:
             return late_i
-    if a[2] != c[2]:
-        return a[2] < c[2]
-    if wp.abs(a[1] - c[1]) > 1.0:
-        return a[1] < c[1]
+    if own_way[2] != other_way[2]:
+        return own_way[2] < other_way[2]
+    if wp.abs(own_way[1] - other_way[1]) > 1.0:
+        return own_way[1] < other_way[1]
     if inside_i and inside_j:
-        p = seen.pose[b, i]
-        q = seen.pose[b, j]
-        across = wp.sin(q[2] - p[2])
-        if wp.abs(across) > 0.5:
-            # who is first where their straight ways cross; who brakes for the other stays second
-            dx = q[0] - p[0]
-            dy = q[1] - p[1]
-            far_i = (dx * wp.sin(q[2]) - dy * wp.cos(q[2])) / across
-            far_j = (dx * wp.sin(p[2]) - dy * wp.cos(p[2])) / across
+        own_pose = seen.pose[b, i]
+        other_pose = seen.pose[b, j]
+        sine = wp.sin(other_pose[2] - own_pose[2])
+        if wp.abs(sine) > 0.5:
+            # First at the crossing of their straight paths; an agent that brakes for the other stays second.
+            dx = other_pose[0] - own_pose[0]
+            dy = other_pose[1] - own_pose[1]
+            far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
+            far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
             return first_there(far_i, seen.speed[b, i], i, far_j, seen.speed[b, j], j)
     return i < j
 
@@ -244,51 +244,58 @@ def conflict_gap(
     other: wp.vec2,
     lat_margin: float,
 ) -> float:
-    """Metres from i's front bumper to the near edge of its predicted conflict with j within 4 s, or FAR.
+    """Return the distance from i's front bumper to its predicted conflict with j within 4 s, or FAR.
 
-    i is where it intends to be, j where it will be if it keeps its speed along its own route (its heading if it has
-    none); they are compared at the same time and half a second to either side.
+    i is predicted along its intention, j along its own route at constant speed (along its heading if it has none);
+    they are compared at the same time and half a second to either side. The distance is to the near edge of the
+    conflict.
     """
     gap = FAR
     u = float(0.0)
-    w = v
-    # so long that who is fast and short is not first before my way and then behind it
-    long = wp.max(other[0], 0.5 * STRIDE * wp.abs(seen.speed[b, j]) - own[1])
-    reach = own[0] + long + 2.0
-    reach2 = reach * reach
+    speed = v
+    # Long enough that a fast, short agent does not skip from before the path to behind it.
+    half_length = wp.max(other[0], 0.5 * STRIDE * wp.abs(seen.speed[b, j]) - own[1])
+    reach = own[0] + half_length + 2.0
+    squared_reach = reach * reach
     before = seen.pose[b, j]
     now = seen.forecast[b, j, 0]
-    for k in range(HORIZON):
+    for step in range(HORIZON):
         # it slows down for bends as the route's speed profile says
-        spot = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
-        after = wp.min(w + 2.0 * STRIDE, wp.min(wp.max(target, w), wp.max(roads.rule[spot][0], w - 4.0 * STRIDE)))
-        u = u + 0.5 * (w + after) * STRIDE
-        w = after
-        at = way_frame(roads, route[0], route[1], shift, u0 + u)
+        route_point = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
+        next_speed = wp.min(
+            speed + 2.0 * STRIDE,
+            wp.min(wp.max(target, speed), wp.max(roads.rule[route_point][0], speed - 4.0 * STRIDE)),
+        )
+        u = u + 0.5 * (speed + next_speed) * STRIDE
+        speed = next_speed
+        frame = way_frame(roads, route[0], route[1], shift, u0 + u)
         later = now
-        if k + 1 < HORIZON:
-            later = seen.forecast[b, j, k + 1]
-        for n in range(3):
-            q = now
-            if n == 0:
-                q = before
-            elif n == 2:
-                q = later
-            rx = q[0] - at[0]
-            ry = q[1] - at[1]
-            if rx * rx + ry * ry < reach2:
-                along = rx * at[2] + ry * at[3]
-                across = ry * at[2] - rx * at[3]
-                qc = wp.cos(q[2])
-                qs = wp.sin(q[2])
-                ct = wp.abs(qc * at[2] + qs * at[3])
-                st = wp.abs(qs * at[2] - qc * at[3])
-                he = long * ct + other[1] * st
-                we = long * st + other[1] * ct
-                if wp.abs(across) < own[1] + we + lat_margin and wp.abs(along) < own[0] + he + 1.0:
-                    edge = u + along - he - own[0]
+        if step + 1 < HORIZON:
+            later = seen.forecast[b, j, step + 1]
+        for moment in range(3):
+            other_pose = now
+            if moment == 0:
+                other_pose = before
+            elif moment == 2:
+                other_pose = later
+            rel_x = other_pose[0] - frame[0]
+            rel_y = other_pose[1] - frame[1]
+            if rel_x * rel_x + rel_y * rel_y < squared_reach:
+                longitudinal = rel_x * frame[2] + rel_y * frame[3]
+                lateral = rel_y * frame[2] - rel_x * frame[3]
+                other_cos = wp.cos(other_pose[2])
+                other_sin = wp.sin(other_pose[2])
+                abs_cos = wp.abs(other_cos * frame[2] + other_sin * frame[3])
+                abs_sin = wp.abs(other_sin * frame[2] - other_cos * frame[3])
+                half_along = half_length * abs_cos + other[1] * abs_sin
+                half_across = half_length * abs_sin + other[1] * abs_cos
+                if (
+                    wp.abs(lateral) < own[1] + half_across + lat_margin
+                    and wp.abs(longitudinal) < own[0] + half_along + 1.0
+                ):
+                    edge = u + longitudinal - half_along - own[0]
                     # already past the near edge with j behind the middle: braking would only stay in its way
-                    if edge > 0.0 or along > 0.0:
+                    if edge > 0.0 or longitudinal > 0.0:
                         gap = wp.min(gap, wp.max(edge, 0.0))
         before = now
         now = later
@@ -308,17 +315,17 @@ def apart(
     ahead: float,
     off: float,
 ) -> bool:
-    """Whether j's next 4 s cannot meet mine, by the boxes that hold both in my frame: cheap and never wrong.
+    """Return whether j's next 4 s cannot meet i's, by bounding boxes in i's frame: cheap and never wrong.
 
-    lon, lat: where j is now; ahead: metres I can go; off: what bent paths and the bodies' reach add.
+    lon, lat: place of j now; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
     """
-    q = seen.forecast[b, j, HORIZON - 1]
-    dx = q[0] - pose[0]
-    dy = q[1] - pose[1]
-    lon1 = dx * c + dy * s
-    lat1 = dy * c - dx * s
-    aside = wp.min(lat, lat1) > off or wp.max(lat, lat1) < -off
-    return aside or wp.min(lon, lon1) - off > ahead or wp.max(lon, lon1) + off < 0.0
+    last_pose = seen.forecast[b, j, HORIZON - 1]
+    dx = last_pose[0] - pose[0]
+    dy = last_pose[1] - pose[1]
+    last_lon = dx * c + dy * s
+    last_lat = dy * c - dx * s
+    aside = wp.min(lat, last_lat) > off or wp.max(lat, last_lat) < -off
+    return aside or wp.min(lon, last_lon) - off > ahead or wp.max(lon, last_lon) + off < 0.0
 
 
 @wp.func
@@ -343,66 +350,66 @@ def look_around(
         return
     at = state.progress[b, i]
     first = route[0] + at
-    rule = row(roads.rule, first)
+    road_rule = row(roads.rule, first)
     pose = state.pose[b, i]
-    v = state.speed[b, i]
-    own = bank.body[bank.model[e, i]]
-    p = row(roads.path, first)
-    part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
-    cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
+    speed = state.speed[b, i]
+    own_body = bank.body[bank.model[e, i]]
+    point = row(roads.path, first)
+    offset = (pose[0] - point[0]) * wp.cos(point[2]) + (pose[1] - point[1]) * wp.sin(point[2])
+    speed_cap = wp.min(road_rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
     shift = state.shift[b, i]
-    target = wp.min(wp.min(state.cruise[b, i], cap), change_speed(shift, float(at) + part))
-    state.aim[b, i] = wp.vec2(float(at) + part, target)
+    target = wp.min(wp.min(state.cruise[b, i], speed_cap), change_speed(shift, float(at) + offset))
+    state.aim[b, i] = wp.vec2(float(at) + offset, target)
     react = float(0.0)
 
-    index = roads.path_signal[first]
-    lit = int(SignalState.OFF)
-    if index >= 0 and rule[1] - part < SIGHT + 40.0:
-        lit = light(bank, roads, state, seen, b, i, e, index, dt)
+    signal_index = roads.path_signal[first]
+    signal_now = int(SignalState.OFF)
+    if signal_index >= 0 and road_rule[1] - offset < SIGHT + 40.0:
+        signal_now = light(bank, roads, state, seen, b, i, e, signal_index, dt)
     obeys = i > 0 or seen.believes[b] == 0 or seen.sign[b] == 1  # who does not know of a sign does not stop
-    if obeys and lit == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
-        ahead = roads.ahead[first][0] - part - own[0]
-        if ahead > -0.5 and ahead < SIGHT + 20.0:
-            react = idm_gap(v, 0.0, ahead + 1.0)
-    if index >= 0:
-        ahead = rule[1] - part - own[0]
-        if ahead > -0.5 and ahead < SIGHT + 20.0:
-            stop = lit == SignalState.RED
-            if lit == SignalState.YELLOW:
-                stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
+    if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
+        line_gap = roads.ahead[first][0] - offset - own_body[0]
+        if line_gap > -0.5 and line_gap < SIGHT + 20.0:
+            react = idm_gap(speed, 0.0, line_gap + 1.0)
+    if signal_index >= 0:
+        line_gap = road_rule[1] - offset - own_body[0]
+        if line_gap > -0.5 and line_gap < SIGHT + 20.0:
+            stop = signal_now == SignalState.RED
+            if signal_now == SignalState.YELLOW:
+                stop = speed * speed < 2.0 * 3.5 * wp.max(line_gap, 0.0)
             if (
-                lit == SignalState.RED
-                and int(rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT
+                signal_now == SignalState.RED
+                and int(road_rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT
                 and state.waited[b, i] >= 1.0
             ):
                 stop = False  # right turn on red, after a stop; it yields below
             if stop:
-                react = wp.min(react, idm_gap(v, 0.0, ahead + 1.0))
+                react = wp.min(react, idm_gap(speed, 0.0, line_gap + 1.0))
     state.react[b, i] = react
     state.stalled[b, i] = 0
     work.leader[b, i] = NO_LEADER
 
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
-    # how far ahead anybody matters: 4 s of driving, and the distance to brake in comfort
-    goes = wp.max(target, v) * STRIDE * float(HORIZON)
-    sees = wp.min(wp.max(goes, 15.0 + 3.0 * v), SIGHT)
+    # Range within which agents matter: 4 s of driving, and the distance of comfortable braking.
+    travel = wp.max(target, speed) * STRIDE * float(HORIZON)
+    view_range = wp.min(wp.max(travel, 15.0 + 3.0 * speed), SIGHT)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
     if changes(shift):
-        bend = bend + ASIDE + SIGHT * wp.abs(wp.sin(pose[2] - p[2]))
-    low = wp.vec2(pose[0], pose[1])
-    high = low
-    for k in range(5):
-        at_k = way_frame(roads, route[0], route[1], shift, float(at) + part + 0.2 * float(k + 1) * sees)
-        low = wp.vec2(wp.min(low[0], at_k[0]), wp.min(low[1], at_k[1]))
-        high = wp.vec2(wp.max(high[0], at_k[0]), wp.max(high[1], at_k[1]))
+        bend = bend + ASIDE + SIGHT * wp.abs(wp.sin(pose[2] - point[2]))
+    box_low = wp.vec2(pose[0], pose[1])
+    box_high = box_low
+    for corner in range(5):
+        frame = way_frame(roads, route[0], route[1], shift, float(at) + offset + 0.2 * float(corner + 1) * view_range)
+        box_low = wp.vec2(wp.min(box_low[0], frame[0]), wp.min(box_low[1], frame[1]))
+        box_high = wp.vec2(wp.max(box_high[0], frame[0]), wp.max(box_high[1], frame[1]))
     # room for both bodies (LONGEST: of any model), and 2 m each that bends leave the chords between the five places
-    pad = own[0] + LONGEST + 4.0
+    padding = own_body[0] + LONGEST + 4.0
     if changes(shift):
-        pad = pad + ASIDE
-    low = wp.vec2(low[0] - pad, low[1] - pad)
-    high = wp.vec2(high[0] + pad, high[1] + pad)
+        padding = padding + ASIDE
+    box_low = wp.vec2(box_low[0] - padding, box_low[1] - padding)
+    box_high = wp.vec2(box_high[0] + padding, box_high[1] + padding)
     from_row = int(0)
     to_row = agents
     if i == 0 and seen.believes[b] == 1:
@@ -411,28 +418,37 @@ def look_around(
     for j in range(from_row, to_row):
         if j != i and seen.kind[b, j] != AgentKind.NONE:
             box = seen.span[b, j]
-            if box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
-                other = seen.half[b, j]
-                q = seen.pose[b, j]
-                dx = q[0] - pose[0]
-                dy = q[1] - pose[1]
-                lon = dx * c + dy * s
-                lat = dy * c - dx * s
-                turn = q[2] - pose[2]
+            if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
+                other_half = seen.half[b, j]
+                other_pose = seen.pose[b, j]
+                dx = other_pose[0] - pose[0]
+                dy = other_pose[1] - pose[1]
+                longitudinal = dx * c + dy * s
+                lateral = dy * c - dx * s
+                turn = other_pose[2] - pose[2]
                 facing = wp.cos(turn)
                 # across straight lanes only the width of an aligned body counts
-                wide = own[1] + other[0] * wp.abs(wp.sin(turn)) + other[1] * wp.abs(facing) + 1.0
+                half_width = own_body[1] + other_half[0] * wp.abs(wp.sin(turn)) + other_half[1] * wp.abs(facing) + 1.0
                 flags = int(0)
-                near = q[0] < high[0] and q[0] > low[0] and q[1] < high[1] and q[1] > low[1]
-                if near and lon > -bend - own[0] and wp.abs(lat) < bend + wide:
+                in_box = (
+                    other_pose[0] < box_high[0]
+                    and other_pose[0] > box_low[0]
+                    and other_pose[1] < box_high[1]
+                    and other_pose[1] > box_low[1]
+                )
+                if in_box and longitudinal > -bend - own_body[0] and wp.abs(lateral) < bend + half_width:
                     flags = 1
-                if wp.abs(seen.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5 or wp.abs(lat) > wide):
-                    # who is behind me in my lane and goes my way keeps its distance itself
+                if wp.abs(seen.speed[b, j]) > 0.2 and (
+                    longitudinal >= 0.0 or facing <= 0.5 or wp.abs(lateral) > half_width
+                ):
+                    # An agent behind in the same lane and direction keeps its distance itself.
                     bend_j = seen.way[b, j][3]
-                    reach = wide
+                    reach = half_width
                     if bend_j > 1.0 or bend > 2.0:
-                        reach = own[0] + other[0] + 2.0
-                    if not apart(seen, b, j, pose, c, s, lon, lat, goes + own[0], bend + bend_j + reach):
+                        reach = own_body[0] + other_half[0] + 2.0
+                    if not apart(
+                        seen, b, j, pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach
+                    ):
                         flags = flags + 2
                 if flags > 0 and wp.abs(seen.height[b, j] - seen.height[b, i]) > BRIDGE:
                     flags = 0  # one of us is on a bridge
@@ -476,7 +492,7 @@ def meet(
     workers: int,
     dt: float,
 ):
-    """Reactions of Autopilots to those whom `sight` listed: following, stopping for, and giving way."""
+    """Compute the reactions of Autopilots to the agents that `sight` listed: following, stopping and giving way."""
     tid = wp.tid()
     total = work.count[0]
     slot = int(tid)
@@ -492,17 +508,17 @@ def meet(
         route = bank.route[e, i]
         shift = state.shift[b, i]
         pose = state.pose[b, i]
-        q = seen.pose[b, j]
-        v = wp.max(state.speed[b, i], 0.0)
-        own = bank.body[bank.model[e, i]]
-        other = seen.half[b, j]
+        other_pose = seen.pose[b, j]
+        speed = wp.max(state.speed[b, i], 0.0)
+        own_body = bank.body[bank.model[e, i]]
+        other_half = seen.half[b, j]
         walks = seen.kind[b, j] == AgentKind.WALKER
         aim = state.aim[b, i]
         react = float(0.0)
         leads = int(0)
         first = route[0] + state.progress[b, i]
-        part = aim[0] - float(state.progress[b, i])
-        line = line_ahead(roads, first, part, own[0])
+        offset = aim[0] - float(state.progress[b, i])
+        line = line_ahead(roads, first, offset, own_body[0])
         if line > -1.0 and roads.rule[first][2] <= 0.0:
             # in the junction, and so short that its front seems to be before it
             if state.waited[b, i] > LOCKED:
@@ -510,8 +526,8 @@ def meet(
         if flags != 2:
             c = wp.cos(pose[2])
             s = wp.sin(pose[2])
-            heading = wp.vec2(wp.cos(q[2]), wp.sin(q[2]))
-            lon = (q[0] - pose[0]) * c + (q[1] - pose[1]) * s
+            heading = wp.vec2(wp.cos(other_pose[2]), wp.sin(other_pose[2]))
+            longitudinal = (other_pose[0] - pose[0]) * c + (other_pose[1] - pose[1]) * s
             stands = wp.abs(seen.speed[b, j]) < STANDS and heading[0] * c + heading[1] * s < 0.7
             margin = 0.3
             if walks:
@@ -519,17 +535,19 @@ def meet(
             bend = roads.bend[route[0] + state.progress[b, i]]
             if aim[0] < shift[1]:
                 bend = bend + ASIDE
-            lead = lead_gap(roads, seen, b, j, route, shift, aim[0], lon, own, other, heading, margin, bend)
-            if lead[0] < FAR:
-                react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
-                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(lead[0], 0.0, SIGHT)) * LEADERS + j)
+            leader = lead_gap(
+                roads, seen, b, j, route, shift, aim[0], longitudinal, own_body, other_half, heading, margin, bend
+            )
+            if leader[0] < FAR:
+                react = idm_gap(speed, wp.max(leader[1], 0.0), leader[0])
+                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(leader[0], 0.0, SIGHT)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
-                near = NOSE_TO_NOSE
+                contact_range = NOSE_TO_NOSE
                 if state.control[b, i][3] > 0.5:
-                    near = MAKES_ROOM  # backs out already
-                if stands and lead[0] < near and wp.min(state.waited[b, i], seen.waited[b, j]) > BACK_OUT:
-                    # who has to wait makes room, or, if it has no room behind, the other one
+                    contact_range = MAKES_ROOM  # backs out already
+                if stands and leader[0] < contact_range and wp.min(state.waited[b, i], seen.waited[b, j]) > BACK_OUT:
+                    # The agent without priority makes room, or the other one if it has no room behind.
                     from_row = int(0)
                     to_row = agents
                     if i == 0 and seen.believes[b] == 1:
@@ -540,30 +558,30 @@ def meet(
                     elif not room_behind(seen, b, j, from_row, to_row):
                         state.stalled[b, i] = 1
                 # a junction is entered only where there is room behind it
-                room = roads.ahead[first][2] - part - own[0] + 2.0 * own[0] + 2.0
-                if line > -1.0 and lead[0] > line + 3.0 and lead[0] < room and lead[1] < 1.5:
-                    react = wp.min(react, idm_gap(v, 0.0, wp.max(line, 0.0) + 1.0))
+                required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
+                if line > -1.0 and leader[0] > line + 3.0 and leader[0] < required_room and leader[1] < 1.5:
+                    react = wp.min(react, idm_gap(speed, 0.0, wp.max(line, 0.0) + 1.0))
         if flags >= 2 and leads == 0:
             margin = 0.4
             if walks:
                 margin = 1.0
-            gap = conflict_gap(roads, seen, b, j, route, shift, aim[0], v, aim[1], own, other, margin)
+            gap = conflict_gap(roads, seen, b, j, route, shift, aim[0], speed, aim[1], own_body, other_half, margin)
             if gap < FAR:
                 goes_first = has_priority(bank, roads, state, seen, b, i, j, e, dt)
                 goes_first = change_priority(seen, b, i, j, goes_first)
-                if not goes_first and line > -1.0 and not walks and v * v < 8.0 * (line + 1.5):
+                if not goes_first and line > -1.0 and not walks and speed * speed < 8.0 * (line + 1.5):
                     # it is waited before the junction, not in it, but to turn left on green
                     index = roads.path_signal[first]
-                    lit = int(SignalState.OFF)
+                    signal_now = int(SignalState.OFF)
                     if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
-                        lit = light(bank, roads, state, seen, b, i, e, index, dt)
+                        signal_now = light(bank, roads, state, seen, b, i, e, index, dt)
                     entered = inside(seen, b, j)
-                    crosses = wp.abs(wp.cos(q[2] - pose[2])) < 0.7
-                    if lit == SignalState.OFF or lit == SignalState.RED or entered or crosses:
+                    crosses = wp.abs(wp.cos(other_pose[2] - pose[2])) < 0.7
+                    if signal_now == SignalState.OFF or signal_now == SignalState.RED or entered or crosses:
                         gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
                 # whoever stands and has to wait is not expected to go after all
-                if not goes_first or (gap < 0.5 * v and wp.abs(seen.speed[b, j]) > STANDS):
-                    react = wp.min(react, idm_gap(v, 0.0, gap))
+                if not goes_first or (gap < 0.5 * speed and wp.abs(seen.speed[b, j]) > STANDS):
+                    react = wp.min(react, idm_gap(speed, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)
         slot = slot + workers

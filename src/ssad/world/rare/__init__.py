@@ -1,1 +1,1 @@
-"""How likely is it that a driver fails? Estimators of small probabilities over any batched simulation with chance."""
+"""Estimators of small failure probabilities of a driver, over any batched simulation with randomness."""

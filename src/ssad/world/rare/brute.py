@@ -1,4 +1,4 @@
-"""Plain Monte Carlo: many episodes, and how many of them fail."""
+"""Plain Monte Carlo estimate of a failure probability."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _KEPT = 100
 
 
 def draw_keys(random: np.random.Generator, count: int) -> Keys:
-    """As many keys of episodes."""
+    """Draw episode keys."""
     return random.integers(0, 2**64, count, dtype=np.uint64)
 
 
 def run(process: Process) -> Bool:
-    """Run all rows of a process, which have just been reset, to their ends; [B] which have failed."""
-    whole = getattr(process, "run", None)
-    if whole is not None:
-        return np.asarray(whole())
+    """Run all rows of a process that has just been reset to their ends; return [B] the failures."""
+    run_all = getattr(process, "run", None)
+    if run_all is not None:
+        return np.asarray(run_all())
     while process.running().any():
         process.step()
     return np.asarray(process.score() >= 1.0)
@@ -32,39 +32,39 @@ def run(process: Process) -> Bool:
 def monte_carlo(
     process: Process, random: np.random.Generator, *, episodes: int, events: int | None = None
 ) -> Iterator[tuple[RareEstimate, Keys]]:
-    """Run episodes until there have been `episodes` of them, or `events` failures; whole batches only.
+    """Run whole batches of episodes until `episodes` of them are complete, or `events` have failed.
 
     Args:
         process: The process.
-        random: Where the episodes' keys come from.
-        episodes: How many at least, unless there are enough failures before.
-        events: Failures that are enough.
+        random: Source of the episodes' keys.
+        episodes: Minimum number, unless there are enough failures before.
+        events: Number of failures after which to stop; None: no limit.
 
     Yields:
         After each batch the estimate so far, and the keys of the first failures, up to 100. Stopping at a number of
-        failures makes the estimate too large by about one part in that number.
+        failures biases the estimate upwards by about one part in that number.
     """
     count = failures = 0
-    found = draw_keys(random, 0)
-    before = process.work()
+    failure_keys = draw_keys(random, 0)
+    initial_work = process.work()
     while count < episodes and (events is None or failures < events):
         keys = draw_keys(random, process.batch)
         process.reset(keys)
         failed = run(process)
         count += process.batch
         failures += int(failed.sum())
-        found = np.concatenate([found, keys[failed]])[:_KEPT]
-        low, high = weighted_limits(failures, failures, 1.0, count)
+        failure_keys = np.concatenate([failure_keys, keys[failed]])[:_KEPT]
+        lower, upper = weighted_limits(failures, failures, 1.0, count)
         yield (
             RareEstimate(
                 failures / count,
-                float(low),
-                float(high),
+                float(lower),
+                float(upper),
                 "Monte Carlo",
                 count,
                 failures,
                 float(failures),
-                process.work() - before,
+                process.work() - initial_work,
             ),
-            found,
+            failure_keys,
         )

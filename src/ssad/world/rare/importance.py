@@ -1,12 +1,12 @@
-"""Importance sampling: episodes in which chance is led towards failure, and each failure weighed by how likely it was.
+"""Importance sampling: noise is steered towards failure, and each failure is weighted by its likelihood ratio.
 
-The proposal is a mixture: the process as it is (the defence, which bounds every weight), and copies of it in which the
-means of the normal numbers are moved. They are learned from failures: first from those that splitting finds, then, by
-the cross-entropy method, from those of all rounds' episodes, each with its weight among all that was drawn. Two kinds
-of copies cover failures that are too rare to be learned from: what is moved half as far, for failures that need less
-than most, and what is moved some time later (`Process.later`), for those that come later than most. Without the copies
-such a failure is drawn very seldom, and then its weight exceeds that of all others together. The weights are exact,
-since the likelihood ratio of moved normal numbers needs only their sums.
+The proposal is a mixture: the unchanged process (the defence, which bounds every weight), and components in which the
+means of the normal numbers are shifted. The shifts are learned from failures: first from those of splitting, then, by
+the cross-entropy method, from those of all rounds' episodes, each with its weight under everything drawn. Two kinds
+of copies cover failures that are too rare to learn from: half the shift, for failures that need less than most, and a
+delayed shift (`Process.later`), for those that come later than most. Without the copies such a failure is drawn very
+seldom, and then its weight exceeds that of all others together. The weights are exact, since the likelihood ratio of
+shifted normal numbers needs only their sums.
 
 Source: Owen and Zhou, "Safe and effective importance sampling" (2000), the mixture and its weights; Veach and Guibas,
 "Optimally combining sampling techniques" (1995), the weights of several rounds together; Rubinstein and Kroese, "The
@@ -32,18 +32,18 @@ LATER = 0.2  # share of the copies that begin later
 
 @dataclass(frozen=True)
 class Proposal:
-    """A mixture of the process as it is and of K moved ones.
+    """Mixture of the unchanged process and K shifted ones.
 
     Attributes:
-        share: [K + 1] of the components, the process as it is first.
-        means: [K, D] by how much each moves the means of the normal numbers.
+        share: [K + 1] weights of the components, the unchanged process first.
+        means: [K, D] shift of the means of the normal numbers in each.
     """
 
     share: F64
     means: F64
 
     def spread(self) -> Proposal:
-        """The same with a copy of each moved component that is moved half as far; the two share its share."""
+        """Add a copy of each shifted component with half the shift; the two split its share."""
         share = np.concatenate([self.share[:1], 0.5 * self.share[1:], 0.5 * self.share[1:]])
         return Proposal(share, np.vstack([0.5 * self.means, self.means]))
 
@@ -53,38 +53,39 @@ class Proposal:
         The copies get the share `LATER`, or half of what is moved if that is less. Where nothing is moved, or the
         process has no later times, nothing changes.
         """
-        moved = 1.0 - float(self.share[0])
-        most = 1 + np.argsort(-self.share[1:])[:2]
-        copies = [process.later(self.means[k - 1]) for k in most]
-        weight = np.repeat(self.share[most], [len(one) for one in copies])
-        if not weight.any():
+        shifted_share = 1.0 - float(self.share[0])
+        largest = 1 + np.argsort(-self.share[1:])[:2]
+        copies = [process.later(self.means[component - 1]) for component in largest]
+        copy_weights = np.repeat(self.share[largest], [len(copy) for copy in copies])
+        if not copy_weights.any():
             return self
-        later = min(LATER, 0.5 * moved)
-        kept = (1.0 - later / moved) * self.share[1:]
-        share = np.concatenate([self.share[:1], kept, later * weight / weight.sum()])
+        delayed_share = min(LATER, 0.5 * shifted_share)
+        remaining_share = (1.0 - delayed_share / shifted_share) * self.share[1:]
+        share = np.concatenate([self.share[:1], remaining_share, delayed_share * copy_weights / copy_weights.sum()])
         return Proposal(share, np.vstack([self.means, *copies]))
 
     def log_ratios(self, total: F64, count: F64) -> F64:
-        """[n, K] log of each moved component's likelihood over that of the process as it is."""
+        """Return the log likelihood ratio [n, K] of each shifted component over the unchanged process."""
         return np.asarray(total @ self.means.T - 0.5 * (count @ (self.means**2).T))
 
     def weights(self, total: F64, count: F64) -> F64:
-        """[n] likelihood of the process as it is over that of the mixture: at most 1 / share[0]."""
+        """Return the likelihood ratio [n] of the unchanged process over the mixture: at most 1 / share[0]."""
+        # exp(709) is the largest double; a larger ratio would overflow.
         ratios = np.exp(np.minimum(self.log_ratios(total, count), 700.0))
         return np.asarray(1.0 / (self.share[0] + ratios @ self.share[1:]))
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Episodes from a proposal, [n].
+    """Episodes drawn from a proposal, [n].
 
     Attributes:
-        failed: Which have failed.
-        weight: How likely each was without the proposal, to how likely with it.
+        failed: Mask of the failures.
+        weight: Likelihood ratio of the unchanged process over the proposal.
         total: [n, D] sums of the normal numbers.
-        count: [n, D] how many they are.
-        keys: Their keys.
-        component: Which component of the proposal each is from, 0: the process as it is.
+        count: [n, D] their counts.
+        keys: Keys of the episodes.
+        component: Component of the proposal that each is drawn from, 0: the unchanged process.
     """
 
     failed: Bool
@@ -96,7 +97,7 @@ class Sample:
 
 
 def sample(process: Process, proposal: Proposal, random: np.random.Generator, *, episodes: int) -> Sample:
-    """Run at least `episodes` episodes, whole batches, of a proposal."""
+    """Run at least `episodes` episodes of a proposal, in whole batches."""
     parts: list[Sample] = []
     means = np.vstack([np.zeros(process.width), proposal.means])
     while sum(len(part.keys) for part in parts) < episodes:
@@ -108,8 +109,10 @@ def sample(process: Process, proposal: Proposal, random: np.random.Generator, *,
         total, count = process.totals()
         weight = proposal.weights(total, count)
         parts.append(Sample(failed, weight, total, count, keys, component))
-    names = Sample.__dataclass_fields__
-    return Sample(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    field_names = Sample.__dataclass_fields__
+    return Sample(
+        **{field_name: np.concatenate([getattr(part, field_name) for part in parts]) for field_name in field_names}
+    )
 
 
 def learn(
@@ -137,25 +140,28 @@ def learn(
         defence: Share of the process as it is.
         shrink: Steps of no movement that are added to what is learned from, so that few episodes move little.
     """
-    found = splitting(process, random, repeats=1)
-    best = process.score()
-    chosen = found.failed if found.failed.any() else best >= np.quantile(best, 0.9)
-    total, count = (values[chosen] for values in process.totals())
+    initial = splitting(process, random, repeats=1)
+    final_scores = process.score()
+    informative = initial.failed if initial.failed.any() else final_scores >= np.quantile(final_scores, 0.9)
+    total, count = (statistic[informative] for statistic in process.totals())
     weight = np.ones(len(total))
-    drawn: list[tuple[Proposal, Sample]] = []
-    for number in range(rounds + 1):
-        fitted = _fit(total, count, weight, random, components=components, defence=defence, shrink=shrink)
-        proposal = fitted.with_later(process)
-        if number == rounds:
+    history: list[tuple[Proposal, Sample]] = []
+    for round_index in range(rounds + 1):
+        mixture = _fit(total, count, weight, random, components=components, defence=defence, shrink=shrink)
+        proposal = mixture.with_later(process)
+        if round_index == rounds:
             break
-        drawn.append((proposal, sample(process, proposal, random, episodes=episodes)))
-        parts = [(s.total[s.failed], s.count[s.failed]) for _, s in drawn]
-        if sum(len(part) for part, _ in parts) < 10:
+        history.append((proposal, sample(process, proposal, random, episodes=episodes)))
+        parts = [(batch.total[batch.failed], batch.count[batch.failed]) for _, batch in history]
+        if sum(len(total_rows) for total_rows, _ in parts) < 10:
             break  # too few to learn more from
         total, count = (np.concatenate(column) for column in zip(*parts, strict=True))
         # as if all had been drawn from the mixture of all rounds' proposals
-        size = np.array([len(s.keys) for _, s in drawn], float)
-        weight = 1.0 / sum(n / p.weights(total, count) for n, (p, _) in zip(size / size.sum(), drawn, strict=True))
+        sizes = np.array([len(batch.keys) for _, batch in history], float)
+        weight = 1.0 / sum(
+            fraction / round_proposal.weights(total, count)
+            for fraction, (round_proposal, _) in zip(sizes / sizes.sum(), history, strict=True)
+        )
         # few episodes must not decide alone
         weight = np.minimum(weight, 10.0 * weight.mean())
     return proposal.spread()
@@ -171,21 +177,23 @@ def _fit(
     defence: float,
     shrink: float,
 ) -> Proposal:
-    """The mixture of moved processes under which weighted episodes are likeliest: expectation and maximisation."""
+    """Fit the mixture that maximises the likelihood of weighted episodes, by expectation maximisation."""
     weight = weight / weight.sum()
-    size = 1.0 / float((weight**2).sum())  # episodes of equal weight that would say as much
-    start = random.choice(len(weight), components, p=weight)
-    means = 0.3 * total[start] / np.maximum(count[start], 1.0)
-    share = np.full(components, 1.0 / components)
+    effective_size = 1.0 / float((weight**2).sum())  # episodes of equal weight that would say as much
+    seeds = random.choice(len(weight), components, p=weight)
+    means = 0.3 * total[seeds] / np.maximum(count[seeds], 1.0)
+    shares = np.full(components, 1.0 / components)
     for _ in range(30):
-        logs = np.log(share) + Proposal(share, means).log_ratios(total, count)
-        logs -= logs.max(axis=1, keepdims=True)
-        belongs = np.exp(logs)
-        belongs *= (size * weight / belongs.sum(axis=1))[:, None]
-        means = (belongs.T @ total) / (belongs.T @ count + shrink)
-        share = np.maximum(belongs.sum(axis=0) / size, 1e-3)
-        share /= share.sum()
-    return Proposal(np.concatenate([[defence], (1.0 - defence) * share]), means)
+        log_shares = np.log(shares) + Proposal(shares, means).log_ratios(total, count)
+        # The log-sum-exp shift: only ratios of the components matter.
+        log_shares -= log_shares.max(axis=1, keepdims=True)
+        responsibilities = np.exp(log_shares)
+        responsibilities *= (effective_size * weight / responsibilities.sum(axis=1))[:, None]
+        means = (responsibilities.T @ total) / (responsibilities.T @ count + shrink)
+        # A component of share 0 could never recover, since its log would be minus infinity.
+        shares = np.maximum(responsibilities.sum(axis=0) / effective_size, 1e-3)
+        shares /= shares.sum()
+    return Proposal(np.concatenate([[defence], (1.0 - defence) * shares]), means)
 
 
 def importance(
@@ -195,17 +203,19 @@ def importance(
 
     Args:
         process: The process.
-        proposal: What to draw from.
-        random: Source of chance.
-        episodes: How many, in whole batches.
-        training: Agent-steps that learning the proposal took; they count.
+        proposal: Distribution to draw from.
+        random: Source of randomness.
+        episodes: Minimum number, in whole batches.
+        training: Agent-steps spent on learning the proposal; they count as work.
 
     Returns:
         The estimate, and its episodes.
     """
-    before = process.work()
-    drawn = sample(process, proposal, random, episodes=episodes)
-    values = np.where(drawn.failed, drawn.weight, 0.0)
-    work = process.work() - before + training
-    most = 1.0 / float(proposal.share[0])
-    return weighted_estimate(values, "importance sampling", most=most, work=work, training=training), drawn
+    initial_work = process.work()
+    episodes_drawn = sample(process, proposal, random, episodes=episodes)
+    values = np.where(episodes_drawn.failed, episodes_drawn.weight, 0.0)
+    work = process.work() - initial_work + training
+    max_weight = 1.0 / float(proposal.share[0])
+    return weighted_estimate(
+        values, "importance sampling", most=max_weight, work=work, training=training
+    ), episodes_drawn

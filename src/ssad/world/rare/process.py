@@ -1,4 +1,4 @@
-"""What the estimators run: many episodes side by side, with chance in them, and how near each is to failure."""
+"""Processes that the estimators run: parallel random episodes, each with a score of its closeness to failure."""
 
 from __future__ import annotations
 
@@ -35,28 +35,31 @@ class Process(Protocol):
     width: int
 
     def reset(self, keys: Keys) -> None:
-        """Start all rows again, with these keys [B] and means that are not moved."""
+        """Restart all rows with these keys [B], without shifted means."""
 
     def step(self) -> None:
         """Advance every row that has not ended."""
 
     def running(self) -> Bool:
-        """[B] which rows have not ended."""
+        """Return the mask of rows that have not ended, [B]."""
 
     def score(self) -> F64:
-        """[B] how near each is to failure now, from 0 to 1; exactly 1 where it has failed, and only there."""
+        """Return the closeness of each row to failure, [B], in [0, 1]; 1 where it has failed, and only there."""
 
     def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Everything that changes, [B, ...]; what is kept must be copied."""
+        """Return everything that changes, [B, ...]; copy the arrays to keep them."""
 
     def put(self, rows: Rows, states: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Put rows into states of `snapshot`, [n, ...]."""
+        """Set rows to states of `snapshot`, [n, ...]."""
 
     def rekey(self, rows: Rows, keys: Keys) -> None:
-        """Give rows another future."""
+        """Give rows an independent future."""
 
     def push(self, means: F64) -> None:
-        """Move the means of the normal numbers of each row, [B, D]: those of a group of steps, agent and kind alike."""
+        """Shift the means of the normal numbers of each row, [B, D].
+
+        One shift applies to all numbers of one group of steps, one agent and one kind.
+        """
 
     def later(self, means: F64) -> F64:
         """[M, D] means that do at M later times what means [D] do from the start; M is 0 where there is no such time.
@@ -65,20 +68,20 @@ class Process(Protocol):
         """
 
     def totals(self) -> tuple[F64, F64]:
-        """Sums of the normal numbers so far as they were used, and how many they are, both [B, D]."""
+        """Return the sums of the normal numbers used so far, and their counts, both [B, D]."""
 
     def work(self) -> float:
-        """What has been simulated so far, in agent-steps."""
+        """Return the amount simulated so far, in agent-steps."""
 
 
 class WorldProcess:
-    """A world with noise, and drivers in it, as a `Process`: failure is a collision of the ego.
+    """A world with noise and its drivers as a `Process`; failure is a collision of the ego.
 
-    The drivers must not remember anything themselves (what runs inside the world, and learned policies, do not).
+    Drivers must be stateless: drivers that run inside the world and learned policies are.
     """
 
     def __init__(self, loop: Loop) -> None:
-        """Take a loop over a world. ConfigError: the world has no noise, or a driver is none of this kind."""
+        """Wrap a loop over a world. ConfigError: the world has no noise, or a driver is not supported."""
         world = loop.simulator
         if not isinstance(world, World) or world.chance is None:
             raise ConfigError("how often a driver fails needs chance: a World with noise")
@@ -88,7 +91,8 @@ class WorldProcess:
         self.loop, self.world, self.noise = loop, world, world.chance
         self.batch = world.batch
         self.steps = max(
-            min(int(e.limits.max_steps), int(np.ceil(e.limits.max_time / world.dt))) for e in world.episodes
+            min(int(episode.limits.max_steps), int(np.ceil(episode.limits.max_time / world.dt)))
+            for episode in world.episodes
         )
         self._used = used_numbers(world)
         self.width = int(self._used.sum())
@@ -97,7 +101,7 @@ class WorldProcess:
         self._pushed = self._recorded = False
 
     def reset(self, keys: Keys) -> None:
-        """Start all rows again."""
+        """Restart all rows."""
         self.loop.reset()
         self.world.rekey(keys)
         if self._pushed:
@@ -115,7 +119,7 @@ class WorldProcess:
             self.loop.step()
 
     def run(self) -> Bool:
-        """Advance all rows, which have just been reset, to their ends (on CUDA with one launch); [B] who has failed."""
+        """Run all rows, which have just been reset, to their ends (one launch on CUDA); return the failures [B]."""
         if self.world.device == "cpu" or not self._inside:
             while self.running().any():
                 self.step()
@@ -127,89 +131,91 @@ class WorldProcess:
                 self.world.step()
             self.world.capture(steps=self.steps)
             self._recorded = True
-        # who leaves before the end is counted on
+        # Agents that leave before the end count as well.
         self._work += float((self.world.array("step") * self._there()).sum())
         return self.failed()
 
     def _there(self) -> npt.NDArray[np.int64]:
-        kinds = np.array([sum(1 for _ in e.agents) for e in self.world.episodes])
-        return np.asarray(kinds[self.world.array("episode")])
+        counts = np.array([sum(1 for _ in episode.agents) for episode in self.world.episodes])
+        return np.asarray(counts[self.world.array("episode")])
 
     def running(self) -> Bool:
-        """[B] which rows have not ended."""
+        """Return the mask of rows that have not ended, [B]."""
         return np.asarray(self.world.ended() == End.RUNNING)
 
     def failed(self) -> Bool:
-        """[B] which egos have collided."""
+        """Return the mask of egos that have collided, [B]."""
         return np.asarray(self.world.ended() == End.COLLISION)
 
     def score(self) -> F64:
-        """[B] closeness of the nearest danger; 1: collision."""
+        """Return the closeness of the most critical agent, [B]; 1: collision."""
         return np.where(self.failed(), 1.0, np.minimum(closeness(self.world.state()), 0.999))
 
     def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Everything that changes but the keys and the means; on CPU views."""
-        names = [n for n in self.world.names if n not in ("noise.key", "noise.push")]
+        """Return everything that changes except the keys and the means; views on CPU."""
+        names = [array_name for array_name in self.world.names if array_name not in ("noise.key", "noise.push")]
         return {name: self.world.array(name) for name in names}
 
     def put(self, rows: Rows, states: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Put rows into states of `snapshot`."""
+        """Set rows to states of `snapshot`."""
         for name, value in states.items():
-            array = self.world.array(name)
-            array[rows] = value
+            current = self.world.array(name)
+            current[rows] = value
             if self.world.device != "cpu":
-                self.world.put(name, array)
+                self.world.put(name, current)
 
     def rekey(self, rows: Rows, keys: Keys) -> None:
-        """Give rows another future."""
+        """Give rows an independent future."""
         self.world.rekey(keys, rows)
 
     def push(self, means: F64) -> None:
-        """Move the means of the normal numbers of each row."""
-        push = np.zeros(self.world.array("noise.push").shape, np.float32)
-        push[:, self._used] = means
-        self.world.put("noise.push", push)
+        """Shift the means of the normal numbers of each row."""
+        shifts = np.zeros(self.world.array("noise.push").shape, np.float32)
+        shifts[:, self._used] = means
+        self.world.put("noise.push", shifts)
         self._pushed = True
 
     def later(self, means: F64) -> F64:
-        """[M, D] copies that begin 1, 2, ... stretches later than means [D].
+        """Return [M, D] copies that begin 1, 2, ... stretches later than means [D].
 
-        Stretch s of a copy that begins k later is moved as stretch s - k of the original. What the first step moves,
-        where processes begin, the stretch before the shifted ones makes up for: at its end they are as far from 0.
-        A last stretch that goes on for longer than the others is not moved.
+        Stretch s of a copy delayed by k is shifted as stretch s - k of the original. The shift of the first step,
+        where processes begin, is reproduced by the stretch before the delayed ones: at its end they are as far from
+        0. A last stretch that is longer than the others is not shifted.
         """
-        number, length = self.noise.stretches, self.noise.stretch
-        full = np.zeros((max(number - 2, 0), *self._used.shape))
-        one = np.zeros(self._used.shape)
-        one[self._used] = means
-        keep = np.exp(-self.world.dt / np.array([self.noise.accel_time, self.noise.choice_time]))
+        stretch_count, length = self.noise.stretches, self.noise.stretch
+        copies = np.zeros((max(stretch_count - 2, 0), *self._used.shape))
+        original = np.zeros(self._used.shape)
+        original[self._used] = means
+        memory = np.exp(-self.world.dt / np.array([self.noise.accel_time, self.noise.choice_time]))
         # by how much a stretch whose means are moved by 1 moves the process at its end; one that hardly forgets cannot
-        gain = np.sqrt(1.0 - keep**2) * (keep ** np.arange(length)[:, None]).sum(axis=0)
-        start = np.divide(one[:, 0], gain, out=np.zeros_like(one[:, 0]), where=gain > _LEAST_GAIN)
-        for by in range(1, number - 1):
-            full[by - 1, :, by] = start
-            full[by - 1, :, by + 1 :] = one[:, 1 : number - by]
-        if self.steps > 1 + length * (number - 1):
-            full[:, :, -1] = 0.0
-        return full[:, self._used]
+        end_gain = np.sqrt(1.0 - memory**2) * (memory ** np.arange(length)[:, None]).sum(axis=0)
+        compensation = np.divide(
+            original[:, 0], end_gain, out=np.zeros_like(original[:, 0]), where=end_gain > _LEAST_GAIN
+        )
+        for delay in range(1, stretch_count - 1):
+            copies[delay - 1, :, delay] = compensation
+            copies[delay - 1, :, delay + 1 :] = original[:, 1 : stretch_count - delay]
+        if self.steps > 1 + length * (stretch_count - 1):
+            copies[:, :, -1] = 0.0
+        return copies[:, self._used]
 
     def totals(self) -> tuple[F64, F64]:
-        """Sums of the normal numbers and how many they are."""
-        total = self.world.array("noise.total").astype(np.float64)
-        step, number = self.world.array("step")[:, None], np.arange(self.noise.stretches)
-        first = np.where(number > 0, 1 + self.noise.stretch * (number - 1), 0)
-        end = np.append(first[1:], 1 << 30)
-        count = np.clip(step - first, 0, end - first).astype(np.float64)
-        full = np.broadcast_to(count[:, None, :, None], total.shape)
-        return total[:, self._used], full[:, self._used]
+        """Return the sums of the normal numbers and their counts."""
+        sums = self.world.array("noise.total").astype(np.float64)
+        step, stretch_index = self.world.array("step")[:, None], np.arange(self.noise.stretches)
+        first_step = np.where(stretch_index > 0, 1 + self.noise.stretch * (stretch_index - 1), 0)
+        last_step = np.append(first_step[1:], 1 << 30)
+        count = np.clip(step - first_step, 0, last_step - first_step).astype(np.float64)
+        counts = np.broadcast_to(count[:, None, :, None], sums.shape)
+        return sums[:, self._used], counts[:, self._used]
 
     def work(self) -> float:
-        """Agent-steps so far."""
+        """Return the number of agent-steps so far."""
         return self._work
 
 
 class Told(World):
-    """A world of one scene whose future is told: from which step on which key, and by how much means are moved."""
+    """World of one scene that replays a given future: keys by step, and shifted means."""
 
     def __init__(
         self,
@@ -221,16 +227,16 @@ class Told(World):
         device: str,
         noise: Noise,
     ) -> None:
-        """Take keys by step, and the means of `Process.push` (none: not moved)."""
+        """Take keys by step, and the means of `Process.push` (none: not shifted)."""
         self._keys = keys
         super().__init__(episodes, graphs, device=device, noise=noise)
         if means:
-            push = np.zeros(self.array("noise.push").shape, np.float32)
-            push[:, used_numbers(self)] = means
-            self.put("noise.push", push)
+            shifts = np.zeros(self.array("noise.push").shape, np.float32)
+            shifts[:, used_numbers(self)] = means
+            self.put("noise.push", shifts)
 
     def step(self, controls: npt.ArrayLike | None = None) -> None:
-        """Advance by one step, with the key of that step."""
+        """Advance by one step with the key of that step."""
         key = self._keys.get(int(self.array("step")[0]))
         if key is not None:
             self.rekey(np.array([key], np.uint64))
@@ -238,43 +244,46 @@ class Told(World):
 
 
 def used_numbers(world: World) -> Bool:
-    """Which sums of normal numbers [A, L, 2] anything can hang on: the others have no business in a proposal."""
+    """Return the sums of normal numbers [A, L, 2] that influence anything; the others have no place in a proposal."""
     noise = world.chance
     assert noise is not None
     used = np.zeros((world.agents, noise.stretches, 2), bool)
+    # The ego's acceleration is never perturbed; only its lapses are random.
     used[0, :, 1] = noise.lapse > 0.0
     used[1:, :, 0], used[1:, :, 1] = noise.accel > 0.0, noise.careless > 0.0
     return used
 
 
 def closeness(state: WorldState) -> F64:
-    """How near each ego is to a collision, [B] in [0, 1).
+    """Return the closeness of each ego to a collision, [B] in [0, 1): the maximum over the other agents.
 
-    For each other agent whose path the ego's crosses: a / (a + 8 m/s^2), where a is how hard the one behind would have
-    to brake if the one in front now stopped with 8 m/s^2; or, for one beside, 1 / (1 + t), where t is the time in s
-    until the gap between them closes, 0.2 m/s faster than it does. The greatest counts.
+    For each agent whose path the ego's crosses: a / (a + 8 m/s^2), where a is the braking that the rear one needs if
+    the front one stops with 8 m/s^2; or, for one beside, 1 / (1 + t), where t is the time in s until the gap between
+    them closes, 0.2 m/s faster than it does.
     """
     pose = state.pose.astype(np.float64)
-    c, s = np.cos(pose[:, :1, 2]), np.sin(pose[:, :1, 2])
-    turn = pose[..., 2] - pose[:, :1, 2]
-    own, along, aside = state.speed[:, :1], state.speed * np.cos(turn), state.speed * np.sin(turn)
-    d = pose[..., :2] - pose[:, :1, :2]
-    dx, dy = c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]
+    ego_cos, ego_sin = np.cos(pose[:, :1, 2]), np.sin(pose[:, :1, 2])
+    relative_yaw = pose[..., 2] - pose[:, :1, 2]
+    ego_speed, along, aside = state.speed[:, :1], state.speed * np.cos(relative_yaw), state.speed * np.sin(relative_yaw)
+    offset = pose[..., :2] - pose[:, :1, :2]
+    dx, dy = ego_cos * offset[..., 0] + ego_sin * offset[..., 1], ego_cos * offset[..., 1] - ego_sin * offset[..., 0]
     half = 0.5 * state.size.astype(np.float64)
-    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    gap = np.abs(dx) - (half[:, :1, 0] + half[..., 0] * cos + half[..., 1] * sin)
-    room = np.abs(dy) - (half[:, :1, 1] + half[..., 0] * sin + half[..., 1] * cos)
-    others = state.active.copy()
-    others[:, 0] = False
+    cos, sin = np.abs(np.cos(relative_yaw)), np.abs(np.sin(relative_yaw))
+    longitudinal_gap = np.abs(dx) - (half[:, :1, 0] + half[..., 0] * cos + half[..., 1] * sin)
+    lateral_gap = np.abs(dy) - (half[:, :1, 1] + half[..., 0] * sin + half[..., 1] * cos)
+    candidates = state.active.copy()
+    candidates[:, 0] = False
 
-    behind, front = np.where(dx > 0.0, own, along), np.where(dx > 0.0, along, own)
-    stops = front * np.abs(front) / (2.0 * _HARD)  # negative where it comes towards the other
-    brake = np.maximum(behind, 0.0) ** 2 / (2.0 * np.maximum(gap + stops, 0.1))
-    soon = np.maximum(gap, 0.0) / np.maximum(behind - front, 1.0)
-    meets = np.abs(dy + aside * np.minimum(soon, 2.0)) < np.abs(dy) - room
-    follows = np.where(others & (gap > 0.0) & meets, brake / (brake + _HARD), 0.0)
+    behind, front = np.where(dx > 0.0, ego_speed, along), np.where(dx > 0.0, along, ego_speed)
+    stopping_distance = front * np.abs(front) / (2.0 * _HARD)  # negative where it comes towards the other
+    needed_braking = np.maximum(behind, 0.0) ** 2 / (2.0 * np.maximum(longitudinal_gap + stopping_distance, 0.1))
+    time_to_close = np.maximum(longitudinal_gap, 0.0) / np.maximum(behind - front, 1.0)
+    paths_cross = np.abs(dy + aside * np.minimum(time_to_close, 2.0)) < np.abs(dy) - lateral_gap
+    following_risk = np.where(
+        candidates & (longitudinal_gap > 0.0) & paths_cross, needed_braking / (needed_braking + _HARD), 0.0
+    )
 
-    time = np.maximum(room, 0.0) / (np.maximum(-aside * np.sign(dy), 0.0) + 0.2)
-    meets = np.abs(dx + (along - own) * np.minimum(time, 2.0)) < np.abs(dx) - gap
-    beside = np.where(others & (room > 0.0) & meets, 1.0 / (1.0 + time), 0.0)
-    return np.asarray(np.maximum(follows, beside).max(axis=1))
+    lateral_time = np.maximum(lateral_gap, 0.0) / (np.maximum(-aside * np.sign(dy), 0.0) + 0.2)
+    paths_cross = np.abs(dx + (along - ego_speed) * np.minimum(lateral_time, 2.0)) < np.abs(dx) - longitudinal_gap
+    side_risk = np.where(candidates & (lateral_gap > 0.0) & paths_cross, 1.0 / (1.0 + lateral_time), 0.0)
+    return np.asarray(np.maximum(following_risk, side_risk).max(axis=1))

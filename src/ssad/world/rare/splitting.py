@@ -1,12 +1,12 @@
-"""Adaptive multilevel splitting: episodes that come nearest to failure are branched, again and again.
+"""Adaptive multilevel splitting: episodes that come nearest to failure are branched repeatedly.
 
-Of N particles those with the least greatest score are given up, ties included, and each is replaced by a copy of one of
-the others from the first moment that this was beyond that level, with a future of its own. The product of the shares
-that survive, times the share that fails in the end, has the failure probability as its mean for any N, score and number
-of particles given up.
+Of N particles, those with the smallest maximum score are discarded, ties included. Each is replaced by a copy of a
+survivor from the first moment at which that one exceeded the level, with an independent future. The product of the
+surviving shares, times the share that fails in the end, is an unbiased estimate of the failure probability for any N,
+score and number of discarded particles.
 
-Source: Cerou and Guyader, "Adaptive multilevel splitting for rare event analysis" (2007); Brehier et al., "Unbiasedness
-of some generalized adaptive multilevel splitting algorithms" (2016).
+Source: Cerou and Guyader, "Adaptive multilevel splitting for rare event analysis" (2007); Brehier et al.,
+"Unbiasedness of some generalized adaptive multilevel splitting algorithms" (2016).
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from ssad.world.rare.process import Process
 
 @dataclass(frozen=True)
 class Splitting:
-    """What splitting found.
+    """Result of splitting.
 
     Attributes:
         estimates: [R] one for each independent repeat.
-        levels: [R] how often particles were given up.
-        failed: [B] which particles have failed in the end.
-        keys: [T, B] the key of each particle's future at each step: by them it can be run again.
+        levels: [R] number of levels at which particles were discarded.
+        failed: [B] mask of the particles that have failed in the end.
+        keys: [T, B] key of each particle's future at each step; they suffice to replay it.
         work: [R] agent-steps of each repeat (exact if rows have the same number of agents, else shared out by steps).
-        episodes: Particles that were run, copies included.
+        episodes: Number of particles run, copies included.
     """
 
     estimates: F64
@@ -46,7 +46,7 @@ class Splitting:
     episodes: int
 
     def estimate(self) -> RareEstimate:
-        """The mean of the repeats with its interval, which needs at least 8 of them."""
+        """Return the mean of the repeats with its interval, which needs at least 8 of them."""
         events = int(self.failed.sum())
         return repeated_estimate(
             self.estimates.tolist(), "splitting", episodes=self.episodes, events=events, work=float(self.work.sum())
@@ -54,50 +54,53 @@ class Splitting:
 
 
 class _History:
-    """Every particle's path: states, greatest score so far and keys at each of its steps."""
+    """Path of every particle: states, maximum score so far and keys at each of its steps."""
 
     def __init__(self, process: Process, keys: Keys) -> None:
         self.process, self.rows = process, np.arange(process.batch)
         states = process.snapshot()
-        self.states = {k: np.zeros((process.steps + 1, *v.shape), v.dtype) for k, v in states.items()}
+        self.states = {
+            name: np.zeros((process.steps + 1, *values.shape), values.dtype) for name, values in states.items()
+        }
         self.best = np.zeros((process.steps + 1, process.batch))
+        # A particle can be replayed from its keys alone, so they are kept for every step.
         self.keys = np.tile(keys, (process.steps + 1, 1))
         self.now = np.zeros(process.batch, np.int64)
         self.taken = np.zeros(process.batch)  # steps taken, of all lives
         self._keep(self.rows, np.full(process.batch, -np.inf))
 
     def _keep(self, rows: npt.NDArray[np.intp], before: F64) -> None:
-        at = self.now[rows]
+        steps = self.now[rows]
         for name, value in self.process.snapshot().items():
-            self.states[name][at, rows] = value[rows]
-        self.best[at, rows] = np.maximum(before, self.process.score()[rows])
+            self.states[name][steps, rows] = value[rows]
+        self.best[steps, rows] = np.maximum(before, self.process.score()[rows])
 
     def finish(self) -> None:
-        """Run all that have not ended."""
-        while (going := self.process.running()).any():
-            rows = np.flatnonzero(going)
-            before = self.best[self.now[rows], rows]
+        """Run all particles that have not ended."""
+        while (running := self.process.running()).any():
+            rows = np.flatnonzero(running)
+            previous_best = self.best[self.now[rows], rows]
             self.process.step()
             self.now[rows] += 1
             self.taken[rows] += 1
-            self._keep(rows, before)
+            self._keep(rows, previous_best)
 
     def final(self) -> F64:
-        """[B] greatest score of each."""
+        """Return the maximum score of each particle, [B]."""
         return self.best[self.now, self.rows]
 
     def branch(self, rows: npt.NDArray[np.intp], parents: npt.NDArray[np.intp], level: F64, *, keys: Keys) -> None:
-        """Replace rows by copies of others from the first step at which these were beyond `level`, with new keys."""
+        """Replace rows by copies of others from the first step at which these exceeded `level`, with new keys."""
         times = np.arange(len(self.best))[:, None]
         beyond = (self.best[:, parents] > level) & (times <= self.now[parents])
-        first = beyond.argmax(axis=0)
-        until = int(first.max()) + 1
+        branch_steps = beyond.argmax(axis=0)
+        copied_steps = int(branch_steps.max()) + 1
         for array in (self.best, self.keys, *self.states.values()):
-            array[:until, rows] = array[:until, parents]
-        later = times >= first
+            array[:copied_steps, rows] = array[:copied_steps, parents]
+        later = times >= branch_steps
         self.keys[:, rows] = np.where(later, keys, self.keys[:, rows])
-        self.now[rows] = first
-        self.process.put(rows, {name: value[first, parents] for name, value in self.states.items()})
+        self.now[rows] = branch_steps
+        self.process.put(rows, {name: value[branch_steps, parents] for name, value in self.states.items()})
         self.process.rekey(rows, keys)
 
 
@@ -108,52 +111,52 @@ def splitting(
 
     Args:
         process: The process; each repeat has batch / repeats of its rows as particles.
-        random: Where keys and the choice of parents come from.
+        random: Source of the keys and of the choice of parents.
         repeats: Independent runs, side by side.
-        kill: Share of the particles that is given up at each level, at least one.
-        levels: Levels after which it stops; what has not failed by then counts as not failing.
+        kill: Share of the particles that is discarded at each level, at least one.
+        levels: Maximum number of levels; particles that have not failed by then count as not failing.
 
     Returns:
         The estimates.
     """
-    count = process.batch // repeats
-    if count * repeats != process.batch or count < 2:
+    particles = process.batch // repeats
+    if particles * repeats != process.batch or particles < 2:
         raise ValueError(f"{process.batch} rows do not make {repeats} repeats of two particles or more")
-    worst = max(1, int(kill * count))
-    before = process.work()
+    discarded = max(1, int(kill * particles))
+    initial_work = process.work()
     keys = draw_keys(random, process.batch)
     process.reset(keys)
     history = _History(process, keys)
     history.finish()
-    share, passed = np.ones(repeats), np.zeros(repeats, np.int64)
-    born = process.batch
+    survival, passed_levels = np.ones(repeats), np.zeros(repeats, np.int64)
+    particle_count = process.batch
     for _ in range(levels):
-        final = history.final().reshape(repeats, count)
-        level = np.sort(final, axis=1)[:, worst - 1]
-        dies = (final <= level[:, None]) & (level < 1.0)[:, None] & (share > 0.0)[:, None]
-        share *= 1.0 - dies.mean(axis=1)
-        dies &= (share > 0.0)[:, None]  # where all died at once the estimate is 0
-        passed += dies.any(axis=1)
-        rows = np.flatnonzero(dies)
-        if not len(rows):
+        best_scores = history.final().reshape(repeats, particles)
+        thresholds = np.sort(best_scores, axis=1)[:, discarded - 1]
+        dying = (best_scores <= thresholds[:, None]) & (thresholds < 1.0)[:, None] & (survival > 0.0)[:, None]
+        survival *= 1.0 - dying.mean(axis=1)
+        dying &= (survival > 0.0)[:, None]  # where all died at once the estimate is 0
+        passed_levels += dying.any(axis=1)
+        replaced = np.flatnonzero(dying)
+        if not len(replaced):
             break
         # a parent for each, uniformly among its repeat's survivors
-        alive = ~dies
-        order = np.argsort(~alive, axis=1, kind="stable")
-        own = rows // count
-        pick = (random.random(len(rows)) * alive.sum(axis=1)[own]).astype(np.int64)
-        parents = own * count + order[own, pick]
-        history.branch(rows, parents, level[own], keys=draw_keys(random, len(rows)))
-        born += len(rows)
+        alive = ~dying
+        survivors_first = np.argsort(~alive, axis=1, kind="stable")
+        repeat_index = replaced // particles
+        choice = (random.random(len(replaced)) * alive.sum(axis=1)[repeat_index]).astype(np.int64)
+        parents = repeat_index * particles + survivors_first[repeat_index, choice]
+        history.branch(replaced, parents, thresholds[repeat_index], keys=draw_keys(random, len(replaced)))
+        particle_count += len(replaced)
         history.finish()
     failed = history.final() >= 1.0
-    estimates = share * failed.reshape(repeats, count).mean(axis=1)
-    work = (process.work() - before) * history.taken.reshape(repeats, count).sum(axis=1) / history.taken.sum()
-    return Splitting(estimates, passed, failed, history.keys, work, born)
+    estimates = survival * failed.reshape(repeats, particles).mean(axis=1)
+    work = (process.work() - initial_work) * history.taken.reshape(repeats, particles).sum(axis=1) / history.taken.sum()
+    return Splitting(estimates, passed_levels, failed, history.keys, work, particle_count)
 
 
 def keys_of(found: Splitting, row: int) -> Mapping[int, int]:
     """From which step on a particle had which key: what it takes to run it again."""
-    column: Any = found.keys[:, row]
-    changes = [0, *(np.flatnonzero(column[1:] != column[:-1]) + 1).tolist()]
-    return {int(step): int(column[step]) for step in changes}
+    row_keys: Any = found.keys[:, row]
+    changes = [0, *(np.flatnonzero(row_keys[1:] != row_keys[:-1]) + 1).tolist()]
+    return {int(step): int(row_keys[step]) for step in changes}

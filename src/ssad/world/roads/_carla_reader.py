@@ -1,6 +1,6 @@
-"""Run by `bake` in a process of its own, because carla's C++ may abort: samples lanes with carla.Map.
+"""Sampling of lanes with carla.Map; `bake` runs it in a process of its own, because carla's C++ may abort.
 
-`python -m ssad.world.roads._carla_reader MAP.xodr REQUEST.npz ANSWER.npz`. Request: road, lane [L] ids, s0, s1 [L]
+`python -m ssad.roads._carla_reader MAP.xodr REQUEST.npz ANSWER.npz`. Request: road, lane [L] ids, s0, s1 [L]
 m. Answer in OpenDRIVE's right-handed frame: count [L]; table [P, 6]: s, x, y, z, yaw (along the traffic), width;
 crosswalk [., 3]: number, x, y; light_id [S], light [S, 3]: x, y, yaw.
 """
@@ -17,7 +17,7 @@ NUDGE = 1e-3  # m, so that a sample belongs to its own section
 
 
 def main(source: str, request: str, answer: str) -> int:
-    """Sample the lanes; exit code 3: carla refused the map, with its reason as the last line of stderr."""
+    """Sample the lanes. Exit code 3: carla refused the map; the last line of stderr holds its reason."""
     import carla
 
     try:
@@ -25,40 +25,43 @@ def main(source: str, request: str, answer: str) -> int:
     except RuntimeError as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 3
-    with np.load(request) as data:
-        wanted = list(zip(*(data[name].tolist() for name in ("road", "lane", "s0", "s1")), strict=True))
-    rows: list[tuple[float, ...]] = []
-    count = []
-    for road, lane, s0, s1 in wanted:
-        before = len(rows)
+    with np.load(request) as archive:
+        lanes = list(zip(*(archive[name].tolist() for name in ("road", "lane", "s0", "s1")), strict=True))
+    sample_rows: list[tuple[float, ...]] = []
+    sample_counts = []
+    for road, lane, s0, s1 in lanes:
+        first_row = len(sample_rows)
         pieces = max(1, int(np.ceil((s1 - s0) / STEP)))
-        for s in np.linspace(s0 + NUDGE, s1 - NUDGE, pieces + 1).tolist() if s1 - s0 > 4 * NUDGE else ():
-            point = road_map.get_waypoint_xodr(road, lane, s)
-            if point is None:
+        for position in np.linspace(s0 + NUDGE, s1 - NUDGE, pieces + 1).tolist() if s1 - s0 > 4 * NUDGE else ():
+            waypoint = road_map.get_waypoint_xodr(road, lane, position)
+            if waypoint is None:
                 continue
-            place = point.transform
+            transform = waypoint.transform
             # CARLA's frame is left-handed: y and yaw change sign
-            at, yaw = place.location, -np.radians(place.rotation.yaw)
-            rows.append((s, at.x, -at.y, at.z, yaw, point.lane_width))
-        count.append(len(rows) - before)
-    table = np.array(rows, np.float64).reshape(-1, 6)
+            location, yaw = transform.location, -np.radians(transform.rotation.yaw)
+            sample_rows.append((position, location.x, -location.y, location.z, yaw, waypoint.lane_width))
+        sample_counts.append(len(sample_rows) - first_row)
+    table = np.array(sample_rows, np.float64).reshape(-1, 6)
     crosswalk = []
-    number, first = 0, None
+    crosswalk_number, first_corner = 0, None
     for corner in road_map.get_crosswalks():
-        here = (corner.x, -corner.y)
-        if first is None:
-            first = here
-        elif np.hypot(here[0] - first[0], here[1] - first[1]) < 1e-3:
-            number, first = number + 1, None
+        corner_point = (corner.x, -corner.y)
+        if first_corner is None:
+            first_corner = corner_point
+        # Each crosswalk ends with its first corner again; the list has no other separator.
+        elif np.hypot(corner_point[0] - first_corner[0], corner_point[1] - first_corner[1]) < 1e-3:
+            crosswalk_number, first_corner = crosswalk_number + 1, None
             continue
-        crosswalk.append((number, *here))
+        crosswalk.append((crosswalk_number, *corner_point))
     lights: dict[str, tuple[float, float, float]] = {}
-    for mark in road_map.get_all_landmarks():
-        place = mark.transform
-        lights.setdefault(mark.id, (place.location.x, -place.location.y, -float(np.radians(place.rotation.yaw))))
+    for landmark in road_map.get_all_landmarks():
+        transform = landmark.transform
+        lights.setdefault(
+            landmark.id, (transform.location.x, -transform.location.y, -float(np.radians(transform.rotation.yaw)))
+        )
     np.savez(
         answer,
-        count=np.array(count, np.int64),
+        count=np.array(sample_counts, np.int64),
         table=table,
         crosswalk=np.array(crosswalk, np.float64).reshape(-1, 3),
         light_id=np.array(list(lights), np.str_),

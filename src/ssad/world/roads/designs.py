@@ -1,4 +1,4 @@
-"""The towns that ship with SSAD, as code, and their OpenDRIVE; `benchmarks/make_towns.py` bakes them."""
+"""Towns that ship with SSAD, defined in code, and their OpenDRIVE; `benchmarks/make_towns.py` bakes them."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from ssad.world.roads.writer_parts import Interchange, Point, RoadSpec, Roundabo
 
 
 def _chain(stops: list[Point], make: Callable[[tuple[Point, ...]], RoadSpec]) -> list[RoadSpec]:
-    """Streets from stop to stop."""
-    return [make((a, b)) for a, b in pairwise(stops)]
+    """Return streets between consecutive stops."""
+    return [make((start, end)) for start, end in pairwise(stops)]
 
 
 def twinford() -> Town:
-    """Two-lane streets and T-junctions, about 240 x 220 m, in the spirit of CARLA's Town02."""
+    """Return a town of two-lane streets and T-junctions, about 240 x 220 m, in the spirit of CARLA's Town02."""
 
     def street(points: tuple[Point, ...]) -> RoadSpec:
         return RoadSpec(points, lanes=1, width=3.75, shoulder=0.5, sidewalk=3.0, limit=25.0, radius=18.0)
 
-    w, m, e = 0.0, 120.0, 240.0
+    west, middle, east = 0.0, 120.0, 240.0
     streets = [
         # outer loop, cut where an inner street meets it
-        street(((m, 0.0), (w, 0.0), (w, 120.0))),
-        street(((w, 120.0), (w, 220.0), (m, 220.0))),
-        street(((m, 220.0), (e, 220.0), (e, 165.0))),
-        street(((e, 165.0), (e, 60.0))),
-        street(((e, 60.0), (e, 0.0), (m, 0.0))),
-        *_chain([(m, 0.0), (m, 60.0), (m, 120.0), (m, 165.0), (m, 220.0)], street),
-        street(((w, 120.0), (m, 120.0))),
-        street(((m, 60.0), (e, 60.0))),
-        street(((m, 165.0), (e, 165.0))),
+        street(((middle, 0.0), (west, 0.0), (west, 120.0))),
+        street(((west, 120.0), (west, 220.0), (middle, 220.0))),
+        street(((middle, 220.0), (east, 220.0), (east, 165.0))),
+        street(((east, 165.0), (east, 60.0))),
+        street(((east, 60.0), (east, 0.0), (middle, 0.0))),
+        *_chain([(middle, 0.0), (middle, 60.0), (middle, 120.0), (middle, 165.0), (middle, 220.0)], street),
+        street(((west, 120.0), (middle, 120.0))),
+        street(((middle, 60.0), (east, 60.0))),
+        street(((middle, 165.0), (east, 165.0))),
     ]
-    return Town("Twinford", tuple(streets), signalled=((m, 0.0), (m, 120.0), (m, 60.0), (e, 165.0)))
+    return Town("Twinford", tuple(streets), signalled=((middle, 0.0), (middle, 120.0), (middle, 60.0), (east, 165.0)))
 
 
 def crossgate() -> Town:
-    """Streets of 2 + 2 lanes, four signalled crossroads inside an outer ring, 400 x 400 m; like CARLA's Town05."""
+    """Return streets of 2 + 2 lanes: four signalled crossroads in an outer ring, 400 x 400 m; like CARLA's Town05."""
 
     def street(points: tuple[Point, ...]) -> RoadSpec:
         return RoadSpec(points, lanes=2, width=3.5, shoulder=0.5, sidewalk=3.0, limit=35.0, radius=30.0)
@@ -48,27 +48,27 @@ def crossgate() -> Town:
     def ring(points: tuple[Point, ...]) -> RoadSpec:
         return RoadSpec(points, lanes=2, width=3.5, shoulder=1.5, sidewalk=2.0, limit=45.0, radius=40.0)
 
-    size, xs, ys = 400.0, (125.0, 270.0), (140.0, 275.0)
+    size, x_positions, y_positions = 400.0, (125.0, 270.0), (140.0, 275.0)
     streets = [
-        ring(((xs[0], 0.0), (xs[1], 0.0))),
-        ring(((xs[1], 0.0), (size, 0.0), (size, ys[0]))),
-        ring(((size, ys[0]), (size, ys[1]))),
-        ring(((size, ys[1]), (size, size), (xs[1], size))),
-        ring(((xs[1], size), (xs[0], size))),
-        ring(((xs[0], size), (0.0, size), (0.0, ys[1]))),
-        ring(((0.0, ys[1]), (0.0, ys[0]))),
-        ring(((0.0, ys[0]), (0.0, 0.0), (xs[0], 0.0))),
+        ring(((x_positions[0], 0.0), (x_positions[1], 0.0))),
+        ring(((x_positions[1], 0.0), (size, 0.0), (size, y_positions[0]))),
+        ring(((size, y_positions[0]), (size, y_positions[1]))),
+        ring(((size, y_positions[1]), (size, size), (x_positions[1], size))),
+        ring(((x_positions[1], size), (x_positions[0], size))),
+        ring(((x_positions[0], size), (0.0, size), (0.0, y_positions[1]))),
+        ring(((0.0, y_positions[1]), (0.0, y_positions[0]))),
+        ring(((0.0, y_positions[0]), (0.0, 0.0), (x_positions[0], 0.0))),
     ]
-    for x in xs:
-        streets += _chain([(x, 0.0), (x, ys[0]), (x, ys[1]), (x, size)], street)
-    for y in ys:
-        streets += _chain([(0.0, y), (xs[0], y), (xs[1], y), (size, y)], street)
-    inner = tuple((x, y) for x in xs for y in ys)
-    return Town("Crossgate", tuple(streets), signalled=(*inner, (xs[0], 0.0), (size, ys[1])))
+    for x in x_positions:
+        streets += _chain([(x, 0.0), (x, y_positions[0]), (x, y_positions[1]), (x, size)], street)
+    for y in y_positions:
+        streets += _chain([(0.0, y), (x_positions[0], y), (x_positions[1], y), (size, y)], street)
+    inner = tuple((x, y) for x in x_positions for y in y_positions)
+    return Town("Crossgate", tuple(streets), signalled=(*inner, (x_positions[0], 0.0), (size, y_positions[1])))
 
 
 def proving_ground() -> Town:
-    """A grid of 2 + 2 lanes that cross every 200 m, and a country road of 1 + 1 lanes to the east.
+    """Return a grid of 2 + 2 lanes that cross every 200 m, and a country road of 1 + 1 lanes to the east.
 
     Opposing lanes lie side by side. The grid is 600 x 600 m; the country road leaves it at (600, 200), runs 200 m
     straight, bends north, and comes back at (600, 400).
@@ -77,25 +77,29 @@ def proving_ground() -> Town:
     def street(points: tuple[Point, ...]) -> RoadSpec:
         return RoadSpec(points, lanes=2, width=3.5, shoulder=0.5, sidewalk=3.0, limit=40.0, radius=40.0)
 
-    step = (0.0, 200.0, 400.0, 600.0)
-    low, a, b, high = step
+    grid = (0.0, 200.0, 400.0, 600.0)
+    low, inner_low, inner_high, high = grid
     streets = [
-        street(((a, low), (b, low))),
-        street(((b, low), (high, low), (high, a))),
-        street(((high, a), (high, b))),
-        street(((high, b), (high, high), (b, high))),
-        street(((b, high), (a, high))),
-        street(((a, high), (low, high), (low, b))),
-        street(((low, b), (low, a))),
-        street(((low, a), (low, low), (a, low))),
+        street(((inner_low, low), (inner_high, low))),
+        street(((inner_high, low), (high, low), (high, inner_low))),
+        street(((high, inner_low), (high, inner_high))),
+        street(((high, inner_high), (high, high), (inner_high, high))),
+        street(((inner_high, high), (inner_low, high))),
+        street(((inner_low, high), (low, high), (low, inner_high))),
+        street(((low, inner_high), (low, inner_low))),
+        street(((low, inner_low), (low, low), (inner_low, low))),
     ]
-    for at in (a, b):
-        streets += _chain([(at, y) for y in step], street)
-        streets += _chain([(x, at) for x in step], street)
-    country = ((high, a), (high + 260.0, a), (high + 260.0, b), (high, b))
+    for position in (inner_low, inner_high):
+        streets += _chain([(position, y) for y in grid], street)
+        streets += _chain([(x, position) for x in grid], street)
+    country = ((high, inner_low), (high + 260.0, inner_low), (high + 260.0, inner_high), (high, inner_high))
     streets.append(RoadSpec(country, lanes=1, width=3.5, shoulder=1.5, sidewalk=0.0, limit=40.0, radius=40.0))
-    inner = tuple((x, y) for x in (a, b) for y in (a, b))
-    return Town("ProvingGround", tuple(streets), signalled=(*inner, (a, low), (b, high), (high, a), (low, b)))
+    inner = tuple((x, y) for x in (inner_low, inner_high) for y in (inner_low, inner_high))
+    return Town(
+        "ProvingGround",
+        tuple(streets),
+        signalled=(*inner, (inner_low, low), (inner_high, high), (high, inner_low), (low, inner_high)),
+    )
 
 
 def shifted(a: Point, b: Point, *, lead: float, aside: float = 0.0) -> tuple[Point, ...]:
@@ -107,21 +111,24 @@ def shifted(a: Point, b: Point, *, lead: float, aside: float = 0.0) -> tuple[Poi
         lead: From each end to where it turns, m. The axis is that of the longer side.
         aside: How far to the left of the straight way from a to b it is in the middle, m; 0: no point is added there.
     """
-    along = (1.0, 0.0) if abs(b[0] - a[0]) > abs(b[1] - a[1]) else (0.0, 1.0)
-    step = along[0] * (b[0] - a[0]) + along[1] * (b[1] - a[1])
+    axis = (1.0, 0.0) if abs(b[0] - a[0]) > abs(b[1] - a[1]) else (0.0, 1.0)
+    step = axis[0] * (b[0] - a[0]) + axis[1] * (b[1] - a[1])
     if not aside and (abs(b[0] - a[0]) < 1e-9 or abs(b[1] - a[1]) < 1e-9):
         return a, b
-    sign = lead if step > 0.0 else -lead
-    one = (a[0] + sign * along[0], a[1] + sign * along[1])
-    two = (b[0] - sign * along[0], b[1] - sign * along[1])
+    signed_lead = lead if step > 0.0 else -lead
+    first_corner = (a[0] + signed_lead * axis[0], a[1] + signed_lead * axis[1])
+    second_corner = (b[0] - signed_lead * axis[0], b[1] - signed_lead * axis[1])
     if not aside:
-        return a, one, two, b
-    u, v = ((end - start) / math.dist(a, b) for start, end in zip(a, b, strict=True))
-    return a, one, (0.5 * (a[0] + b[0]) - aside * v, 0.5 * (a[1] + b[1]) + aside * u), two, b
+        return a, first_corner, second_corner, b
+    u, v = (
+        (coordinate_end - coordinate_start) / math.dist(a, b)
+        for coordinate_start, coordinate_end in zip(a, b, strict=True)
+    )
+    return a, first_corner, (0.5 * (a[0] + b[0]) - aside * v, 0.5 * (a[1] + b[1]) + aside * u), second_corner, b
 
 
 def oldmarket() -> Town:
-    """Narrow two-lane streets of an old town: short crooked blocks inside a crescent, about 280 x 260 m.
+    """Return an old town of narrow two-lane streets: short crooked blocks inside a crescent, about 280 x 260 m.
 
     Junctions lie off the grid by some metres, so that no street is straight for long. The market is the large block.
     """
@@ -138,7 +145,7 @@ def oldmarket() -> Town:
     middle: list[Point] = [(8.0, 128.0), (84.0, 136.0)]
     upper: list[Point] = [(0.0, 192.0), (78.0, 198.0), (196.0, 190.0), (294.0, 198.0)]
     north: list[Point] = [(86.0, 256.0), (214.0, 260.0)]
-    pairs = [
+    stop_pairs = [
         *pairwise(south),
         *pairwise(lower),
         *pairwise(middle),
@@ -150,7 +157,7 @@ def oldmarket() -> Town:
         (south[1], lower[2]),
         (lower[4], upper[3]),
     ]
-    streets = [street(shifted(a, b, lead=19.0)) for a, b in pairs]
+    streets = [street(shifted(start, end, lead=19.0)) for start, end in stop_pairs]
     streets += [
         crescent((south[0], (lower[0][0], south[0][1]), lower[0])),
         crescent((south[2], (lower[4][0], south[2][1]), lower[4])),
@@ -161,7 +168,7 @@ def oldmarket() -> Town:
 
 
 def larkhill() -> Town:
-    """A suburb of two-lane roads that wind, with T-junctions and cul-de-sacs that end in a loop; 470 x 450 m."""
+    """Return a suburb of winding two-lane roads, with T-junctions and cul-de-sacs that end in a loop; 470 x 450 m."""
 
     def road(*points: Point) -> RoadSpec:
         return RoadSpec(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=1.8, limit=25.0, radius=34.0)
@@ -172,8 +179,15 @@ def larkhill() -> Town:
     def loop(head: Point, ahead: Point, aside: float) -> RoadSpec:
         """A street that leaves `head` sideways, runs round and comes back; ahead: m east and north to its far side."""
         (x, y), (u, v) = head, ahead
-        a, b = (0.0, aside) if u else (aside, 0.0)
-        return close(head, (x + a, y + b), (x + a + u, y + b + v), (x - a + u, y - b + v), (x - a, y - b), head)
+        side_x, side_y = (0.0, aside) if u else (aside, 0.0)
+        return close(
+            head,
+            (x + side_x, y + side_y),
+            (x + side_x + u, y + side_y + v),
+            (x - side_x + u, y - side_y + v),
+            (x - side_x, y - side_y),
+            head,
+        )
 
     south, lane, east = (120.0, 20.0), (245.0, 0.0), (335.0, 12.0)
     west, centre, fork, gate = (20.0, 180.0), (200.0, 160.0), (335.0, 176.0), (450.0, 190.0)
@@ -235,10 +249,11 @@ def ringmere() -> Town:
 
 
 def longreach() -> Town:
-    """A motorway of 2 + 2 lanes, 3 + 3 between its two interchanges, and two-lane streets on both sides; 1,500 x 500 m.
+    """Return a motorway with two interchanges, and two-lane streets on both sides; 1,500 x 500 m.
 
-    The motorway begins and ends at a signalled T-junction. An interchange has a ramp on and a ramp off, which meet the
-    streets at signalled crossroads. The town looks the same when it is turned by half a turn.
+    The motorway has 2 + 2 lanes, 3 + 3 between the interchanges, and begins and ends at a signalled T-junction. An
+    interchange has an entry and an exit ramp, which meet the streets at signalled crossroads. The town is symmetric
+    under a half turn.
     """
 
     def street(*points: Point) -> RoadSpec:
@@ -253,36 +268,37 @@ def longreach() -> Town:
     def turned(point: Point) -> Point:
         return 1500.0 - point[0], 60.0 - point[1]
 
-    end, interchange = (0.0, 0.0), (350.0, 0.0)
-    on, off = (348.0, -9.5), (348.0, 9.5)  # beside the outermost lane of the narrower part
+    motorway_end, interchange = (0.0, 0.0), (350.0, 0.0)
+    entry_ramp, exit_ramp = (348.0, -9.5), (348.0, 9.5)  # beside the outermost lane of the narrower part
     south, north = (150.0, -110.0), (150.0, 110.0)
     mill, mill_end, park, hill = (420.0, -110.0), (420.0, -220.0), (700.0, -110.0), (1000.0, -50.0)
-    far = turned(north)
-    half = [
-        motorway(end, interchange, lanes=2, limit=50.0),
-        ramp(south, (150.0, -50.0), (285.0, -9.5), on),
-        ramp(off, (285.0, 9.5), (150.0, 50.0), north),
-        street(end, (0.0, -110.0), south),
-        street(end, (0.0, 110.0), north),
+    far_street = turned(north)
+    half_town = [
+        motorway(motorway_end, interchange, lanes=2, limit=50.0),
+        ramp(south, (150.0, -50.0), (285.0, -9.5), entry_ramp),
+        ramp(exit_ramp, (285.0, 9.5), (150.0, 50.0), north),
+        street(motorway_end, (0.0, -110.0), south),
+        street(motorway_end, (0.0, 110.0), north),
         street(south, mill),
         street(mill, park),
         street(park, (780.0, -110.0), (920.0, -50.0), hill),
-        street(hill, far),
+        street(hill, far_street),
         street(south, (150.0, -220.0), mill_end),
         street(mill, mill_end),
         street(mill_end, (700.0, -220.0), park),
-        street(hill, (1000.0, -150.0), (1350.0, -150.0), far),
+        street(hill, (1000.0, -150.0), (1350.0, -150.0), far_street),
     ]
     middle = motorway(interchange, (620.0, 0.0), (880.0, 60.0), turned(interchange), lanes=3, limit=60.0)
-    other = [replace(road, points=tuple(turned(point) for point in road.points)) for road in half]
-    lights = (end, south, north)
+    # The other half is the same turned by half a turn about the middle.
+    mirrored_half = [replace(road, points=tuple(turned(point) for point in road.points)) for road in half_town]
+    signalled_places = (motorway_end, south, north)
     return Town(
         "Longreach",
-        (*half, middle, *other),
-        signalled=(*lights, *(turned(place) for place in lights)),
+        (*half_town, middle, *mirrored_half),
+        signalled=(*signalled_places, *(turned(place) for place in signalled_places)),
         interchanges=(
-            Interchange(interchange, on, off),
-            Interchange(turned(interchange), turned(on), turned(off)),
+            Interchange(interchange, entry_ramp, exit_ramp),
+            Interchange(turned(interchange), turned(entry_ramp), turned(exit_ramp)),
         ),
     )
 
@@ -299,7 +315,7 @@ DESIGNS: dict[str, Callable[[], Town]] = {
 
 
 def generate_town(name: str) -> str:
-    """OpenDRIVE 1.4 text of a built-in town. UnknownNameError."""
+    """Return the OpenDRIVE 1.4 text of a built-in town. UnknownNameError."""
     if name not in DESIGNS:
         raise unknown_name("town", name, DESIGNS)
     return write_town(DESIGNS[name]())

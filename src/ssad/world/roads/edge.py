@@ -1,4 +1,4 @@
-"""How far points are from the edge of the road, on a raster around them."""
+"""Distances of points from the edge of the road, on a raster around them."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def edge_raster(query: LaneQuery, held: F64) -> tuple[F64, F64]:
     """
     origin: F64 = np.floor(held.min(0) - MARGIN)
     shape = np.ceil((held.max(0) + MARGIN - origin) / CELL).astype(int) + 1
-    x, y = (origin[k] + CELL * np.arange(shape[k]) for k in (0, 1))
+    x, y = (origin[axis] + CELL * np.arange(shape[axis]) for axis in (0, 1))
     grid = np.stack(np.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
-    off = query.off_road(grid).reshape(shape[1], shape[0])
+    off_road = query.off_road(grid).reshape(shape[1], shape[0])
     # the edge lies half-way between a cell on the road and one off it
-    outside, inside = (distance_transform_edt(mask) for mask in (off, ~off))
-    return CELL * np.where(off, outside - 0.5, 0.5 - inside), origin
+    outside, inside = (distance_transform_edt(mask) for mask in (off_road, ~off_road))
+    return CELL * np.where(off_road, outside - 0.5, 0.5 - inside), origin
 
 
 def edge_distances(query: LaneQuery, points: F64) -> F64:
-    """Signed distances from the edge of the road [n], m, more than 0 off it, of points [n, 2], m; linear in between."""
+    """Return signed distances [n] of points [n, 2] from the road's edge, m, positive off it; linear in between."""
     raster, origin = edge_raster(query, points)
     return np.asarray(map_coordinates(raster, ((points - origin) / CELL).T[::-1], order=1), np.float64)

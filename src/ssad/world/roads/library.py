@@ -1,4 +1,4 @@
-"""Towns by name: those that ship, those the user has imported, or a file."""
+"""Towns by name: built-in, imported, random, or from a file."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "
 
 
 def town_names() -> dict[str, str]:
-    """Name -> "built-in", or the path of an imported town. A built-in name cannot be taken by an import."""
-    found = dict.fromkeys(BUILT_IN, "built-in")
+    """Return name -> "built-in", or the path of an imported town. An import cannot take a built-in name."""
+    towns = dict.fromkeys(BUILT_IN, "built-in")
     for path in sorted((home() / "towns").glob("*.npz")):
-        found.setdefault(path.stem, str(path))
-    return found
+        towns.setdefault(path.stem, str(path))
+    return towns
 
 
 def is_town(name: str) -> bool:
-    """Whether this is the name of a town: one of `town_names`, or Random and a number (see `random_town`)."""
+    """Return whether a name is one of `town_names`, or Random and a number (see `random_town`)."""
     return name in town_names() or RANDOM.fullmatch(name) is not None
 
 
 def load_town(name: str) -> LaneGraph:
-    """The lane graph of a town: its name, or the path of a baked town (.npz) or OpenDRIVE map (.xodr).
+    """Return the lane graph of a town by its name, or the path of a baked town (.npz) or OpenDRIVE map (.xodr).
 
-    UnknownNameError shows the closest names; MapError says what is wrong with a file. A graph is immutable and
-    kept, so that asking again is free.
+    A graph is immutable and cached. UnknownNameError lists the closest names; MapError describes the problem of a
+    file.
     """
     if name in BUILT_IN:
         return _built_in(name)
@@ -52,7 +52,7 @@ def load_town(name: str) -> LaneGraph:
 
 
 def town_xodr(name: str) -> str:
-    """The OpenDRIVE text of a town, as `load_town` finds it.
+    """Return the OpenDRIVE text of a town, as `load_town` finds it.
 
     Raises:
         MapError: The town has none: its lanes were not made from OpenDRIVE.
@@ -61,8 +61,8 @@ def town_xodr(name: str) -> str:
 
     if name in BUILT_IN:
         return generate_town(name)
-    plain = Path(name).name == name and Path(name).suffix != ".xodr"
-    path = home() / "towns" / f"{name}.xodr" if plain else Path(name).with_suffix(".xodr")
+    is_name = Path(name).name == name and Path(name).suffix != ".xodr"
+    path = home() / "towns" / f"{name}.xodr" if is_name else Path(name).with_suffix(".xodr")
     if not path.is_file() and RANDOM.fullmatch(name):
         return write_random_town(name)
     if not path.is_file():
@@ -72,7 +72,7 @@ def town_xodr(name: str) -> str:
 
 @lru_cache(maxsize=8)
 def town_signals(name: str) -> dict[int, str]:
-    """The id that each signal of a town has in its OpenDRIVE; MapError as `town_xodr`."""
+    """Return the OpenDRIVE id of each signal of a town; MapError as `town_xodr`."""
     with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
         path = Path(folder) / "map.xodr"
         path.write_text(town_xodr(name), encoding="utf-8")
@@ -95,4 +95,5 @@ def _random(name: str) -> LaneGraph:
 
 @lru_cache(maxsize=64)
 def _stored(path: str, changed: int) -> LaneGraph:
+    # The modification time is part of the cache key, so a new import is read again.
     return load_graph(path)

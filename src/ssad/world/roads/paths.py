@@ -1,4 +1,4 @@
-"""A lane graph from the paths that vehicles have driven, where no map is at hand."""
+"""Lane graphs from driven paths of vehicles, for places without a map."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ ALIGNED: Final = np.radians(45.0)
 
 
 def graph_of_paths(name: str, paths: Sequence[F64], *, speeds: Sequence[float], width: float = WIDTH) -> LaneGraph:
-    """Lanes along paths.
+    """Return a lane graph with lanes along paths.
 
-    The first path is a lane from end to end, a little longer than it is. Of each other path, the stretches become lanes
-    that no lane before it covers (half a width beside, the same way). Lanes do not join, nor is anything known about
-    who has the right of way.
+    The first path becomes a lane from end to end, slightly extended. Of each other path, the stretches become lanes
+    that no earlier lane covers (within half a width, in the same direction). Lanes do not join, and there are no
+    priority rules.
 
     Args:
         name: Of the town.
-        paths: Places [N, 2] of the middles of vehicles in the order of time, m.
+        paths: Positions [N, 2] of the middles of vehicles in the order of time, m.
         speeds: Speed limit along each path, m/s.
         width: Of the lanes, m.
 
@@ -38,65 +38,66 @@ def graph_of_paths(name: str, paths: Sequence[F64], *, speeds: Sequence[float], 
     lanes: list[F64] = []
     limits: list[float] = []
     for number, (path, speed) in enumerate(zip(paths, speeds, strict=True)):
-        even = _even(path)
+        resampled = _even(path)
         if number == 0:
-            if len(even) < LEAST / STEP:
+            if len(resampled) < LEAST / STEP:
                 raise MapError(f"town '{name}': a path of less than {LEAST:g} m makes no lane")
-            even = _longer(even)
-        if len(even) < 2:
+            resampled = _longer(resampled)
+        if len(resampled) < 2:
             continue
-        free = ~_covered(even, lanes, 0.5 * width)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(int)))
-        for start, stop in edges.reshape(-1, 2).tolist():
-            if stop - start > LEAST / STEP:
-                lanes.append(even[start:stop])
+        uncovered = ~_covered(resampled, lanes, 0.5 * width)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], uncovered, [False]]).astype(int)))
+        for first_index, last_index in edges.reshape(-1, 2).tolist():
+            if last_index - first_index > LEAST / STEP:
+                lanes.append(resampled[first_index:last_index])
                 limits.append(speed)
-    count = [len(lane) for lane in lanes]
-    total, amount = sum(count), len(lanes)
-    along = [np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane, axis=0).T))]) for lane in lanes]
-    none, alone = np.zeros(0, np.int32), np.full(amount, -1, np.int32)
+    point_counts = [len(lane) for lane in lanes]
+    point_count, lane_count = sum(point_counts), len(lanes)
+    arc_lengths = [np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane, axis=0).T))]) for lane in lanes]
+    no_links, no_lane = np.zeros(0, np.int32), np.full(lane_count, -1, np.int32)
     return LaneGraph(
         name=name,
         xy=np.concatenate(lanes).astype(np.float32),
-        z=np.zeros(total, np.float32),
+        z=np.zeros(point_count, np.float32),
         yaw=np.concatenate([_headings(lane) for lane in lanes]).astype(np.float32),
-        width=np.full(total, width, np.float32),
-        s=np.concatenate(along).astype(np.float32),
-        offset=np.concatenate([[0], np.cumsum(count)]).astype(np.int32),
-        kind=np.full(amount, LaneType.DRIVING, np.uint8),
-        road=np.arange(amount, dtype=np.int32),
-        section=np.zeros(amount, np.int32),
-        lane_id=alone,
-        junction=alone,
+        width=np.full(point_count, width, np.float32),
+        s=np.concatenate(arc_lengths).astype(np.float32),
+        offset=np.concatenate([[0], np.cumsum(point_counts)]).astype(np.int32),
+        kind=np.full(lane_count, LaneType.DRIVING, np.uint8),
+        road=np.arange(lane_count, dtype=np.int32),
+        section=np.zeros(lane_count, np.int32),
+        lane_id=no_lane,
+        junction=no_lane,
         speed_limit=np.array(limits, np.float32),
-        left=alone,
-        right=alone,
-        left_marking=np.zeros(amount, np.uint8),
-        right_marking=np.zeros(amount, np.uint8),
-        succ_offset=np.zeros(amount + 1, np.int32),
-        succ=none,
+        left=no_lane,
+        right=no_lane,
+        left_marking=np.zeros(lane_count, np.uint8),
+        right_marking=np.zeros(lane_count, np.uint8),
+        succ_offset=np.zeros(lane_count + 1, np.int32),
+        succ=no_links,
         **no_signals(),
     )
 
 
 def _even(path: F64) -> F64:
-    """A path with a point each `STEP`; where it stands, trembles or goes back it has none."""
-    kept = [path[0]]
-    ahead = np.zeros(2)
+    """Return a path with a point every `STEP` m, without standstill, jitter and steps back."""
+    points = [path[0]]
+    direction = np.zeros(2)
     for point in path[1:]:
-        move = point - kept[-1]
-        far = float(np.hypot(*move))
-        if far >= APART and float(move @ ahead) >= 0.0:
-            kept.append(point)
-            ahead = move / far
-    xy = np.array(kept, np.float64)
-    s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))]) if len(xy) > 1 else np.zeros(1)
-    at = np.arange(0.0, s[-1] + 1e-9, STEP)
-    return np.stack([np.interp(at, s, xy[:, 0]), np.interp(at, s, xy[:, 1])], 1)
+        move = point - points[-1]
+        distance = float(np.hypot(*move))
+        # A move against the last direction is jitter or reversing, not progress along the path.
+        if distance >= APART and float(move @ direction) >= 0.0:
+            points.append(point)
+            direction = move / distance
+    xy = np.array(points, np.float64)
+    arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))]) if len(xy) > 1 else np.zeros(1)
+    positions = np.arange(0.0, arc_length[-1] + 1e-9, STEP)
+    return np.stack([np.interp(positions, arc_length, xy[:, 0]), np.interp(positions, arc_length, xy[:, 1])], 1)
 
 
 def _longer(path: F64) -> F64:
-    """A path that goes on straight at its ends."""
+    """Extend a path straight at its ends."""
     first, last = path[0] - path[1], path[-1] - path[-2]
     before = path[0] + np.arange(BEFORE, 0.0, -STEP)[:, None] * (first / np.hypot(*first))
     after = path[-1] + np.arange(STEP, AFTER + 1e-9, STEP)[:, None] * (last / np.hypot(*last))
@@ -104,18 +105,18 @@ def _longer(path: F64) -> F64:
 
 
 def _headings(path: F64) -> F64:
-    """Heading [N] of a path at its points."""
-    run = np.gradient(path, axis=0)
-    return np.asarray(np.unwrap(np.arctan2(run[:, 1], run[:, 0])))
+    """Return the headings [N] of a path at its points."""
+    steps = np.gradient(path, axis=0)
+    return np.asarray(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))
 
 
 def _covered(path: F64, lanes: Sequence[F64], beside: float) -> Bool:
     """Which points of a path lie at most so far (m) beside a lane that runs the same way."""
-    found = np.zeros(len(path), bool)
+    covered = np.zeros(len(path), bool)
     yaw = _headings(path)
     for lane in lanes:
-        away = np.hypot(path[:, None, 0] - lane[None, :, 0], path[:, None, 1] - lane[None, :, 1])
-        nearest = away.argmin(1)
-        turn = np.remainder(_headings(lane)[nearest] - yaw + np.pi, 2 * np.pi) - np.pi
-        found |= (away.min(1) <= beside) & (np.abs(turn) <= ALIGNED)
-    return found
+        distance = np.hypot(path[:, None, 0] - lane[None, :, 0], path[:, None, 1] - lane[None, :, 1])
+        nearest = distance.argmin(1)
+        heading_difference = np.remainder(_headings(lane)[nearest] - yaw + np.pi, 2 * np.pi) - np.pi
+        covered |= (distance.min(1) <= beside) & (np.abs(heading_difference) <= ALIGNED)
+    return covered

@@ -1,4 +1,4 @@
-"""Towns drawn at random: detectors that learn in many towns learn no town by heart."""
+"""Randomly generated towns, so that detectors do not learn single towns by heart."""
 
 from __future__ import annotations
 
@@ -25,74 +25,89 @@ def write_random_town(name: str) -> str:
 
 
 def random_town(number: int) -> Town:
-    """A town of a crooked grid from which streets are missing; the same for the same number.
+    """Return a town of a crooked grid from which streets are missing; deterministic in its number.
 
-    Everything that a town has but roundabouts and motorways is drawn: blocks of 66 to 124 m (up to 154 with 2 + 2
-    lanes), how far junctions lie off the grid, lanes, widths of lanes, shoulders and sidewalks, bends, speed limits,
-    lights.
+    Everything except roundabouts and motorways is random: blocks of 66 to 124 m (up to 154 with 2 + 2 lanes), the
+    offset of junctions from the grid, lanes, widths of lanes, shoulders and sidewalks, bends, speed limits, lights.
 
     Args:
-        number: Which one.
+        number: Seed of the town.
 
     Returns:
         The specification, from which `write_town` makes OpenDRIVE.
     """
-    draws = generator("random town", number)
-    lanes = 2 if draws.random() < 0.25 else 1
-    off, least = draws.uniform(0.0, 12.0), 66.0 + 30.0 * (lanes - 1)
-    columns, rows = draws.integers(4, 6), draws.integers(3, 5)
-    xs, ys = (np.cumsum(draws.uniform(least, least + 58.0, n)) for n in (columns, rows))
-    at = {
-        (i, j): (round(float(xs[i] + draws.uniform(-off, off)), 2), round(float(ys[j] + draws.uniform(-off, off)), 2))
-        for i in range(columns)
-        for j in range(rows)
+    rng = generator("random town", number)
+    lanes = 2 if rng.random() < 0.25 else 1
+    max_offset, min_block = rng.uniform(0.0, 12.0), 66.0 + 30.0 * (lanes - 1)
+    columns, rows = rng.integers(4, 6), rng.integers(3, 5)
+    x_positions, y_positions = (
+        np.cumsum(rng.uniform(min_block, min_block + 58.0, block_count)) for block_count in (columns, rows)
+    )
+    positions = {
+        (column, row): (
+            round(float(x_positions[column] + rng.uniform(-max_offset, max_offset)), 2),
+            round(float(y_positions[row] + rng.uniform(-max_offset, max_offset)), 2),
+        )
+        for column in range(columns)
+        for row in range(rows)
     }
-    edges = {(a, b) for a in at for b in ((a[0] + 1, a[1]), (a[0], a[1] + 1)) if b in at}
-    whole = sorted(edges)
-    fewest = (1.0 - draws.uniform(0.0, 0.22)) * len(whole)
-    for k in draws.permutation(len(whole)):
-        if len(edges) - 1 >= fewest and _holds(at, edges - {whole[k]}):
-            edges = edges - {whole[k]}
-    width, sidewalk = round(draws.uniform(3.1, 3.75), 2), round(draws.uniform(1.6, 3.5), 1)
-    shoulder, limit = float(draws.choice([0.5, 0.5, 1.5, 2.0])), float(draws.choice([20.0, 25.0, 30.0, 35.0]))
-    radius, lead = draws.uniform(14.0, 30.0), draws.uniform(16.0, 18.0) + 6.0 * (lanes - 1)
-    wind = draws.uniform(0.0, 12.0)
+    edges = {
+        (place, neighbour)
+        for place in positions
+        for neighbour in ((place[0] + 1, place[1]), (place[0], place[1] + 1))
+        if neighbour in positions
+    }
+    all_edges = sorted(edges)
+    min_edges = (1.0 - rng.uniform(0.0, 0.22)) * len(all_edges)
+    for index in rng.permutation(len(all_edges)):
+        # Only streets whose loss creates no dead end and splits no part off may go.
+        if len(edges) - 1 >= min_edges and _holds(positions, edges - {all_edges[index]}):
+            edges = edges - {all_edges[index]}
+    width, sidewalk = round(rng.uniform(3.1, 3.75), 2), round(rng.uniform(1.6, 3.5), 1)
+    shoulder, limit = float(rng.choice([0.5, 0.5, 1.5, 2.0])), float(rng.choice([20.0, 25.0, 30.0, 35.0]))
+    radius, lead = rng.uniform(14.0, 30.0), rng.uniform(16.0, 18.0) + 6.0 * (lanes - 1)
+    max_bend = rng.uniform(0.0, 12.0)
     setback = lanes * width + CLEARANCE
     streets = tuple(
         _fitting(RoadSpec(points, lanes, width, shoulder, sidewalk, limit, radius), setback)
-        for points in _polylines(at, edges, lead, lambda: float(draws.uniform(-wind, wind)))
+        for points in _polylines(positions, edges, lead, lambda: float(rng.uniform(-max_bend, max_bend)))
     )
-    ends = [p for street in streets for p in (street.points[0], street.points[-1])]
-    junctions = sorted({p for p in ends if ends.count(p) > 2})
-    lit = draws.random(len(junctions)) < draws.uniform(0.2, 0.7)
-    return Town(f"Random{number}", streets, tuple(p for p, one in zip(junctions, lit, strict=True) if one))
+    # Three or more streets make a junction; two only meet in a bend.
+    end_points = [position for street in streets for position in (street.points[0], street.points[-1])]
+    junctions = sorted({position for position in end_points if end_points.count(position) > 2})
+    is_signalled = rng.random(len(junctions)) < rng.uniform(0.2, 0.7)
+    return Town(
+        f"Random{number}",
+        streets,
+        tuple(position for position, signalled in zip(junctions, is_signalled, strict=True) if signalled),
+    )
 
 
 def _fitting(street: RoadSpec, setback: float) -> RoadSpec:
-    """The street with corners of the largest radius, up to the one it has, that leave room for each other."""
-    tries = (replace(street, radius=0.9**k * street.radius) for k in range(20))
-    return next(one for one in tries if min(_straights(one, setback)) > 0.5)
+    """Reduce the radius of a street's corners until they leave room for each other."""
+    candidates = (replace(street, radius=0.9**step * street.radius) for step in range(20))
+    return next(candidate for candidate in candidates if min(_straights(candidate, setback)) > 0.5)
 
 
 def _straights(street: RoadSpec, setback: float) -> list[float]:
-    """Lengths of its straight pieces, m; below 0 where corners overlap."""
+    """Return the lengths of its straight pieces, m; negative where corners overlap."""
     return [piece.length for piece in plan_pieces(street, setback, setback) if not piece.curvature]
 
 
 def _holds(places: Iterable[Place], edges: set[Edge]) -> bool:
-    """Whether every place has two streets or more, and each can be reached from each."""
-    near: dict[Place, set[Place]] = {place: set() for place in places}
-    for a, b in edges:
-        near[a].add(b)
-        near[b].add(a)
-    seen: set[Place] = set()
-    todo = [next(iter(near))]
-    while todo:
-        place = todo.pop()
-        if place not in seen:
-            seen.add(place)
-            todo += near[place]
-    return len(seen) == len(near) and min(map(len, near.values())) >= 2
+    """Return whether every place has two streets or more, and all places are connected."""
+    neighbours: dict[Place, set[Place]] = {place: set() for place in places}
+    for start, end in edges:
+        neighbours[start].add(end)
+        neighbours[end].add(start)
+    visited: set[Place] = set()
+    pending = [next(iter(neighbours))]
+    while pending:
+        place = pending.pop()
+        if place not in visited:
+            visited.add(place)
+            pending += neighbours[place]
+    return len(visited) == len(neighbours) and min(map(len, neighbours.values())) >= 2
 
 
 def _polylines(
@@ -106,24 +121,24 @@ def _polylines(
         lead: How far a street follows the axis from each place, m.
         aside: How far off its way a street is in the middle of a block, m; drawn for each.
     """
-    near: dict[Place, list[Place]] = {place: [] for place in at}
-    for a, b in sorted(edges):
-        near[a].append(b)
-        near[b].append(a)
-    left = set(edges)
-    found = []
+    neighbours: dict[Place, list[Place]] = {place: [] for place in at}
+    for start_place, end_place in sorted(edges):
+        neighbours[start_place].append(end_place)
+        neighbours[end_place].append(start_place)
+    unused = set(edges)
+    polylines = []
     for start in sorted(at):
-        for following in near[start] if len(near[start]) > 2 else ():
-            if (min(start, following), max(start, following)) not in left:
+        for following in neighbours[start] if len(neighbours[start]) > 2 else ():
+            if (min(start, following), max(start, following)) not in unused:
                 continue
-            way = [start, following]
-            left.discard((min(start, following), max(start, following)))
-            while len(near[way[-1]]) == 2:
-                (ahead,) = (place for place in near[way[-1]] if place != way[-2])
-                left.discard((min(way[-1], ahead), max(way[-1], ahead)))
-                way.append(ahead)
+            chain = [start, following]
+            unused.discard((min(start, following), max(start, following)))
+            while len(neighbours[chain[-1]]) == 2:
+                (next_place,) = (place for place in neighbours[chain[-1]] if place != chain[-2])
+                unused.discard((min(chain[-1], next_place), max(chain[-1], next_place)))
+                chain.append(next_place)
             points = [at[start]]
-            for a, b in pairwise(way):
-                points += shifted(at[a], at[b], lead=lead, aside=aside())[1:]
-            found.append(tuple(points))
-    return found
+            for start_place, end_place in pairwise(chain):
+                points += shifted(at[start_place], at[end_place], lead=lead, aside=aside())[1:]
+            polylines.append(tuple(points))
+    return polylines

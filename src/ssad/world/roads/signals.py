@@ -1,4 +1,4 @@
-"""Where signals and signs stand, which lanes they stop, and which signals are green together."""
+"""Placement of signals and signs: position, controlled lanes, and phases of simultaneous green."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TAIL = 15.0  # m before the end of a lane in which a crosswalk moves its stop l
 
 @dataclass(frozen=True)
 class Approaches:
-    """What signal placement needs to know of the lanes; rows are lanes."""
+    """Lane data for the placement of signals; rows are lanes."""
 
     network: Network
     keys: list[tuple[int, int, int]]
@@ -54,37 +54,40 @@ def place_signals(data: Approaches) -> dict[str, Any]:
     least three arms without lights gets the same, marked virtual, if ways of different arms meet there. Phases
     come from the map's controllers where every light has one, else arms that face each other share a phase.
     """
-    signals: list[tuple[float, float, float, int, int, bool]] = []
-    stops: list[tuple[int, int, float]] = []
+    signal_rows: list[tuple[float, float, float, int, int, bool]] = []
+    stop_rows: list[tuple[int, int, float]] = []
     for junction, arms in _arms(data).items():
-        approaches = [arm for arm in arms if arm.lanes]
-        inner = [i for i in range(len(data.keys)) if data.junction[i] == junction]
-        for arm in approaches:
-            arm.light = _facing(data, arm, inner)
-        real = any(arm.light for arm in approaches)
-        if not approaches or (not real and (len(arms) < ARMS or not _meet(data, approaches, set(inner)))):
+        approaches = [approach for approach in arms if approach.lanes]
+        junction_lanes = [lane_index for lane_index in range(len(data.keys)) if data.junction[lane_index] == junction]
+        for approach in approaches:
+            approach.light = _facing(data, approach, junction_lanes)
+        has_lights = any(approach.light for approach in approaches)
+        if not approaches or (
+            not has_lights and (len(arms) < ARMS or not _meet(data, approaches, set(junction_lanes)))
+        ):
             continue
-        for arm, phase in zip(approaches, _phases(data, approaches), strict=True):
-            outer = min(arm.lanes, key=lambda i: -abs(data.keys[i][2]))
+        for approach, phase in zip(approaches, _phases(data, approaches), strict=True):
+            # The outermost lane: OpenDRIVE numbers lanes outwards from the centre.
+            outer = min(approach.lanes, key=lambda lane_index: -abs(data.keys[lane_index][2]))
             x, y, yaw = data.end[outer]
-            if arm.light and arm.light in data.lights:
-                x, y = data.lights[arm.light][:2]
+            if approach.light and approach.light in data.lights:
+                x, y = data.lights[approach.light][:2]
             else:
-                aside = 0.5 * data.width[outer] + 1.0
-                x, y = x + aside * np.sin(yaw), y - aside * np.cos(yaw)
-            stops += [(len(signals), lane, _stop(data, lane)) for lane in arm.lanes]
-            signals.append((x, y, yaw, junction, phase, not real))
-    table = np.array(signals, np.float64).reshape(-1, 6)
-    line = np.array(stops, np.float64).reshape(-1, 3)
+                lateral = 0.5 * data.width[outer] + 1.0
+                x, y = x + lateral * np.sin(yaw), y - lateral * np.cos(yaw)
+            stop_rows += [(len(signal_rows), lane, _stop(data, lane)) for lane in approach.lanes]
+            signal_rows.append((x, y, yaw, junction, phase, not has_lights))
+    signal_table = np.array(signal_rows, np.float64).reshape(-1, 6)
+    stop_table = np.array(stop_rows, np.float64).reshape(-1, 3)
     return {
-        "signal_xy": table[:, :2],
-        "signal_yaw": table[:, 2],
-        "signal_junction": table[:, 3].astype(np.int32),
-        "signal_phase": table[:, 4].astype(np.int32),
-        "signal_virtual": table[:, 5].astype(bool),
-        "stop_signal": line[:, 0].astype(np.int32),
-        "stop_lane": line[:, 1].astype(np.int32),
-        "stop_s": line[:, 2],
+        "signal_xy": signal_table[:, :2],
+        "signal_yaw": signal_table[:, 2],
+        "signal_junction": signal_table[:, 3].astype(np.int32),
+        "signal_phase": signal_table[:, 4].astype(np.int32),
+        "signal_virtual": signal_table[:, 5].astype(bool),
+        "stop_signal": stop_table[:, 0].astype(np.int32),
+        "stop_lane": stop_table[:, 1].astype(np.int32),
+        "stop_s": stop_table[:, 2],
     }
 
 
@@ -94,120 +97,158 @@ def place_signs(data: Approaches) -> dict[str, Any]:
     A sign rules the lanes of one approach: those that the map names, by road and direction or by the connecting lanes
     behind them; where it names several approaches, the one that ends nearest to the sign.
     """
-    before: dict[int, list[int]] = {}
-    for i, found in enumerate(data.links):
-        for j in found:
-            before.setdefault(j, []).append(i)
-    named: dict[str, set[int]] = {}
-    for i, (road, _, lane) in enumerate(data.keys):
-        for place in data.network.roads[road].signs:
-            ahead = place.way == 0 or place.way * lane < 0
-            if place.sign not in data.network.signs or not ahead:
+    predecessors: dict[int, list[int]] = {}
+    for lane_index, successors in enumerate(data.links):
+        for successor in successors:
+            predecessors.setdefault(successor, []).append(lane_index)
+    signed_lanes: dict[str, set[int]] = {}
+    for lane_index, (road, _, lane) in enumerate(data.keys):
+        for placement in data.network.roads[road].signs:
+            in_direction = placement.way == 0 or placement.way * lane < 0
+            if placement.sign not in data.network.signs or not in_direction:
                 continue
-            if place.low == 0 == place.high or place.low <= lane <= place.high:
-                named.setdefault(place.sign, set()).update([i] if data.junction[i] < 0 else before.get(i, []))
-    signs: list[tuple[float, float, float, int]] = []
-    rules: list[tuple[int, int, float]] = []
-    for sign in sorted(named, key=lambda name: (len(name), name)):
-        lanes = _approach(data, sign, named[sign])
+            if placement.low == 0 == placement.high or placement.low <= lane <= placement.high:
+                signed_lanes.setdefault(placement.sign, set()).update(
+                    [lane_index] if data.junction[lane_index] < 0 else predecessors.get(lane_index, [])
+                )
+    sign_rows: list[tuple[float, float, float, int]] = []
+    rule_rows: list[tuple[int, int, float]] = []
+    for sign in sorted(signed_lanes, key=lambda sign_id: (len(sign_id), sign_id)):
+        lanes = _approach(data, sign, signed_lanes[sign])
         if not lanes:
             continue
-        outer = min(lanes, key=lambda i: -abs(data.keys[i][2]))
-        x, y, yaw = data.end[outer]
+        outer_lane = min(lanes, key=lambda lane_index: -abs(data.keys[lane_index][2]))
+        x, y, yaw = data.end[outer_lane]
         if sign in data.lights:
             x, y = data.lights[sign][:2]
         else:
-            aside = 0.5 * data.width[outer] + 1.0
-            x, y = x + aside * np.sin(yaw), y - aside * np.cos(yaw)
-        rules += [(len(signs), lane, _stop(data, lane)) for lane in lanes]
-        signs.append((x, y, yaw, int(data.network.signs[sign])))
-    table = np.array(signs, np.float64).reshape(-1, 4)
-    ruled = np.array(rules, np.float64).reshape(-1, 3)
+            lateral = 0.5 * data.width[outer_lane] + 1.0
+            x, y = x + lateral * np.sin(yaw), y - lateral * np.cos(yaw)
+        rule_rows += [(len(sign_rows), lane, _stop(data, lane)) for lane in lanes]
+        sign_rows.append((x, y, yaw, int(data.network.signs[sign])))
+    sign_table = np.array(sign_rows, np.float64).reshape(-1, 4)
+    rule_table = np.array(rule_rows, np.float64).reshape(-1, 3)
     return {
-        "sign_kind": table[:, 3].astype(np.uint8),
-        "sign_xy": table[:, :2],
-        "sign_yaw": table[:, 2],
-        "rule_sign": ruled[:, 0].astype(np.int32),
-        "rule_lane": ruled[:, 1].astype(np.int32),
-        "rule_s": ruled[:, 2],
+        "sign_kind": sign_table[:, 3].astype(np.uint8),
+        "sign_xy": sign_table[:, :2],
+        "sign_yaw": sign_table[:, 2],
+        "rule_sign": rule_table[:, 0].astype(np.int32),
+        "rule_lane": rule_table[:, 1].astype(np.int32),
+        "rule_s": rule_table[:, 2],
     }
 
 
 def _approach(data: Approaches, sign: str, named: set[int]) -> list[int]:
     """Of the lanes that a sign is for, those of one approach to a junction."""
-    ways: dict[tuple[int, bool], list[int]] = {}
-    for i in sorted(named):
-        leads_in = any(data.junction[j] >= 0 and data.kind[j] == LaneType.DRIVING for j in data.links[i])
-        if data.kind[i] == LaneType.DRIVING and data.junction[i] < 0 and leads_in:
-            ways.setdefault((data.keys[i][0], data.keys[i][2] < 0), []).append(i)
-    if len(ways) < 2 or sign not in data.lights:
-        return next(iter(ways.values()), [])
+    approaches: dict[tuple[int, bool], list[int]] = {}
+    for lane_index in sorted(named):
+        leads_in = any(
+            data.junction[successor] >= 0 and data.kind[successor] == LaneType.DRIVING
+            for successor in data.links[lane_index]
+        )
+        if data.kind[lane_index] == LaneType.DRIVING and data.junction[lane_index] < 0 and leads_in:
+            approaches.setdefault((data.keys[lane_index][0], data.keys[lane_index][2] < 0), []).append(lane_index)
+    if len(approaches) < 2 or sign not in data.lights:
+        return next(iter(approaches.values()), [])
     x, y = data.lights[sign][:2]
-    return min(ways.values(), key=lambda lanes: min(np.hypot(*(data.end[i, :2] - [x, y])) for i in lanes))
+    return min(
+        approaches.values(),
+        key=lambda lanes: min(np.hypot(*(data.end[lane_index, :2] - [x, y])) for lane_index in lanes),
+    )
 
 
 def _arms(data: Approaches) -> dict[int, list[_Approach]]:
     """Arms of every junction: (road, end) pairs, with the driving lanes that lead in (may be none)."""
-    arms: dict[int, dict[tuple[int, bool], _Approach]] = {}
-    for i, found in enumerate(data.links):
-        if data.kind[i] != LaneType.DRIVING:
+    arms_by_junction: dict[int, dict[tuple[int, bool], _Approach]] = {}
+    for lane_index, successors in enumerate(data.links):
+        if data.kind[lane_index] != LaneType.DRIVING:
             continue
-        road, _, lane = data.keys[i]
-        for j in found:
-            if data.kind[j] != LaneType.DRIVING:
+        road, _, lane = data.keys[lane_index]
+        for successor in successors:
+            if data.kind[successor] != LaneType.DRIVING:
                 continue
-            here, there = int(data.junction[i]), int(data.junction[j])
-            if here == there:
+            own_junction, next_junction = int(data.junction[lane_index]), int(data.junction[successor])
+            if own_junction == next_junction:
                 continue
-            if there >= 0:
-                arm = arms.setdefault(there, {}).setdefault((road, lane < 0), _Approach(there, []))
-                if i not in arm.lanes:
-                    arm.lanes.append(i)
-            if here >= 0:
-                out, _, lane_out = data.keys[j]
-                arms.setdefault(here, {}).setdefault((out, lane_out > 0), _Approach(here, []))
-    return {junction: [found[k] for k in sorted(found)] for junction, found in sorted(arms.items())}
+            if next_junction >= 0:
+                approach = arms_by_junction.setdefault(next_junction, {}).setdefault(
+                    (road, lane < 0), _Approach(next_junction, [])
+                )
+                if lane_index not in approach.lanes:
+                    approach.lanes.append(lane_index)
+            if own_junction >= 0:
+                exit_road, _, exit_lane = data.keys[successor]
+                arms_by_junction.setdefault(own_junction, {}).setdefault(
+                    (exit_road, exit_lane > 0), _Approach(own_junction, [])
+                )
+    return {
+        junction: [successors[key] for key in sorted(successors)]
+        for junction, successors in sorted(arms_by_junction.items())
+    }
 
 
 def _meet(data: Approaches, arms: list[_Approach], inner: set[int]) -> bool:
     """Whether ways of different arms come so near that two vehicles could touch; not so at a motorway's interchange."""
-    ways = [[data.line[j][0] for j in sorted({j for i in arm.lanes for j in data.links[i]} & inner)] for arm in arms]
-    pairs = ((a, b) for k, mine in enumerate(ways) for other in ways[k + 1 :] for a in mine for b in other)
-    return any(float(np.hypot(*np.moveaxis(a[:, None] - b[None], -1, 0)).min()) < TOUCHING for a, b in pairs)
+    paths_by_arm = [
+        [
+            data.line[connecting_lane][0]
+            for connecting_lane in sorted(
+                {connecting_lane for lane_index in arm.lanes for connecting_lane in data.links[lane_index]} & inner
+            )
+        ]
+        for arm in arms
+    ]
+    pairs = (
+        (path, other_path)
+        for arm_index, own_paths in enumerate(paths_by_arm)
+        for other_paths in paths_by_arm[arm_index + 1 :]
+        for path in own_paths
+        for other_path in other_paths
+    )
+    return any(
+        float(np.hypot(*np.moveaxis(path[:, None] - other_path[None], -1, 0)).min()) < TOUCHING
+        for path, other_path in pairs
+    )
 
 
 def _facing(data: Approaches, arm: _Approach, inner: list[int]) -> str | None:
     """The light that the map ties to an arm: on its own lanes, or on the connecting lanes after them."""
-    known = set(data.network.lights)
+    light_ids = set(data.network.lights)
     votes: Counter[str] = Counter()
-    after = {j for i in arm.lanes for j in data.links[i]} & set(inner)
-    for i in [*arm.lanes, *sorted(after)]:
-        road, _, lane = data.keys[i]
-        for place in data.network.roads[road].lights:
-            spans_all = place.low == 0 == place.high
-            if place.signal not in known or (spans_all and i in arm.lanes):
+    connecting_lanes = {successor for lane_index in arm.lanes for successor in data.links[lane_index]} & set(inner)
+    for lane_index in [*arm.lanes, *sorted(connecting_lanes)]:
+        road, _, lane = data.keys[lane_index]
+        for placement in data.network.roads[road].lights:
+            spans_all = placement.low == 0 == placement.high
+            if placement.signal not in light_ids or (spans_all and lane_index in arm.lanes):
                 continue  # a post beside the approach without a list of lanes may face another road
-            if spans_all or place.low <= lane <= place.high:
-                votes[place.signal] += 1
+            if spans_all or placement.low <= lane <= placement.high:
+                votes[placement.signal] += 1
     return min(votes, key=lambda signal: (-votes[signal], signal)) if votes else None
 
 
 def _phases(data: Approaches, arms: list[_Approach]) -> list[int]:
     """Phase of each arm: the map's, unless it shows green to arms that cross."""
-    given = [data.network.phase.get(arm.light or "") for arm in arms]
-    if all(phase is not None for phase in given) and len(set(given)) > 1:
-        order = sorted({phase for phase in given if phase is not None})
-        mapped = [order.index(phase) for phase in given if phase is not None]
-        pairs = ((k, m) for k in range(len(arms)) for m in range(k) if mapped[k] == mapped[m])
-        if not any(_cross(data, arms[k], arms[m]) for k, m in pairs):
+    map_phases = [data.network.phase.get(arm.light or "") for arm in arms]
+    if all(phase is not None for phase in map_phases) and len(set(map_phases)) > 1:
+        phase_order = sorted({phase for phase in map_phases if phase is not None})
+        mapped = [phase_order.index(phase) for phase in map_phases if phase is not None]
+        pairs = (
+            (arm_index, other_index)
+            for arm_index in range(len(arms))
+            for other_index in range(arm_index)
+            if mapped[arm_index] == mapped[other_index]
+        )
+        # Phases that show green to crossing arms at once are not used.
+        if not any(_cross(data, arms[arm_index], arms[other_index]) for arm_index, other_index in pairs):
             return mapped
     phases: list[int] = []
-    for k, arm in enumerate(arms):
-        same = -1
-        for m in range(k):
-            if _heading(data, arm, arms[m]) < FACING and same < 0:
-                same = phases[m]
-        phases.append(same if same >= 0 else max(phases, default=-1) + 1)
+    for arm_index, arm in enumerate(arms):
+        shared_phase = -1
+        for other_index in range(arm_index):
+            if _heading(data, arm, arms[other_index]) < FACING and shared_phase < 0:
+                shared_phase = phases[other_index]
+        phases.append(shared_phase if shared_phase >= 0 else max(phases, default=-1) + 1)
     return phases
 
 
@@ -223,35 +264,37 @@ def _cross(data: Approaches, one: _Approach, other: _Approach) -> bool:
 
 def _stop(data: Approaches, lane: int) -> float:
     """Arc length of the stop line: the end of the lane, or before a crosswalk on its last metres."""
-    xy, s = data.line[lane]
-    at = np.arange(max(0.0, s[-1] - _TAIL), s[-1], 0.25)
-    points = np.stack([np.interp(at, s, xy[:, k]) for k in range(2)], axis=1)
-    stop = float(s[-1])
-    for area in data.crosswalks:
-        hit = in_polygon(points, area)
-        if hit.any():
-            stop = min(stop, float(at[hit][0]) - SETBACK)
+    xy, arc_length = data.line[lane]
+    positions = np.arange(max(0.0, arc_length[-1] - _TAIL), arc_length[-1], 0.25)
+    points = np.stack([np.interp(positions, arc_length, xy[:, axis]) for axis in range(2)], axis=1)
+    stop = float(arc_length[-1])
+    for crosswalk in data.crosswalks:
+        on_crosswalk = in_polygon(points, crosswalk)
+        if on_crosswalk.any():
+            stop = min(stop, float(positions[on_crosswalk][0]) - SETBACK)
     return max(stop, 0.0)
 
 
 def signal_names(graph: LaneGraph, network: Network) -> dict[int, str]:
-    """The id that each signal of a lane graph has in the OpenDRIVE map it was made from; virtual ones have none.
+    """Return the OpenDRIVE id of each signal of a lane graph; virtual signals have none.
 
     The rule is that of `place_signals`: the map ties a light to lanes of an approach, or to the lanes after them.
     """
     names: dict[int, str] = {}
-    known = set(network.lights)
+    light_ids = set(network.lights)
     for signal in np.flatnonzero(~graph.signal_virtual).tolist():
         lanes = graph.stop_lane[graph.stop_signal == signal].tolist()
-        after = {int(n) for lane in lanes for n in graph.successors(lane) if graph.junction[n] >= 0}
+        connecting_lanes = {
+            int(successor) for lane in lanes for successor in graph.successors(lane) if graph.junction[successor] >= 0
+        }
         votes: Counter[str] = Counter()
-        for lane in [*lanes, *sorted(after)]:
-            number = int(graph.lane_id[lane])
-            for place in network.roads[int(graph.road[lane])].lights:
-                spans_all = place.low == 0 == place.high
-                if place.signal in known and not (spans_all and lane in lanes):
-                    votes[place.signal] += spans_all or place.low <= number <= place.high
-        best = min(votes, key=lambda name: (-votes[name], name), default="")
-        if votes[best]:
-            names[signal] = best
+        for lane in [*lanes, *sorted(connecting_lanes)]:
+            lane_id = int(graph.lane_id[lane])
+            for placement in network.roads[int(graph.road[lane])].lights:
+                spans_all = placement.low == 0 == placement.high
+                if placement.signal in light_ids and not (spans_all and lane in lanes):
+                    votes[placement.signal] += spans_all or placement.low <= lane_id <= placement.high
+        winner = min(votes, key=lambda name: (-votes[name], name), default="")
+        if votes[winner]:
+            names[signal] = winner
     return names

@@ -1,4 +1,4 @@
-"""Writes streets and junctions as OpenDRIVE 1.4: the geometry of towns that are made of straight arms and arcs."""
+"""Writer of streets and junctions as OpenDRIVE 1.4, for towns that are made of straight arms and arcs."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from ssad.world.roads.writer_parts import (
     wrap,
 )
 
-STOP_LINE = CROSSWALK_END + CROSSWALK + 1.0  # m from the end of a street with a crosswalk to where it is waited
+STOP_LINE = CROSSWALK_END + CROSSWALK + 1.0  # m from the end of a street with a crosswalk to the waiting line
 PARTING = 0.25  # m from the middle of an interchange to the ends of its arms
 SIGN_ASIDE = 0.75  # m from the kerb to the post of a sign
-YIELDS = 3  # at every so manieth T-junction without lights the stem yields, elsewhere it stops
+YIELDS = 3  # at every third T-junction without lights the stem yields, elsewhere it stops
 
 
 def write_town(town: Town) -> str:
-    """The town as OpenDRIVE text, the same for the same town."""
-    ends = _ends(town)
+    """Return the town as OpenDRIVE text; deterministic."""
+    junction_by_end = _ends(town)
     root = Element("OpenDRIVE")
     SubElement(
         root,
@@ -53,191 +53,212 @@ def write_town(town: Town) -> str:
     roads: list[Element] = []
     lengths: dict[int, float] = {}
     for number, street in enumerate(town.streets, start=1):
-        start, end = ends[number, False], ends[number, True]
-        pieces = plan_pieces(street, start.setback, end.setback)
+        start_junction, end_junction = junction_by_end[number, False], junction_by_end[number, True]
+        pieces = plan_pieces(street, start_junction.setback, end_junction.setback)
         lengths[number] = sum(piece.length for piece in pieces)
-        roads.append(_street(number, street, pieces, (start, end)))
-    gates = {place.place: (place.on, place.off) for place in town.interchanges}
-    special = {*(gate for pair in gates.values() for gate in pair), *(ring.place for ring in town.roundabouts)}
-    junctions = list({id(junction): junction for junction in ends.values()}.values())
+        roads.append(_street(number, street, pieces, (start_junction, end_junction)))
+    ramps_by_place = {interchange.place: (interchange.on, interchange.off) for interchange in town.interchanges}
+    special_places = {
+        *(ramp_place for ramp_places in ramps_by_place.values() for ramp_place in ramp_places),
+        *(roundabout.place for roundabout in town.roundabouts),
+    }
+    junctions = list({id(junction): junction for junction in junction_by_end.values()}.values())
     by_place = {junction.place: junction for junction in junctions}
-    plain = [junction for junction in junctions if junction.place not in special]
-    for junction in plain:
-        if junction.place in gates:
-            on, off = (by_place[gate] for gate in gates[junction.place])
-            _interchange(roads, root, junction, (on, off))
+    plain_junctions = [junction for junction in junctions if junction.place not in special_places]
+    for junction in plain_junctions:
+        if junction.place in ramps_by_place:
+            entry_ramp, exit_ramp = (by_place[ramp_place] for ramp_place in ramps_by_place[junction.place])
+            _interchange(roads, root, junction, (entry_ramp, exit_ramp))
         else:
             _connect(roads, root, junction)
-    places = set(town.signalled)
-    stems = 0
-    for junction in plain:
-        if junction.place in places:
+    signalled_places = set(town.signalled)
+    stem_count = 0
+    for junction in plain_junctions:
+        if junction.place in signalled_places:
             _signals(root, roads, junction, lengths)
             continue
-        if junction.place in gates:
+        if junction.place in ramps_by_place:
             continue
-        ruled = _ruled(junction)
-        stems += len(ruled) == 1
-        _signs(roads, junction, ruled, lengths, stop=len(ruled) > 1 or stems % YIELDS > 0)
-    for ring in town.roundabouts:
-        entries = [junction for junction in junctions if junction.place == ring.place]
-        _ring(roads, root, ring, entries)
+        signed_arms = _ruled(junction)
+        stem_count += len(signed_arms) == 1
+        _signs(roads, junction, signed_arms, lengths, stop=len(signed_arms) > 1 or stem_count % YIELDS > 0)
+    for roundabout in town.roundabouts:
+        entries = [junction for junction in junctions if junction.place == roundabout.place]
+        _ring(roads, root, roundabout, entries)
         for junction in entries:
             _signs(roads, junction, junction.arms, lengths, stop=False)
-    order = {"header": 0, "controller": 2, "junction": 3}  # as the format asks for it, between them the roads
-    root[:] = sorted([*root, *roads], key=lambda element: order.get(element.tag, 1))
+    tag_order = {"header": 0, "controller": 2, "junction": 3}  # as the format asks for it, between them the roads
+    # `sorted` is stable, so roads and junctions keep the order in which they were made.
+    root[:] = sorted([*root, *roads], key=lambda element: tag_order.get(element.tag, 1))
     indent(root, " ")
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
 
 
 def _ends(town: Town) -> dict[tuple[int, bool], Junction]:
-    """(number of a street, whether its last end) -> the junction there; each arm of a roundabout has one of its own."""
-    rings = {ring.place: ring for ring in town.roundabouts}
-    middle = {gate: place.place for place in town.interchanges for gate in (place.on, place.off)}
-    found: dict[object, Junction] = {}
-    ends: dict[tuple[int, bool], Junction] = {}
+    """Return the junction at each (street number, at its last end); every arm of a roundabout has one of its own."""
+    ring_by_place = {roundabout.place: roundabout for roundabout in town.roundabouts}
+    place_of_ramp = {
+        ramp_place: position.place for position in town.interchanges for ramp_place in (position.on, position.off)
+    }
+    junctions: dict[object, Junction] = {}
+    junction_by_end: dict[tuple[int, bool], Junction] = {}
     for number, street in enumerate(town.streets, start=1):
-        for place, inner, at_end in (
+        for position, next_point, at_end in (
             (street.points[0], street.points[1], False),
             (street.points[-1], street.points[-2], True),
         ):
-            key: object = (place, number, at_end) if place in rings else place
-            junction = found.setdefault(key, Junction(1000 * (len(found) + 1), place))
-            heading = math.atan2(inner[1] - place[1], inner[0] - place[0])
+            # Streets that share a place share its junction, except at a ring.
+            junction_key: object = (position, number, at_end) if position in ring_by_place else position
+            junction = junctions.setdefault(junction_key, Junction(1000 * (len(junctions) + 1), position))
+            heading = math.atan2(next_point[1] - position[1], next_point[0] - position[0])
             junction.arms.append(Arm(number, street, heading, at_end))
-            junction.ring = rings.get(place)
+            junction.ring = ring_by_place.get(position)
             if junction.ring:
                 junction.apart = junction.ring.setback
-            ends[number, at_end] = junction
+            junction_by_end[number, at_end] = junction
     for interchange in town.interchanges:
-        found[interchange.place].apart = PARTING
-    for gate, place in middle.items():
-        found[gate].id, found[gate].apart = found[place].id, 0.0
-    return ends
+        junctions[interchange.place].apart = PARTING
+    # The ramps' connecting roads belong to the junction of the interchange.
+    for ramp_place, position in place_of_ramp.items():
+        junctions[ramp_place].id, junctions[ramp_place].apart = junctions[position].id, 0.0
+    return junction_by_end
 
 
 def _street(number: int, street: RoadSpec, pieces: list[Piece], ends: tuple[Junction, Junction]) -> Element:
     road = road_element(f"street {number}", number, -1, pieces)
     for name, junction in zip(("predecessor", "successor"), ends, strict=True):
         SubElement(road[0], name, elementType="junction", elementId=str(junction.id))
-    kind = Element("type", s="0", type="rural" if not street.sidewalk else "town")
-    SubElement(kind, "speed", max=f"{street.limit:g}", unit="mph")
-    road.insert(1, kind)
+    road_type = Element("type", s="0", type="rural" if not street.sidewalk else "town")
+    SubElement(road_type, "speed", max=f"{street.limit:g}", unit="mph")
+    road.insert(1, road_type)
     lanes = lane_section(road)
-    middle = ("broken", "yellow") if street.lanes == 1 else ("solid solid", "yellow")
+    centre_mark = ("broken", "yellow") if street.lanes == 1 else ("solid solid", "yellow")
     if street.one_way or street.median:
-        middle = ("solid", "white") if street.one_way else ("none", "white")
+        centre_mark = ("solid", "white") if street.one_way else ("none", "white")
     for side, sign in (("left", 1), ("center", 0), ("right", -1)):
         if street.one_way and sign > 0:
             continue
         group = SubElement(lanes, side)
         if not sign:
-            mark_lane(SubElement(group, "lane", id="0", type="none", level="false"), *middle)
+            mark_lane(SubElement(group, "lane", id="0", type="none", level="false"), *centre_mark)
             continue
-        rows = [("median", 0.5 * street.median, ("solid", "white"))] if street.median else []
-        rows += [
-            ("driving", street.width, ("broken", "white") if k < street.lanes else ("solid", "white"))
-            for k in range(1, street.lanes + 1)
+        lane_specs = [("median", 0.5 * street.median, ("solid", "white"))] if street.median else []
+        lane_specs += [
+            ("driving", street.width, ("broken", "white") if index < street.lanes else ("solid", "white"))
+            for index in range(1, street.lanes + 1)
         ]
         if street.shoulder:
-            rows.append(("shoulder", street.shoulder, ("curb" if street.sidewalk else "none", "white")))
+            lane_specs.append(("shoulder", street.shoulder, ("curb" if street.sidewalk else "none", "white")))
         if street.sidewalk:
-            rows.append(("sidewalk", street.sidewalk, ("none", "white")))
-        table = [(sign * (k + 1), row) for k, row in enumerate(rows)]
-        for lane, (what, width, mark) in sorted(table, key=lambda item: -item[0]):
-            lane_element(group, lane, what, (width, 0.0, 0.0, 0.0), mark=mark)
+            lane_specs.append(("sidewalk", street.sidewalk, ("none", "white")))
+        numbered_lanes = [(sign * (index + 1), lane_spec) for index, lane_spec in enumerate(lane_specs)]
+        for lane, (lane_kind, lane_width, marking) in sorted(
+            numbered_lanes, key=lambda numbered_lane: -numbered_lane[0]
+        ):
+            lane_element(group, lane, lane_kind, (lane_width, 0.0, 0.0, 0.0), mark=marking)
     objects = SubElement(road, "objects")
     length = sum(piece.length for piece in pieces)
-    for k, junction in enumerate(ends):
-        aside = junction.crosswalk
-        if aside and street.sidewalk and not street.one_way:
-            _crosswalk(objects, number, k, length - aside if k else aside, street)
+    for index, junction in enumerate(ends):
+        crosswalk_offset = junction.crosswalk
+        if crosswalk_offset and street.sidewalk and not street.one_way:
+            _crosswalk(objects, number, index, length - crosswalk_offset if index else crosswalk_offset, street)
     SubElement(road, "signals")  # the last child: `_signals` fills it
     return road
 
 
 def _crosswalk(objects: Element, number: int, k: int, s: float, street: RoadSpec) -> None:
-    half = street.lanes * street.width + street.shoulder
-    name = {"id": str(100 * number + k), "name": "crosswalk", "type": "crosswalk", "orientation": "none"}
-    place = {"s": decimal(s), "t": "0", "zOffset": "0", "hdg": "0"}
-    item = SubElement(objects, "object", name | place, length=decimal(CROSSWALK), width=decimal(2 * half))
-    outline = SubElement(item, "outline")
-    u, v = 0.5 * CROSSWALK, half
-    for a, b in ((-u, -v), (u, -v), (u, v), (-u, v), (-u, -v)):
-        SubElement(outline, "cornerLocal", u=decimal(a), v=decimal(b), z="0", height="0")
+    half_width = street.lanes * street.width + street.shoulder
+    attributes = {"id": str(100 * number + k), "name": "crosswalk", "type": "crosswalk", "orientation": "none"}
+    position = {"s": decimal(s), "t": "0", "zOffset": "0", "hdg": "0"}
+    crosswalk = SubElement(
+        objects, "object", attributes | position, length=decimal(CROSSWALK), width=decimal(2 * half_width)
+    )
+    outline = SubElement(crosswalk, "outline")
+    u, v = 0.5 * CROSSWALK, half_width
+    for corner_u, corner_v in ((-u, -v), (u, -v), (u, v), (-u, v), (-u, -v)):
+        SubElement(outline, "cornerLocal", u=decimal(corner_u), v=decimal(corner_v), z="0", height="0")
 
 
 def _connect(roads: list[Element], root: Element, junction: Junction) -> None:
-    """Connecting roads for every movement through a junction."""
+    """Write the connecting roads of every movement through a junction."""
     element = SubElement(root, "junction", id=str(junction.id), name=f"junction {junction.id}")
     number = junction.id
-    for start in junction.arms:
-        for end in junction.arms:
-            if start is end or not (start.leads_in and end.leads_out):
+    for start_arm in junction.arms:
+        for end_arm in junction.arms:
+            if start_arm is end_arm or not (start_arm.leads_in and end_arm.leads_out):
                 continue
-            turn = wrap(end.heading - start.heading - math.pi)
-            for pairs in _movements(junction, start, end, turn):
+            turn_angle = wrap(end_arm.heading - start_arm.heading - math.pi)
+            for lane_pairs in _movements(junction, start_arm, end_arm, turn_angle):
                 number += 1
-                road = _way(number, (junction, junction), (start, end), pairs=pairs)
-                _add_way(roads, element, road, start, pairs)
+                road = _way(number, (junction, junction), (start_arm, end_arm), pairs=lane_pairs)
+                _add_way(roads, element, road, start_arm, lane_pairs)
 
 
 def _add_way(roads: list[Element], element: Element, road: Element, start: Arm, pairs: list[tuple[int, int]]) -> None:
     """Enter a connecting road into the list of roads and into its junction."""
     roads.append(road)
     number = road.get("id", "")
-    place = int(number) - int(element.get("id", "0")) - 1
-    attributes = {"id": str(place), "incomingRoad": str(start.road)}
-    joint = SubElement(element, "connection", attributes, connectingRoad=number, contactPoint="start")
-    for k, (one, _) in enumerate(pairs):
-        SubElement(joint, "laneLink", {"from": str(start.inward(one)), "to": str(-k - 1)})
+    position = int(number) - int(element.get("id", "0")) - 1
+    attributes = {"id": str(position), "incomingRoad": str(start.road)}
+    connection = SubElement(element, "connection", attributes, connectingRoad=number, contactPoint="start")
+    for index, (incoming_lane, _) in enumerate(pairs):
+        SubElement(connection, "laneLink", {"from": str(start.inward(incoming_lane)), "to": str(-index - 1)})
 
 
 def _interchange(roads: list[Element], root: Element, junction: Junction, ramps: tuple[Junction, Junction]) -> None:
     """Ways through an interchange: straight on, from the ramp `on` to the wider part, from there to the ramp `off`."""
     element = SubElement(root, "junction", id=str(junction.id), name=f"junction {junction.id}")
-    narrow, wide = sorted(junction.arms, key=lambda arm: arm.street.lanes)
-    on, off = ramps
-    lanes = [(k, k) for k in range(1, narrow.street.lanes + 1)]
-    last = wide.street.lanes
-    for k, (places, arms, pairs) in enumerate(
+    narrow_arm, wide_arm = sorted(junction.arms, key=lambda arm: arm.street.lanes)
+    entry_ramp, exit_ramp = ramps
+    lanes = [(lane, lane) for lane in range(1, narrow_arm.street.lanes + 1)]
+    outermost = wide_arm.street.lanes
+    for lane, (place_pair, arm_pair, lane_pairs) in enumerate(
         (
-            ((junction, junction), (narrow, wide), lanes),
-            ((junction, junction), (wide, narrow), lanes),
-            ((on, junction), (on.arms[0], wide), [(1, last)]),
-            ((junction, off), (wide, off.arms[0]), [(last, 1)]),
+            ((junction, junction), (narrow_arm, wide_arm), lanes),
+            ((junction, junction), (wide_arm, narrow_arm), lanes),
+            ((entry_ramp, junction), (entry_ramp.arms[0], wide_arm), [(1, outermost)]),
+            ((junction, exit_ramp), (wide_arm, exit_ramp.arms[0]), [(outermost, 1)]),
         )
     ):
-        _add_way(roads, element, _way(junction.id + 1 + k, places, arms, pairs=pairs), arms[0], pairs)
+        _add_way(
+            roads,
+            element,
+            _way(junction.id + 1 + lane, place_pair, arm_pair, pairs=lane_pairs),
+            arm_pair[0],
+            lane_pairs,
+        )
 
 
 def _ring(roads: list[Element], root: Element, ring: Roundabout, entries: list[Junction]) -> None:
     """The roads of a ring between its arms, and at each arm the ways on, in and out."""
     entries = sorted(entries, key=lambda junction: wrap(junction.arms[0].heading))
     street = entries[0].arms[0].street
-    spec = RoadSpec((), 1, ring.width, street.shoulder, street.sidewalk, ring.limit, one_way=True)
-    number = {junction.id: junction.id + 400 for junction in entries}
-    for junction, after in zip(entries, entries[1:] + entries[:1], strict=True):
-        begin = junction.arms[0].heading + ring.spread
-        turn = (after.arms[0].heading - junction.arms[0].heading) % math.tau - 2.0 * ring.spread
-        pieces = [_arc(ring, begin, turn)]
-        roads.append(_street(number[junction.id], spec, pieces, (junction, after)))
-    for before, junction in zip(entries[-1:] + entries[:-1], entries, strict=True):
+    ring_spec = RoadSpec((), 1, ring.width, street.shoulder, street.sidewalk, ring.limit, one_way=True)
+    ring_numbers = {junction.id: junction.id + 400 for junction in entries}
+    for junction, next_entry in zip(entries, entries[1:] + entries[:1], strict=True):
+        start_angle = junction.arms[0].heading + ring.spread
+        turn_angle = (next_entry.arms[0].heading - junction.arms[0].heading) % math.tau - 2.0 * ring.spread
+        pieces = [_arc(ring, start_angle, turn_angle)]
+        roads.append(_street(ring_numbers[junction.id], ring_spec, pieces, (junction, next_entry)))
+    for previous_entry, junction in zip(entries[-1:] + entries[:-1], entries, strict=True):
         element = SubElement(root, "junction", id=str(junction.id), name=f"junction {junction.id}")
-        arm, turn = junction.arms[0], 0.5 * math.pi - ring.spread
-        comes, goes = Arm(number[before.id], spec, 0.0, True), Arm(number[junction.id], spec, 0.0, False)
-        low, high = arm.heading - ring.spread, arm.heading + ring.spread
-        end = ahead(ring.place, arm.heading, ring.setback)
-        inner = [ahead(ring.place, angle, ring.island) for angle in (low, high)]
-        ways = (
-            (comes, goes, [_arc(ring, low, 2.0 * ring.spread)]),
-            (arm, goes, turn_pieces(end, arm.heading + math.pi, inner[1], -turn)),
-            (comes, arm, turn_pieces(inner[0], low + 0.5 * math.pi, end, -turn)),
+        arm, turn_angle = junction.arms[0], 0.5 * math.pi - ring.spread
+        ring_in, ring_out = (
+            Arm(ring_numbers[previous_entry.id], ring_spec, 0.0, True),
+            Arm(ring_numbers[junction.id], ring_spec, 0.0, False),
         )
-        for k, (start, to, pieces) in enumerate(ways, start=1):
-            road = _way_road(junction.id + k, junction.id, (start, to), pieces)
-            fill_way(road, start, to, [(1, 1)], kerb=k > 1, eased=True)
-            _add_way(roads, element, road, start, [(1, 1)])
+        low_angle, high_angle = arm.heading - ring.spread, arm.heading + ring.spread
+        arm_end = ahead(ring.place, arm.heading, ring.setback)
+        island_points = [ahead(ring.place, angle, ring.island) for angle in (low_angle, high_angle)]
+        movements = (
+            (ring_in, ring_out, [_arc(ring, low_angle, 2.0 * ring.spread)]),
+            (arm, ring_out, turn_pieces(arm_end, arm.heading + math.pi, island_points[1], -turn_angle)),
+            (ring_in, arm, turn_pieces(island_points[0], low_angle + 0.5 * math.pi, arm_end, -turn_angle)),
+        )
+        for index, (start_arm, target, pieces) in enumerate(movements, start=1):
+            road = _way_road(junction.id + index, junction.id, (start_arm, target), pieces)
+            fill_way(road, start_arm, target, [(1, 1)], kerb=index > 1, eased=True)
+            _add_way(roads, element, road, start_arm, [(1, 1)])
 
 
 def _arc(ring: Roundabout, angle: float, turn: float) -> Piece:
@@ -252,34 +273,38 @@ def _movements(junction: Junction, start: Arm, end: Arm, turn: float) -> list[li
     Straight on keeps the lane. Turns join outermost to outermost, or innermost to innermost; where three arms
     meet they may also enter the lane beside, so that lanes are not separate circuits.
     """
-    n, m = start.street.lanes, end.street.lanes
+    incoming_lanes, outgoing_lanes = start.street.lanes, end.street.lanes
     if abs(turn) < 0.1:
-        return [[(k, k) for k in range(1, min(n, m) + 1)]]
-    one, main, other = (n, m, 1) if turn < 0.0 else (1, 1, m)
-    return [[(one, main)], [(one, other)]] if m > 1 and len(junction.arms) == 3 else [[(one, main)]]
+        return [[(lane, lane) for lane in range(1, min(incoming_lanes, outgoing_lanes) + 1)]]
+    from_lane, main_lane, other_lane = (incoming_lanes, outgoing_lanes, 1) if turn < 0.0 else (1, 1, outgoing_lanes)
+    return (
+        [[(from_lane, main_lane)], [(from_lane, other_lane)]]
+        if outgoing_lanes > 1 and len(junction.arms) == 3
+        else [[(from_lane, main_lane)]]
+    )
 
 
 def _way(
     number: int, places: tuple[Junction, Junction], arms: tuple[Arm, Arm], *, pairs: list[tuple[int, int]]
 ) -> Element:
-    """One connecting road between arms at two places; its reference line runs on the left edge of its leftmost lane."""
-    start, end = arms
-    turn = wrap(end.heading - start.heading - math.pi)
-    heading = start.heading + math.pi
-    a = _edge(places[0], start, -start.offset(pairs[0][0]), inward=True)
-    b = _edge(places[1], end, -end.offset(pairs[0][1]), inward=False)
-    road = _way_road(number, places[0].id, arms, turn_pieces(a, heading, b, turn))
+    """Write a connecting road; its reference line runs on the left edge of its leftmost lane."""
+    start_arm, end_arm = arms
+    turn_angle = wrap(end_arm.heading - start_arm.heading - math.pi)
+    heading = start_arm.heading + math.pi
+    start_point = _edge(places[0], start_arm, -start_arm.offset(pairs[0][0]), inward=True)
+    end_point = _edge(places[1], end_arm, -end_arm.offset(pairs[0][1]), inward=False)
+    road = _way_road(number, places[0].id, arms, turn_pieces(start_point, heading, end_point, turn_angle))
     # a kerb lies to the right of a right turn, and of a way straight on where no arm leaves to the right
-    right = wrap(heading - math.pi / 2.0)
-    open_right = any(abs(wrap(arm.heading - right)) < 0.1 for arm in places[0].arms)
-    outermost = pairs[-1] == (start.street.lanes, end.street.lanes)
-    kerb = outermost and (turn < -0.1 or (abs(turn) <= 0.1 and not open_right))
-    fill_way(road, start, end, pairs, kerb=kerb)
+    right_heading = wrap(heading - math.pi / 2.0)
+    open_right = any(abs(wrap(arm.heading - right_heading)) < 0.1 for arm in places[0].arms)
+    outermost = pairs[-1] == (start_arm.street.lanes, end_arm.street.lanes)
+    along_kerb = outermost and (turn_angle < -0.1 or (abs(turn_angle) <= 0.1 and not open_right))
+    fill_way(road, start_arm, end_arm, pairs, kerb=along_kerb)
     return road
 
 
 def _way_road(number: int, junction: int, arms: tuple[Arm, Arm], pieces: list[Piece]) -> Element:
-    """A connecting road without lanes."""
+    """Write a connecting road without lanes."""
     road = road_element(f"way {number}", number, junction, pieces)
     for name, arm in zip(("predecessor", "successor"), arms, strict=True):
         contact = "end" if arm.at_end else "start"
@@ -288,16 +313,16 @@ def _way_road(number: int, junction: int, arms: tuple[Arm, Arm], pieces: list[Pi
 
 
 def _signals(root: Element, roads: list[Element], junction: Junction, lengths: dict[int, float]) -> None:
-    """A light for every arm, and two controllers: arms along x, then arms along y."""
-    element = next(e for e in root.findall("junction") if e.get("id") == str(junction.id))
+    """Write a light for every arm, and two controllers: arms along x, then arms along y."""
+    element = next(candidate for candidate in root.findall("junction") if candidate.get("id") == str(junction.id))
     groups: dict[int, list[str]] = {}
-    for k, arm in enumerate(junction.arms):
+    for index, arm in enumerate(junction.arms):
         if not arm.leads_in:
             continue
-        number = str(junction.id + 500 + k)
+        number = str(junction.id + 500 + index)
         phase = 0 if abs(math.cos(arm.heading)) > 0.5 else 1
         groups.setdefault(phase, []).append(number)
-        half = arm.offset(arm.street.lanes + 1) + arm.street.shoulder + 0.5
+        offset = arm.offset(arm.street.lanes + 1) + arm.street.shoulder + 0.5
         s = lengths[arm.road] - 0.1 if arm.at_end else 0.1
         # orientation "+": it faces traffic that drives along the road's own direction
         light = SubElement(
@@ -306,7 +331,7 @@ def _signals(root: Element, roads: list[Element], junction: Junction, lengths: d
             name="Signal_3Light_Post01",
             id=number,
             s=decimal(s),
-            t=decimal(-half if arm.at_end else half),
+            t=decimal(-offset if arm.at_end else offset),
             zOffset="0",
             hOffset="0",
             roll="0",
@@ -321,24 +346,24 @@ def _signals(root: Element, roads: list[Element], junction: Junction, lengths: d
             height="1.2",
             width="0.5",
         )
-        low, high = sorted((arm.inward(1), arm.inward(arm.street.lanes)))
-        SubElement(light, "validity", fromLane=str(low), toLane=str(high))
+        low_lane, high_lane = sorted((arm.inward(1), arm.inward(arm.street.lanes)))
+        SubElement(light, "validity", fromLane=str(low_lane), toLane=str(high_lane))
     for phase, numbers in sorted(groups.items()):
         number = str(junction.id + 900 + phase)
         SubElement(element, "controller", id=number, type="0", sequence=str(phase))
         controller = Element("controller", name=f"controller {number}", id=number, sequence=str(phase))
-        for name in numbers:
-            SubElement(controller, "control", signalId=name, type="0")
+        for light_id in numbers:
+            SubElement(controller, "control", signalId=light_id, type="0")
         root.insert(list(root).index(element), controller)
 
 
 def _ruled(junction: Junction) -> list[Arm]:
-    """Arms of a junction without lights that get a sign: all of a crossroads, the stem of a T-junction."""
+    """Return the arms of a junction without lights that get a sign: all of a crossroads, the stem of a T-junction."""
     if len(junction.arms) < 3:
         return []
     arms = [arm for arm in junction.arms if arm.leads_in]
-    facing = [any(math.cos(a.heading - b.heading) < -0.9 for b in junction.arms) for a in arms]
-    return [arm for arm, faced in zip(arms, facing, strict=True) if all(facing) or not faced]
+    opposites = [any(math.cos(incoming.heading - other.heading) < -0.9 for other in junction.arms) for incoming in arms]
+    return [arm for arm, has_opposite in zip(arms, opposites, strict=True) if all(opposites) or not has_opposite]
 
 
 def _signs(
@@ -346,16 +371,16 @@ def _signs(
 ) -> None:
     """A stop or yield sign for each of the arms, beside the line where it is waited."""
     name, kind = ("Sign_Stop", "206") if stop else ("Sign_Yield", "205")
-    for k, arm in enumerate(ruled):
-        aside = arm.offset(arm.street.lanes + 1) + arm.street.shoulder + SIGN_ASIDE
-        back = STOP_LINE if arm.street.sidewalk and not junction.ring else 0.1
+    for index, arm in enumerate(ruled):
+        lateral = arm.offset(arm.street.lanes + 1) + arm.street.shoulder + SIGN_ASIDE
+        setback = STOP_LINE if arm.street.sidewalk and not junction.ring else 0.1
         post = SubElement(
             roads[arm.road - 1][-1],
             "signal",
             name=name,
-            id=str(junction.id + 700 + k),
-            s=decimal(lengths[arm.road] - back if arm.at_end else back),
-            t=decimal(-aside if arm.at_end else aside),
+            id=str(junction.id + 700 + index),
+            s=decimal(lengths[arm.road] - setback if arm.at_end else setback),
+            t=decimal(-lateral if arm.at_end else lateral),
             zOffset="0",
             hOffset="0",
             roll="0",
@@ -370,11 +395,11 @@ def _signs(
             height="0.76",
             width="0.76",
         )
-        low, high = sorted((arm.inward(1), arm.inward(arm.street.lanes)))
-        SubElement(post, "validity", fromLane=str(low), toLane=str(high))
+        low_lane, high_lane = sorted((arm.inward(1), arm.inward(arm.street.lanes)))
+        SubElement(post, "validity", fromLane=str(low_lane), toLane=str(high_lane))
 
 
 def _edge(junction: Junction, arm: Arm, offset: float, *, inward: bool) -> Point:
-    """Point at the end of an arm, `offset` m left of the street's middle as seen by traffic in or out."""
-    x, y = ahead(junction.place, arm.heading, junction.setback)
-    return ahead((x, y), arm.heading + (math.pi if inward else 0.0) + math.pi / 2.0, offset)
+    """Return the point at the end of an arm, `offset` m left of the street's middle as seen by traffic in or out."""
+    arm_x, arm_y = ahead(junction.place, arm.heading, junction.setback)
+    return ahead((arm_x, arm_y), arm.heading + (math.pi if inward else 0.0) + math.pi / 2.0, offset)

@@ -1,4 +1,4 @@
-"""Pieces of OpenDRIVE that towns are written from: specifications, reference lines, arms of junctions, XML elements."""
+"""OpenDRIVE building blocks of towns: specifications, reference lines, arms of junctions, XML elements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SETBACK_OF_CROSSWALK = 17.0  # m from the end of an arm to the crosswalk of a ro
 
 @dataclass(frozen=True)
 class RoadSpec:
-    """A road along a polyline with rounded inner corners; its halves are equal.
+    """Road along a polyline with rounded inner corners; its halves are equal.
 
     Signals and crosswalks belong to the junctions where streets end.
 
@@ -29,7 +29,7 @@ class RoadSpec:
         limit: Speed limit, mph.
         radius: Radius of the corners, m.
         median: Distance between the halves, m.
-        one_way: Only the right half, driven from the first point to the last.
+        one_way: Whether there is only the right half, driven from the first point to the last.
     """
 
     points: tuple[Point, ...]
@@ -45,9 +45,9 @@ class RoadSpec:
 
 @dataclass(frozen=True)
 class Roundabout:
-    """A ring of one lane, driven counterclockwise; streets with one lane on each side that end at its middle meet it.
+    """Ring of one lane, driven counterclockwise. Streets with one lane on each side connect to it and yield to it.
 
-    Arms yield to the ring.
+    A street connects if it ends at the ring's middle.
 
     Attributes:
         place: Middle, m.
@@ -109,13 +109,13 @@ class Town:
 
 @dataclass(frozen=True)
 class Arm:
-    """The end of a street at a junction.
+    """End of a street at a junction.
 
     Attributes:
         road: OpenDRIVE id of the street.
         street: Its specification.
         heading: Outwards from the junction, rad.
-        at_end: Whether the street ends here; else it begins here.
+        at_end: Whether the street ends at the junction; else it begins there.
     """
 
     road: int
@@ -125,12 +125,12 @@ class Arm:
 
     @property
     def leads_in(self) -> bool:
-        """Whether traffic comes from it."""
+        """True if traffic enters the junction from this arm."""
         return self.at_end or not self.street.one_way
 
     @property
     def leads_out(self) -> bool:
-        """Whether traffic leaves into it."""
+        """True if traffic leaves the junction into this arm."""
         return not (self.at_end and self.street.one_way)
 
     def inward(self, k: int) -> int:
@@ -146,18 +146,19 @@ class Arm:
         return 0.5 * self.street.median + (k - 1) * self.street.width
 
     def _id(self, k: int) -> int:
+        # A median takes the innermost lane id.
         return k + (self.street.median > 0.0)
 
 
 @dataclass
 class Junction:
-    """Arms that meet.
+    """Junction of arms.
 
     Attributes:
         id: OpenDRIVE id.
         place: x, y of the middle, m.
-        arms: Ends of the streets that meet here.
-        ring: The roundabout, if the junction is where one arm meets a roundabout.
+        arms: Ends of the streets that meet there.
+        ring: The roundabout, if one arm meets a roundabout at this junction.
         apart: Distance from the place to the ends of the arms, m; None: as far as right turns need.
     """
 
@@ -184,7 +185,7 @@ class Junction:
 
 @dataclass(frozen=True)
 class Piece:
-    """A line (curvature 0) or arc from x, y with heading hdg."""
+    """Line (curvature 0) or arc that starts at x, y with heading hdg."""
 
     x: float
     y: float
@@ -196,20 +197,27 @@ class Piece:
 def plan_pieces(street: RoadSpec, start: float, end: float) -> list[Piece]:
     """Reference line of a street between the ends of its arms: lines, and arcs at its corners."""
     points = list(street.points)
-    heads = [math.atan2(b[1] - a[1], b[0] - a[0]) for a, b in pairwise(points)]
-    points[0] = ahead(points[0], heads[0], start)
-    points[-1] = ahead(points[-1], heads[-1], -end)
-    pieces, here = [], points[0]
-    for i, head in enumerate(heads):
-        corner = points[i + 1]
-        turn = wrap(heads[i + 1] - head) if i + 1 < len(heads) else 0.0
-        tangent = street.radius * math.tan(abs(turn) / 2.0)
-        length = math.dist(here, corner) - tangent
-        pieces.append(Piece(*here, head, length, 0.0))
-        if turn:
-            begin = ahead(corner, head, -tangent)
-            pieces.append(Piece(*begin, head, street.radius * abs(turn), math.copysign(1.0 / street.radius, turn)))
-            here = ahead(corner, heads[i + 1], tangent)
+    headings = [
+        math.atan2(end_point[1] - start_point[1], end_point[0] - start_point[0])
+        for start_point, end_point in pairwise(points)
+    ]
+    points[0] = ahead(points[0], headings[0], start)
+    points[-1] = ahead(points[-1], headings[-1], -end)
+    pieces, position = [], points[0]
+    for index, heading in enumerate(headings):
+        corner = points[index + 1]
+        turn_angle = wrap(headings[index + 1] - heading) if index + 1 < len(headings) else 0.0
+        tangent = street.radius * math.tan(abs(turn_angle) / 2.0)
+        length = math.dist(position, corner) - tangent
+        pieces.append(Piece(*position, heading, length, 0.0))
+        if turn_angle:
+            arc_start = ahead(corner, heading, -tangent)
+            pieces.append(
+                Piece(
+                    *arc_start, heading, street.radius * abs(turn_angle), math.copysign(1.0 / street.radius, turn_angle)
+                )
+            )
+            position = ahead(corner, headings[index + 1], tangent)
     return pieces
 
 
@@ -219,18 +227,18 @@ def turn_pieces(start: Point, heading: float, end: Point, turn: float) -> list[P
         return [Piece(*start, heading, math.dist(start, end), 0.0)]
     # corner: where the two straight lines meet
     dx, dy = end[0] - start[0], end[1] - start[1]
-    out = heading + turn
-    before = (dx * math.sin(out) - dy * math.cos(out)) / math.sin(turn)
-    after = (dy * math.cos(heading) - dx * math.sin(heading)) / math.sin(turn)
-    tangent = min(before, after)
+    end_heading = heading + turn
+    entry_length = (dx * math.sin(end_heading) - dy * math.cos(end_heading)) / math.sin(turn)
+    exit_length = (dy * math.cos(heading) - dx * math.sin(heading)) / math.sin(turn)
+    tangent = min(entry_length, exit_length)
     radius = tangent / math.tan(abs(turn) / 2.0)
     pieces = []
-    if before - tangent > 1e-6:
-        pieces.append(Piece(*start, heading, before - tangent, 0.0))
-    begin = ahead(start, heading, before - tangent)
-    pieces.append(Piece(*begin, heading, radius * abs(turn), math.copysign(1.0 / radius, turn)))
-    if after - tangent > 1e-6:
-        pieces.append(Piece(*ahead(end, out, tangent - after), out, after - tangent, 0.0))
+    if entry_length - tangent > 1e-6:
+        pieces.append(Piece(*start, heading, entry_length - tangent, 0.0))
+    arc_start = ahead(start, heading, entry_length - tangent)
+    pieces.append(Piece(*arc_start, heading, radius * abs(turn), math.copysign(1.0 / radius, turn)))
+    if exit_length - tangent > 1e-6:
+        pieces.append(Piece(*ahead(end, end_heading, tangent - exit_length), end_heading, exit_length - tangent, 0.0))
     return pieces
 
 
@@ -252,52 +260,71 @@ def fill_way(
     centre = SubElement(SubElement(lanes, "center"), "lane", id="0", type="none", level="false")
     mark_lane(centre, "none", "white")
     group = SubElement(lanes, "right")
-    one, two = start.street, end.street
-    rows = [("driving", one.width, two.width, start.inward(i), end.outward(j)) for i, j in pairs]
-    if kerb and one.shoulder and two.shoulder:
-        rows.append(("shoulder", one.shoulder, two.shoulder, start.inward(one.lanes + 1), end.outward(two.lanes + 1)))
-        if one.sidewalk and two.sidewalk:
-            rows.append(
-                ("sidewalk", one.sidewalk, two.sidewalk, start.inward(one.lanes + 2), end.outward(two.lanes + 2))
+    first_street, second_street = start.street, end.street
+    lane_specs = [
+        ("driving", first_street.width, second_street.width, start.inward(incoming), end.outward(outgoing))
+        for incoming, outgoing in pairs
+    ]
+    if kerb and first_street.shoulder and second_street.shoulder:
+        lane_specs.append(
+            (
+                "shoulder",
+                first_street.shoulder,
+                second_street.shoulder,
+                start.inward(first_street.lanes + 1),
+                end.outward(second_street.lanes + 1),
             )
-    for k, (what, width, final, before, after) in enumerate(rows):
-        mark = "curb" if what == "shoulder" and one.sidewalk else "none"
-        slope = (final - width) / length
-        change = (0.0, 3.0 * slope / length, -2.0 * slope / length**2) if eased else (slope, 0.0, 0.0)
-        lane = lane_element(group, -k - 1, what, (width, *change), mark=(mark, "white"))
-        SubElement(lane[0], "predecessor", id=str(before))
-        SubElement(lane[0], "successor", id=str(after))
+        )
+        if first_street.sidewalk and second_street.sidewalk:
+            lane_specs.append(
+                (
+                    "sidewalk",
+                    first_street.sidewalk,
+                    second_street.sidewalk,
+                    start.inward(first_street.lanes + 2),
+                    end.outward(second_street.lanes + 2),
+                )
+            )
+    for index, (lane_kind, start_width, end_width, predecessor, successor) in enumerate(lane_specs):
+        marking = "curb" if lane_kind == "shoulder" and first_street.sidewalk else "none"
+        mean_slope = (end_width - start_width) / length
+        coefficients = (
+            (0.0, 3.0 * mean_slope / length, -2.0 * mean_slope / length**2) if eased else (mean_slope, 0.0, 0.0)
+        )
+        lane_node = lane_element(group, -index - 1, lane_kind, (start_width, *coefficients), mark=(marking, "white"))
+        SubElement(lane_node[0], "predecessor", id=str(predecessor))
+        SubElement(lane_node[0], "successor", id=str(successor))
 
 
 def road_element(name: str, number: int, junction: int, pieces: list[Piece]) -> Element:
-    """A road without lanes; its first child is its link."""
-    total = sum(piece.length for piece in pieces)
-    road = Element("road", name=name, length=decimal(total), id=str(number), junction=str(junction))
+    """Create a road without lanes; its first child is its link."""
+    total_length = sum(piece.length for piece in pieces)
+    road = Element("road", name=name, length=decimal(total_length), id=str(number), junction=str(junction))
     SubElement(road, "link")
-    plan = SubElement(road, "planView")
-    s = 0.0
+    plan_view = SubElement(road, "planView")
+    start = 0.0
     for piece in pieces:
-        item = SubElement(
-            plan,
+        geometry = SubElement(
+            plan_view,
             "geometry",
-            s=decimal(s),
+            s=decimal(start),
             x=decimal(piece.x),
             y=decimal(piece.y),
             hdg=decimal(wrap(piece.hdg)),
             length=decimal(piece.length),
         )
         if piece.curvature:
-            SubElement(item, "arc", curvature=decimal(piece.curvature))
+            SubElement(geometry, "arc", curvature=decimal(piece.curvature))
         else:
-            SubElement(item, "line")
-        s += piece.length
+            SubElement(geometry, "line")
+        start += piece.length
     SubElement(SubElement(road, "elevationProfile"), "elevation", s="0", a="0", b="0", c="0", d="0")
     SubElement(road, "lateralProfile")
     return road
 
 
 def lane_section(road: Element) -> Element:
-    """Add a road's lanes with no offset and one section from its start; returns the section."""
+    """Add a road's lanes without offset and with one section from its start; return the section."""
     lanes = SubElement(road, "lanes")
     SubElement(lanes, "laneOffset", s="0", a="0", b="0", c="0", d="0")
     return SubElement(lanes, "laneSection", s="0")
@@ -306,17 +333,17 @@ def lane_section(road: Element) -> Element:
 def lane_element(
     group: Element, number: int, kind: str, width: tuple[float, float, float, float], *, mark: tuple[str, str]
 ) -> Element:
-    """A lane whose width is a polynomial of the distance from its start; its first child is its link."""
+    """Add a lane whose width is a polynomial of the distance from its start; its first child is its link."""
     lane = SubElement(group, "lane", id=str(number), type=kind, level="false")
     SubElement(lane, "link")
-    factors = dict(zip("abcd", map(decimal, width), strict=True))
-    SubElement(lane, "width", {"sOffset": "0"} | factors)
+    coefficients = dict(zip("abcd", map(decimal, width), strict=True))
+    SubElement(lane, "width", {"sOffset": "0"} | coefficients)
     mark_lane(lane, *mark)
     return lane
 
 
 def mark_lane(lane: Element, kind: str, color: str) -> None:
-    """Add the paint on the outer edge of a lane; lane changes across it are allowed where it is broken and white."""
+    """Add the marking on the outer edge of a lane; it may be crossed where it is broken and white."""
     change = "both" if kind == "broken" and color == "white" else "none"
     SubElement(
         lane, "roadMark", sOffset="0", type=kind, weight="standard", color=color, width="0.12", laneChange=change
@@ -324,16 +351,16 @@ def mark_lane(lane: Element, kind: str, color: str) -> None:
 
 
 def ahead(point: Point, heading: float, distance: float) -> Point:
-    """The point at a distance (m) from a point along a heading (rad)."""
+    """Return the point at a distance (m) from a point along a heading (rad)."""
     return point[0] + distance * math.cos(heading), point[1] + distance * math.sin(heading)
 
 
 def wrap(angle: float) -> float:
-    """An angle in -pi..pi, rad."""
+    """Wrap an angle to -pi..pi, rad."""
     return math.remainder(angle, 2.0 * math.pi)
 
 
 def decimal(value: float) -> str:
-    """Nine decimals, so that the last bits of a machine's sine do not show; no minus zero."""
+    """Format a number with nine decimals, so that the last bits of a machine's sine do not show; no minus zero."""
     text = f"{value:.9f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text

@@ -1,6 +1,7 @@
-"""OpenDRIVE text, checked before any C++ sees it, and its structure: sections, lanes, links, signals.
+"""Validated OpenDRIVE text and its structure: sections, lanes, links, signals.
 
-Geometry is not evaluated here; that is `carla.Map`'s work (see `bake`).
+Everything is checked before C++ code reads the file. Geometry is not evaluated here; `carla.Map` does that (see
+`bake`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ MAX_LENGTH = 1.0e5  # m, of one road
 MAX_TOTAL = 1.0e6  # m, of all roads: bounds the work of the reader
 MAX_CURVATURE = 10.0  # 1/m
 PLANS = ("line", "arc", "spiral", "poly3", "paramPoly3")
+# Signal types follow the OpenDRIVE convention that CARLA's maps use.
 TRAFFIC_LIGHT = "1000001"
 SIGNS = {"206": SignKind.STOP, "205": SignKind.YIELD}  # types of signals that stand still
 STENCIL = "Stencil"  # names of paint on the road, to which CARLA's maps give the type of a sign, begin with it
@@ -90,7 +92,7 @@ _NUMBERS = frozenset(
 
 @dataclass(frozen=True)
 class Link:
-    """Where an end of a road leads: kind "road" or "junction", its id, and the end of that road."""
+    """Connection of a road's end: kind "road" or "junction", its id, and the contact point of that road."""
 
     kind: str
     id: int
@@ -99,7 +101,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane of a section; `mark` is the paint on its edge away from the road's centre."""
+    """Lane of a section; `mark` is the marking on its edge away from the road's centre."""
 
     id: int
     kind: LaneType
@@ -122,7 +124,7 @@ class Section:
 
 @dataclass(frozen=True)
 class SignalPlace:
-    """A traffic light, or a reference to one, on a road; it faces the lanes from low to high (0, 0: all)."""
+    """Traffic light on a road, or a reference to one; it applies to the lanes from low to high (0, 0: all)."""
 
     signal: str
     low: int
@@ -131,7 +133,7 @@ class SignalPlace:
 
 @dataclass(frozen=True)
 class SignPlace:
-    """A stop or yield sign on a road, or a reference to one.
+    """Stop or yield sign on a road, or a reference to one.
 
     Attributes:
         sign: Id of the signal.
@@ -148,7 +150,7 @@ class SignPlace:
 
 @dataclass(frozen=True)
 class Road:
-    """A road: its sections, where its ends lead, and the lights and signs on it."""
+    """Road with its sections, the connections of its ends, and its lights and signs."""
 
     id: int
     junction: int
@@ -162,7 +164,7 @@ class Road:
 
 @dataclass(frozen=True)
 class Connection:
-    """One way through a junction: lanes of the incoming road -> lanes of the connecting road."""
+    """Path through a junction: lanes of the incoming road -> lanes of the connecting road."""
 
     incoming: int
     connecting: int
@@ -172,14 +174,14 @@ class Connection:
 
 @dataclass(frozen=True)
 class Network:
-    """What an OpenDRIVE file says besides geometry.
+    """Structure of an OpenDRIVE file, without geometry.
 
     Attributes:
         roads: By id.
         junctions: Connections by id of the junction.
         lights: Ids of the traffic lights.
-        phase: Id of a light -> place of its controller in the cycle.
-        signs: Id of a sign -> what it says.
+        phase: Id of a light -> position of its controller in the cycle.
+        signs: Kind of each sign by id.
     """
 
     roads: dict[int, Road]
@@ -229,80 +231,95 @@ class _Reader:
         if root.tag != "OpenDRIVE":
             self.fail(f"<{str(root.tag)[:40]}>", "the root element is not <OpenDRIVE>")
         roads: dict[int, Road] = {}
-        total = 0.0
+        total_length = 0.0
         for element in root.findall("road"):
             road = self.road(element)
             if road.id in roads:
                 self.fail(f"road {road.id}", "two roads have this id")
             roads[road.id] = road
-            total += road.length
+            total_length += road.length
         if not roads:
             self.fail("<OpenDRIVE>", "no road in it")
-        if total > MAX_TOTAL:
-            self.fail("<OpenDRIVE>", f"{total:.0f} m of road, the limit is {MAX_TOTAL:.0f} m")
-        lanes = [lane for road in roads.values() for part in road.sections for lane in part.lanes.values()]
+        # Bounds the work of the reader, also for a damaged or crafted file.
+        if total_length > MAX_TOTAL:
+            self.fail("<OpenDRIVE>", f"{total_length:.0f} m of road, the limit is {MAX_TOTAL:.0f} m")
+        lanes = [lane for road in roads.values() for section in road.sections for lane in section.lanes.values()]
         if not any(lane.kind == LaneType.DRIVING for lane in lanes):
             self.fail("<OpenDRIVE>", "no drivable lane in it")
         junctions = {}
         for element in root.findall("junction"):
-            where = f"junction {element.get('id')}"
-            junctions[self.whole(element, "id", where)] = self.connections(element, where, roads)
-        posts = {s.get("id") for r in root.findall("road") for s in r.findall("signals/signal")}
+            location = f"junction {element.get('id')}"
+            junctions[self.whole(element, "id", location)] = self.connections(element, location, roads)
+        signal_ids = {
+            signal.get("id")
+            for road_element in root.findall("road")
+            for signal in road_element.findall("signals/signal")
+        }
         for element in root.findall("road"):
-            for other in element.findall("signals/signalReference"):
-                if other.get("id") not in posts:
-                    self.fail(f"road {element.get('id')}", f"it refers to signal {other.get('id')}, which is nowhere")
+            for reference in element.findall("signals/signalReference"):
+                if reference.get("id") not in signal_ids:
+                    self.fail(
+                        f"road {element.get('id')}", f"it refers to signal {reference.get('id')}, which is nowhere"
+                    )
         for road in roads.values():
             self.linked(road, roads, junctions)
-        lamps = [s for r in root.findall("road") for s in r.findall("signals/signal") if _light(s)]
-        lights = [post.get("id", "") for post in lamps]
+        light_signals = [
+            signal
+            for road_element in root.findall("road")
+            for signal in road_element.findall("signals/signal")
+            if _light(signal)
+        ]
+        lights = [light.get("id", "") for light in light_signals]
         phase: dict[str, int] = {}
         for element in root.findall("controller"):
             for control in element.findall("control"):
                 sequence = element.get("sequence", "0")
                 phase.setdefault(control.get("signalId", ""), int(sequence) if sequence.isdigit() else 0)
         signs = {
-            s.get("id", ""): SIGNS[s.get("type", "")]
-            for r in root.findall("road")
-            for s in r.findall("signals/signal")
-            if _sign(s)
+            signal.get("id", ""): SIGNS[signal.get("type", "")]
+            for road_element in root.findall("road")
+            for signal in road_element.findall("signals/signal")
+            if _sign(signal)
         }
         return Network(roads, junctions, tuple(dict.fromkeys(lights)), phase, signs)
 
     def road(self, element: Element) -> Road:
-        where = f"road {element.get('id')}"
-        for part in element.iter():
-            for name in _NUMBERS.intersection(part.keys()):
-                if part.tag not in ("object", "userData") or name in ("s", "t"):
-                    self.number(part, name, where)
-        length = self.number(element, "length", where)
+        location = f"road {element.get('id')}"
+        for descendant in element.iter():
+            for name in _NUMBERS.intersection(descendant.keys()):
+                # Objects and user data may hold other text in attributes of these names.
+                if descendant.tag not in ("object", "userData") or name in ("s", "t"):
+                    self.number(descendant, name, location)
+        length = self.number(element, "length", location)
         if not 0.0 < length <= MAX_LENGTH:
-            self.fail(where, f"length {length:g} m is not in (0, {MAX_LENGTH:g}]")
-        plans = element.findall("planView/geometry")
-        if not plans:
-            self.fail(where, "<planView> has no <geometry>")
-        starts = [self.number(plan, "s", where) for plan in plans]
-        if abs(starts[0]) > 1e-3 or starts != sorted(starts):
-            self.fail(where, f"its <geometry> elements are not in order from s=0 (the first has s={starts[0]:g})")
-        for plan in plans:
+            self.fail(location, f"length {length:g} m is not in (0, {MAX_LENGTH:g}]")
+        geometries = element.findall("planView/geometry")
+        if not geometries:
+            self.fail(location, "<planView> has no <geometry>")
+        start_positions = [self.number(geometry, "s", location) for geometry in geometries]
+        if abs(start_positions[0]) > 1e-3 or start_positions != sorted(start_positions):
+            self.fail(
+                location, f"its <geometry> elements are not in order from s=0 (the first has s={start_positions[0]:g})"
+            )
+        for geometry in geometries:
             for name in ("s", "x", "y", "hdg", "length"):
-                self.number(plan, name, where)
-            if float(plan.get("length", "0")) < 0.0:
-                self.fail(where, "<geometry> has a negative length")
-            shape = [child for child in plan if child.tag != "userData"]
+                self.number(geometry, name, location)
+            if float(geometry.get("length", "0")) < 0.0:
+                self.fail(location, "<geometry> has a negative length")
+            shape = [child for child in geometry if child.tag != "userData"]
             if len(shape) != 1 or shape[0].tag not in PLANS:
-                found = ", ".join(str(child.tag)[:30] for child in shape) or "nothing"
-                self.fail(where, f"<geometry> holds {found}; known are {', '.join(PLANS)}")
+                child_tags = ", ".join(str(child.tag)[:30] for child in shape) or "nothing"
+                self.fail(location, f"<geometry> holds {child_tags}; known are {', '.join(PLANS)}")
             for name in ("curvature", "curvStart", "curvEnd"):
-                if abs(self.number(shape[0], name, where, 0.0)) > MAX_CURVATURE:
-                    self.fail(where, f"{name} is beyond {MAX_CURVATURE:g} 1/m")
+                if abs(self.number(shape[0], name, location, 0.0)) > MAX_CURVATURE:
+                    self.fail(location, f"{name} is beyond {MAX_CURVATURE:g} 1/m")
         return Road(
-            id=self.whole(element, "id", where),
-            junction=self.whole(element, "junction", where) if element.get("junction") else -1,
+            id=self.whole(element, "id", location),
+            junction=self.whole(element, "junction", location) if element.get("junction") else -1,
             length=length,
-            sections=self.sections(element, where, length),
-            predecessor=self.link(element, "predecessor", where),
-            successor=self.link(element, "successor", where),
+            sections=self.sections(element, location, length),
+            predecessor=self.link(element, "predecessor", location),
+            successor=self.link(element, "successor", location),
             lights=tuple(_places(element)),
             signs=tuple(_sign_places(element)),
         )
@@ -317,7 +334,7 @@ class _Reader:
         return Link(kind, self.whole(element, "elementId", where), element.get("contactPoint", "start"))
 
     def linked(self, road: Road, roads: dict[int, Road], junctions: dict[int, tuple[Connection, ...]]) -> None:
-        """Refuse links to what is not there."""
+        """Reject links to roads or junctions that the map lacks."""
         for link in (road.predecessor, road.successor):
             if link and link.id not in (roads if link.kind == "road" else junctions):
                 self.fail(f"road {road.id}", f"it is linked to {link.kind} {link.id}, which the map lacks")
@@ -325,7 +342,7 @@ class _Reader:
     def connections(self, junction: Element, where: str, roads: dict[int, Road]) -> tuple[Connection, ...]:
         found = []
         for element in junction.findall("connection"):
-            pairs = tuple(
+            lane_pairs = tuple(
                 (self.whole(link, "from", where), self.whole(link, "to", where)) for link in element.findall("laneLink")
             )
             incoming = self.whole(element, "incomingRoad", where)
@@ -333,53 +350,57 @@ class _Reader:
             for road in (incoming, connecting):
                 if road not in roads:
                     self.fail(where, f"it connects road {road}, which is not in the map")
-            found.append(Connection(incoming, connecting, element.get("contactPoint", "start"), pairs))
+            found.append(Connection(incoming, connecting, element.get("contactPoint", "start"), lane_pairs))
         return tuple(found)
 
     def sections(self, road: Element, where: str, length: float) -> tuple[Section, ...]:
         elements = road.findall("lanes/laneSection")
         if not elements:
             self.fail(where, "it has no <laneSection>")
-        starts = [self.number(element, "s", where) for element in elements]
-        if starts != sorted(starts) or starts[0] < 0.0:
+        start_positions = [self.number(element, "s", where) for element in elements]
+        if start_positions != sorted(start_positions) or start_positions[0] < 0.0:
             self.fail(where, "its lane sections are not in order")
-        limits = []
-        for kind in road.findall("type"):
-            speed = kind.find("speed")
+        speed_limits = []
+        for road_type in road.findall("type"):
+            speed = road_type.find("speed")
             if speed is not None:
-                limits.append((self.number(kind, "s", where), self.speed(speed, where)))
+                speed_limits.append((self.number(road_type, "s", where), self.speed(speed, where)))
         result = []
-        for i, element in enumerate(elements):
-            end = starts[i + 1] if i + 1 < len(starts) else length
-            middle = 0.5 * (end - starts[i])
+        for index, element in enumerate(elements):
+            section_end = start_positions[index + 1] if index + 1 < len(start_positions) else length
+            middle = 0.5 * (section_end - start_positions[index])
             lanes: dict[int, Lane] = {}
-            centre = Marking.NONE
-            for side in ("left", "center", "right"):
-                for lane in element.findall(f"{side}/lane"):
-                    number = self.whole(lane, "id", where)
-                    mark = self.mark(lane, middle, where)
-                    if number == 0:
-                        centre = mark
+            centre_mark = Marking.NONE
+            for side_name in ("left", "center", "right"):
+                for lane in element.findall(f"{side_name}/lane"):
+                    lane_id = self.whole(lane, "id", where)
+                    marking = self.mark(lane, middle, where)
+                    if lane_id == 0:
+                        centre_mark = marking
                         continue
-                    if (number > 0) != (side == "left") or number in lanes:
-                        self.fail(where, f"lane {number} is on the wrong side or there twice")
-                    lanes[number] = self.lane(lane, number, mark, where)
-            known = [value for s, value in limits if s <= starts[i] + middle]
-            result.append(Section(starts[i], end, lanes, centre, known[-1] if known else None))
+                    if (lane_id > 0) != (side_name == "left") or lane_id in lanes:
+                        self.fail(where, f"lane {lane_id} is on the wrong side or there twice")
+                    lanes[lane_id] = self.lane(lane, lane_id, marking, where)
+            valid_limits = [value for position, value in speed_limits if position <= start_positions[index] + middle]
+            result.append(
+                Section(
+                    start_positions[index], section_end, lanes, centre_mark, valid_limits[-1] if valid_limits else None
+                )
+            )
         return tuple(result)
 
     def lane(self, element: Element, number: int, mark: Marking, where: str) -> Lane:
-        linked: list[int | None] = []
+        neighbour_ids: list[int | None] = []
         for name in ("predecessor", "successor"):
             link = element.find(f"link/{name}")
-            linked.append(None if link is None else self.whole(link, "id", where))
+            neighbour_ids.append(None if link is None else self.whole(link, "id", where))
         speed = element.find("speed")
         return Lane(
             number,
             _KINDS.get(element.get("type", "none"), LaneType.NONE),
             mark,
             None if speed is None else self.speed(speed, where),
-            *linked,
+            *neighbour_ids,
         )
 
     def speed(self, element: Element, where: str) -> float | None:
@@ -401,7 +422,7 @@ class _Reader:
 
 
 def read_network(path: Path) -> Network:
-    """Check an OpenDRIVE file and give its structure. MapError names file and element."""
+    """Validate an OpenDRIVE file and return its structure. MapError names file and element."""
     return _Reader(path).network()
 
 
@@ -414,26 +435,31 @@ def _sign(signal: Element) -> bool:
 
 
 def _sign_places(road: Element) -> list[SignPlace]:
-    """Signs on a road, and references, which may be to signals of any kind."""
-    found = []
+    """Return the signs on a road, and references, which may be to signals of any kind."""
+    places = []
     for element in [*road.findall("signals/signal"), *road.findall("signals/signalReference")]:
         if element.tag == "signal" and not _sign(element):
             continue
-        way = {"+": 1, "-": -1}.get(element.get("orientation", "none"), 0)
-        found += [SignPlace(element.get("id", ""), way, low, high) for low, high in _spans(element)]
-    return found
+        direction = {"+": 1, "-": -1}.get(element.get("orientation", "none"), 0)
+        places += [
+            SignPlace(element.get("id", ""), direction, low_lane, high_lane) for low_lane, high_lane in _spans(element)
+        ]
+    return places
 
 
 def _spans(signal: Element) -> list[tuple[int, int]]:
-    """Lanes that a signal is for, lowest and highest of each range; 0, 0 for all."""
-    spans = [(int(v.get("fromLane", "0")), int(v.get("toLane", "0"))) for v in signal.findall("validity")]
+    """Return the lowest and highest lane of each range that a signal applies to; 0, 0 for all."""
+    spans = [
+        (int(validity.get("fromLane", "0")), int(validity.get("toLane", "0")))
+        for validity in signal.findall("validity")
+    ]
     return [(min(span), max(span)) for span in spans] or [(0, 0)]
 
 
 def _places(road: Element) -> list[SignalPlace]:
-    found = []
+    places = []
     for element in [*road.findall("signals/signal"), *road.findall("signals/signalReference")]:
         if element.tag == "signal" and not _light(element):
             continue
-        found += [SignalPlace(element.get("id", ""), low, high) for low, high in _spans(element)]
-    return found
+        places += [SignalPlace(element.get("id", ""), low_lane, high_lane) for low_lane, high_lane in _spans(element)]
+    return places

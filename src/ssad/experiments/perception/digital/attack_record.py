@@ -1,4 +1,4 @@
-"""The record of a system under a digital attack: scores, what the attack took, and what is lost of the clean mAP."""
+"""Record of a system under a digital attack: scores, cost of the attack, and loss of clean mAP."""
 
 from __future__ import annotations
 
@@ -31,49 +31,59 @@ from ssad.experiments.perception.scene_boxes import (
 def attack_record(
     examination: Examination, system: str, specs: Sequence[AttackSpec], scenes: Sequence[Condition], *, replicates: int
 ) -> dict[str, Any]:
-    """Metrics of a system, and what an attack took of them.
+    """Return the metrics of a system under an attack, and the cost and effect of the attack.
 
     Args:
         examination: Data, detectors, device.
-        system: Whose boxes are scored.
-        specs: The attack; of an ensemble its members; none: clean data.
-        scenes: Under the attack; of an ensemble those of one member after another. Their boxes are there.
-        replicates: Of the bootstrap.
+        system: System whose boxes are scored.
+        specs: The attack; the members of an ensemble; empty: clean data.
+        scenes: Conditions under the attack, those of an ensemble one member after another. Their boxes exist.
+        replicates: Replicates of the bootstrap.
 
     Raises:
         ConfigError: The attack is about an object that these scenes do not have.
     """
-    eye = Eye(examination, system)
-    whole = [ShiftedScene(None, 0, one.scene) for one in scenes[: len(scenes) // max(len(specs), 1)]]
-    for one in whole:
-        find_boxes(examination, one, [system])
-    truth = truth_of(examination, [one.scene for one in whole])
-    clean, _ = read_scenes(examination, system, whole)
-    before = eye.score(clean, truth, replicates=replicates if not specs else 0)
+    scorer = Eye(examination, system)
+    clean_scenes = [ShiftedScene(None, 0, condition.scene) for condition in scenes[: len(scenes) // max(len(specs), 1)]]
+    # The clean boxes are a by-product of other cells; missing ones are found now.
+    for condition in clean_scenes:
+        find_boxes(examination, condition, [system])
+    truth = truth_of(examination, [condition.scene for condition in clean_scenes])
+    clean_boxes, _ = read_scenes(examination, system, clean_scenes)
+    # Under an attack the clean score is only a reference; its intervals stand in the clean record.
+    clean_result = scorer.score(clean_boxes, truth, replicates=replicates if not specs else 0)
     if not specs:
-        return {**before, "metrics": before["metrics"] | eye.by_distance(clean, truth)}
-    parts = [scenes[k : k + len(whole)] for k in range(0, len(scenes), len(whole))]
-    found, noted = zip(*(read_scenes(examination, system, part) for part in parts), strict=True)
-    told: dict[str, Any] = {}
-    boxes = found[0]
+        return {**clean_result, "metrics": clean_result["metrics"] | scorer.by_distance(clean_boxes, truth)}
+    member_scenes = [scenes[start : start + len(clean_scenes)] for start in range(0, len(scenes), len(clean_scenes))]
+    member_boxes, member_notes = zip(
+        *(read_scenes(examination, system, scene_group) for scene_group in member_scenes), strict=True
+    )
+    worst_column: dict[str, Any] = {}
+    boxes = member_boxes[0]
     if len(specs) > 1:
-        candidates = dict(zip((spec.name for spec in specs), found, strict=True))
-        told["worst"], boxes = worst_of(candidates, truth, eye.match(truth))
-    after = eye.score(boxes, truth, replicates=replicates)
-    metrics = after["metrics"] | eye.by_distance(boxes, truth)
-    clean_score = before["metrics"]["mAP"]
+        candidates = dict(zip((spec.name for spec in specs), member_boxes, strict=True))
+        worst_column["worst"], boxes = worst_of(candidates, truth, scorer.match(truth))
+    attacked_result = scorer.score(boxes, truth, replicates=replicates)
+    metrics = attacked_result["metrics"] | scorer.by_distance(boxes, truth)
+    clean_score = clean_result["metrics"]["mAP"]
     metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None
-    if not specs[0].aim.everything and not eye.flat:
-        places = _places(examination, specs[0], whole)
-        metrics |= target_success(clean, boxes, truth, specs[0].wanted, becomes=dict(specs[0].becomes), at=places)
-    return {**after, **sum_members(noted), **told, "metrics": metrics, "clean_mAP": clean_score}
+    if not specs[0].aim.everything and not scorer.flat:
+        places = _places(examination, specs[0], clean_scenes)
+        metrics |= target_success(clean_boxes, boxes, truth, specs[0].wanted, becomes=dict(specs[0].becomes), at=places)
+    return {
+        **attacked_result,
+        **sum_members(member_notes),
+        **worst_column,
+        "metrics": metrics,
+        "clean_mAP": clean_score,
+    }
 
 
 class Eye:
-    """How the boxes of a system are scored: in the world those of 3D detectors, in the images those of 2D detectors.
+    """Scorer of the boxes of a system: in the world for 3D detectors, in the images for 2D detectors.
 
     Attributes:
-        flat: Whether it finds 2D boxes.
+        flat: True if the system finds 2D boxes.
     """
 
     def __init__(self, examination: Examination, system: str) -> None:
@@ -87,24 +97,28 @@ class Eye:
         return score_found(self._examination, boxes, truth, replicates=replicates)
 
     def match(self, truth: GroundTruth) -> Match | None:
-        """What `worst_of` compares by."""
+        """Return the function by which `worst_of` compares; None: its default."""
         if not self.flat:
             return None
-        pictures = picture_truth_of(self._examination, truth)
-        return lambda boxes: match_pictures(boxes, pictures, self._detector.classes)
+        picture_truth = picture_truth_of(self._examination, truth)
+        return lambda boxes: match_pictures(boxes, picture_truth, self._detector.classes)
 
     def by_distance(self, boxes: Sequence[Any], truth: GroundTruth) -> dict[str, float]:
-        """See `by_distance`; boxes in images are at no distance."""
+        """Return the scores by distance; boxes in images are at no distance."""
         return {} if self.flat else by_distance(boxes, truth)
 
 
 def _places(examination: Examination, spec: AttackSpec, scenes: Sequence[Condition]) -> dict[str, F64] | None:
-    """Where the one object is that is attacked, by sample; None: more than one is. ConfigError: it is nowhere."""
+    """Return the position of the attacked object by sample; None if more than one is attacked.
+
+    Raises:
+        ConfigError: No sample has the object.
+    """
     if not spec.object:
         return None
-    with NuScenes(examination.root, examination.version) as data:
-        parts = [chosen_places(data.scene(one.scene), spec.object, spec.wanted) for one in scenes]
-    found = {token: place for part in parts for token, place in part.items()}
-    if not found:
+    with NuScenes(examination.root, examination.version) as dataset:
+        scene_places = [chosen_places(dataset.scene(condition.scene), spec.object, spec.wanted) for condition in scenes]
+    places = {token: place for places_of_scene in scene_places for token, place in places_of_scene.items()}
+    if not places:
         raise ConfigError(f"object {spec.object}: no moment of these scenes has it; nothing was attacked")
-    return found
+    return places

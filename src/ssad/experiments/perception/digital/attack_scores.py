@@ -1,6 +1,6 @@
-"""What boxes under an attack tell besides mAP and NDS.
+"""Scores under an attack besides mAP and NDS.
 
-Scores by distance, the success of a targeted attack, and the worst of several attacks at each moment.
+They are scores by distance, the success of a targeted attack, and the worst of several attacks at each moment.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ SEEN = 0.1  # least score of a box that counts as a detection of an object
 
 
 class Matched(Protocol):
-    """Boxes against the truth: `ssad.metrics.detection.Matches`, or `PictureMatches` of 2D detectors."""
+    """Boxes matched with the truth: `ssad.metrics.detection.Matches`, or `PictureMatches` of 2D detectors."""
 
     @property
     def samples(self) -> int:
-        """How many there are."""
+        """Number of samples."""
 
     @property
     def truth_counts(self) -> Any:
         """True boxes by class and sample [C, S]."""
 
     def scores(self, weights: Any = None) -> Any:
-        """Scores with `ap` [C, ...] and `mean_ap`, where samples count as often as their weights say."""
+        """Return scores with `ap` [C, ...] and `mean_ap`, in which samples count as often as their weights."""
 
 
 Match = Callable[[Sequence[Any]], Matched]
@@ -53,15 +53,19 @@ def by_distance(found: Sequence[SampleBoxes], truth: GroundTruth) -> dict[str, f
         mAP_BAND, the mean over the classes that are there, and recall_BAND, the share of objects with a box of their
         class within 2 m; a band without objects has neither.
     """
-    real = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
+    truth_boxes = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
     boxes = filter_boxes(box_table(found, truth), racks=truth.racks)
     scores: dict[str, float] = {}
-    for name, (low, high) in BANDS.items():
-        own = match(_between(real, low, high), _between(boxes, low, high), samples=len(truth.samples))
-        there = own.truth_counts.sum(1) > 0
-        if there.any():
-            scores[f"mAP_{name}"] = round(float(own.scores().ap[there].mean()), 6)
-            scores[f"recall_{name}"] = round(_hits(own) / int(own.truth_counts.sum()), 6)
+    for name, (near_limit, far_limit) in BANDS.items():
+        band_matches = match(
+            _between(truth_boxes, near_limit, far_limit),
+            _between(boxes, near_limit, far_limit),
+            samples=len(truth.samples),
+        )
+        has_objects = band_matches.truth_counts.sum(1) > 0
+        if has_objects.any():
+            scores[f"mAP_{name}"] = round(float(band_matches.scores().ap[has_objects].mean()), 6)
+            scores[f"recall_{name}"] = round(_hits(band_matches) / int(band_matches.truth_counts.sum()), 6)
     return scores
 
 
@@ -70,9 +74,9 @@ def _between(boxes: BoxTable, low: float, high: float) -> BoxTable:
 
 
 def _hits(matches: Matches) -> int:
-    """Objects that are found within 2 m."""
-    place = CVPR_2019.dist_ths.index(NEAR)
-    return sum(len(one.hits[place]) for one in matches.classes)
+    """Count the objects that are found within 2 m."""
+    threshold_index = CVPR_2019.dist_ths.index(NEAR)
+    return sum(len(class_matches.hits[threshold_index]) for class_matches in matches.classes)
 
 
 def target_success(
@@ -102,35 +106,48 @@ def target_success(
         success, absent if no such object is found; targets, the number of objects; kept, the share of the others that
         are found as what they are in both, absent if there are none.
     """
-    real = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
-    chosen = np.isin(real.label, [CLASSES.index(name) for name in becomes or classes or CLASSES])
+    truth_boxes = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
+    is_target = np.isin(truth_boxes.label, [CLASSES.index(name) for name in becomes or classes or CLASSES])
     if at is not None:
         places = np.array([at.get(token, np.full(3, np.nan)) for token in truth.samples])
-        chosen &= np.abs(real.centre - places[real.sample]).max(1) < SAME
-    before, after = (_taken_for(real, box_table(found, truth)) for found in (clean, attacked))
-    known = before == real.label
-    others = known & ~chosen
-    kept = {"kept": round(float((after == before)[others].mean()), 6)} if others.any() else {}
-    known &= chosen
-    wanted = {CLASSES.index(one): CLASSES.index(other) for one, other in becomes.items()}
-    reached = after == [wanted.get(int(label), -2) for label in real.label] if becomes else after != real.label
-    count = int(known.sum())
-    return {"targets": count, **({"success": round(float(reached[known].mean()), 6)} if count else {}), **kept}
+        is_target &= np.abs(truth_boxes.centre - places[truth_boxes.sample]).max(1) < SAME
+    clean_labels, attacked_labels = (_taken_for(truth_boxes, box_table(boxes, truth)) for boxes in (clean, attacked))
+    is_found = clean_labels == truth_boxes.label
+    is_bystander = is_found & ~is_target
+    kept_column = (
+        {"kept": round(float((attacked_labels == clean_labels)[is_bystander].mean()), 6)} if is_bystander.any() else {}
+    )
+    is_found &= is_target
+    target_labels = {
+        CLASSES.index(source_class): CLASSES.index(target_class) for source_class, target_class in becomes.items()
+    }
+    # -2 equals no label: -1 already means that there is no box.
+    is_reached = (
+        attacked_labels == [target_labels.get(int(label), -2) for label in truth_boxes.label]
+        if becomes
+        else attacked_labels != truth_boxes.label
+    )
+    count = int(is_found.sum())
+    return {
+        "targets": count,
+        **({"success": round(float(is_reached[is_found].mean()), 6)} if count else {}),
+        **kept_column,
+    }
 
 
 def _taken_for(real: BoxTable, boxes: BoxTable) -> F64:
     """Label of the best box near each object [N]; -1: there is none."""
-    found = np.full(len(real.label), -1)
+    labels = np.full(len(real.label), -1)
     boxes = boxes.take(np.flatnonzero(boxes.score >= SEEN))
     for sample in np.unique(real.sample):
-        rows, near = np.flatnonzero(real.sample == sample), np.flatnonzero(boxes.sample == sample)
-        if not len(near):
+        rows, candidate_rows = np.flatnonzero(real.sample == sample), np.flatnonzero(boxes.sample == sample)
+        if not len(candidate_rows):
             continue
-        gap = np.linalg.norm(real.centre[rows, None, :2] - boxes.centre[None, near, :2], axis=-1)
-        score = np.where(gap < NEAR, boxes.score[near][None], -1.0)
-        best = score.argmax(1)
-        found[rows] = np.where(score.max(1) >= SEEN, boxes.label[near][best], -1)
-    return found
+        distances = np.linalg.norm(real.centre[rows, None, :2] - boxes.centre[None, candidate_rows, :2], axis=-1)
+        nearby_scores = np.where(distances < NEAR, boxes.score[candidate_rows][None], -1.0)
+        best_candidate = nearby_scores.argmax(1)
+        labels[rows] = np.where(nearby_scores.max(1) >= SEEN, boxes.label[candidate_rows][best_candidate], -1)
+    return labels
 
 
 def worst_by_sample(found: Sequence[Sequence[Any]], tokens: Sequence[str], match: Match) -> list[Any]:
@@ -145,41 +162,49 @@ def worst_by_sample(found: Sequence[Sequence[Any]], tokens: Sequence[str], match
         For each sample the boxes of the attack with the least mAP over this sample alone; of equal ones those with the
         larger sum of scores, as there is more among them that is false.
     """
-    tables = [{one.token: one for one in boxes} for boxes in found]
-    left = np.stack([_by_sample(match(boxes)) for boxes in found])
+    tables = [{sample_boxes.token: sample_boxes for sample_boxes in boxes} for boxes in found]
+    sample_ap = np.stack([_by_sample(match(boxes)) for boxes in found])
     noise = np.array([[float(np.sum(table[token].boxes.score)) for token in tokens] for table in tables])
-    return [tables[min(range(len(found)), key=lambda m: (left[m, k], -noise[m, k]))][t] for k, t in enumerate(tokens)]
+    return [
+        tables[
+            min(range(len(found)), key=lambda attack: (sample_ap[attack, sample_index], -noise[attack, sample_index]))
+        ][sample_token]
+        for sample_index, sample_token in enumerate(tokens)
+    ]
 
 
 def worst_of(
     candidates: Mapping[str, Sequence[Any]], truth: GroundTruth, match: Match | None = None
 ) -> tuple[str, list[Any]]:
-    """The boxes that score least over the whole set: those of one of the attacks, or the worst of each moment.
+    """Return the boxes with the lowest score over the whole set: those of one attack, or the worst of each moment.
 
     The mixture of moments alone guarantees nothing, as mAP over a set is no mean over moments.
 
     Args:
         candidates: Boxes of all samples under each attack, by its name.
-        truth: Of the same samples.
+        truth: Ground truth of the same samples.
         match: Matches boxes with the truth; None: as the official evaluation of 3D detectors does.
 
     Returns:
         A name, "mixture" for the worst of each moment, and its boxes: their mAP is at most that of each attack.
     """
-    against: Match = match or (lambda boxes: match_boxes(boxes, truth))
-    every = {**candidates, "mixture": worst_by_sample(list(candidates.values()), truth.samples, against)}
-    left = {name: against(boxes).scores().mean_ap for name, boxes in every.items()}
-    name = min(left, key=lambda one: left[one])
-    return name, list(every[name])
+    match_function: Match = match or (lambda boxes: match_boxes(boxes, truth))
+    all_candidates = {
+        **candidates,
+        "mixture": worst_by_sample(list(candidates.values()), truth.samples, match_function),
+    }
+    mean_ap = {name: match_function(boxes).scores().mean_ap for name, boxes in all_candidates.items()}
+    name = min(mean_ap, key=lambda candidate: mean_ap[candidate])
+    return name, list(all_candidates[name])
 
 
 def _by_sample(matches: Matched) -> F64:
-    """Mean AP of each sample alone [S], over the classes that are in it."""
-    found = np.zeros(matches.samples)
-    for k in range(matches.samples):
-        there = matches.truth_counts[:, k] > 0
-        if there.any():
-            once = np.zeros(matches.samples, np.int64)
-            once[k] = 1
-            found[k] = matches.scores(once).ap[there].mean()
-    return found
+    """Return the mean AP of each sample alone [S], over the classes that are in it."""
+    mean_ap = np.zeros(matches.samples)
+    for sample_index in range(matches.samples):
+        has_class = matches.truth_counts[:, sample_index] > 0
+        if has_class.any():
+            weights = np.zeros(matches.samples, np.int64)
+            weights[sample_index] = 1
+            mean_ap[sample_index] = matches.scores(weights).ap[has_class].mean()
+    return mean_ap

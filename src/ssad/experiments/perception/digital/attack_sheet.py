@@ -1,4 +1,4 @@
-"""What a detector sees under digital attacks: one moment, what was changed, and its boxes before and after."""
+"""Sheet of digital attacks: one moment, the change of its image, and the boxes before and after."""
 
 from __future__ import annotations
 
@@ -18,37 +18,39 @@ from ssad.experiments.perception.sheets import WIDTH, richest, tile
 
 
 def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpec]) -> U8:
-    """A row for the clean moment and for each attack: the picture, its change, and what the detector finds in it.
+    """Draw a row for the clean moment and for each attack: the image, its change, and the detections in it.
 
     Args:
         examination: data, detector, device, seed.
-        split: of which the moment with most to see is taken.
-        specs: the attacks; one that the detector gives no gradient for has no row.
+        split: split that provides the moment with most objects.
+        specs: the attacks; an attack without a usable gradient has no row.
 
     Returns:
-        Picture [H, W, 3], RGB.
+        Image [H, W, 3], RGB.
 
     Raises:
-        FormatError: a picture cannot be read.
+        FormatError: an image cannot be read.
     """
     name, weights = examination.detectors[0]
     detector = detector_of(name, weights, examination.device)
     rows = []
-    with NuScenes(examination.root, examination.version) as data:
-        scene, frame = richest(data, scenes_of(data, split))
+    with NuScenes(examination.root, examination.version) as dataset:
+        scene, frame = richest(dataset, scenes_of(dataset, split))
         clean = read_image(examination.root / frame.filename)
         for spec in [None, *specs]:
-            watched, picture = Watched(detector), clean
+            monitored, image = Watched(detector), clean
             if spec is not None:
-                attacker = SceneAttacker(AttackedScene(spec, scene.record.name), examination, scene, watched)
-                (picture,) = attacker.look([frame])
-                if watched.reason:
+                attacker = SceneAttacker(AttackedScene(spec, scene.record.name), examination, scene, monitored)
+                (image,) = attacker.look([frame])
+                if monitored.reason:
                     continue
             title = "clean" if spec is None else f"{spec.attack}, loss {spec.loss}, {spec.radius:g} px {spec.norm}"
             title += f", {spec.target}" if spec and spec.target else ""
-            seen = tile((watched, examination.device), scene, frame, picture, title="what it finds")
-            change = magnified(picture, clean)
-            rows.append(np.concatenate([_shrunk(picture, title), _shrunk(change, "change, magnified"), seen], 1))
+            detection_tile = tile((monitored, examination.device), scene, frame, image, title="what it finds")
+            change = magnified(image, clean)
+            rows.append(
+                np.concatenate([_shrunk(image, title), _shrunk(change, "change, magnified"), detection_tile], 1)
+            )
     return np.concatenate(rows)
 
 

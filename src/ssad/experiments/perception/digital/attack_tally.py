@@ -1,4 +1,4 @@
-"""What attacks on the images of a scene took, and the sums of it over scenes."""
+"""Cost of attacks on the images of a scene, and its sums over scenes."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from ssad.scenarios.static.digital.budget import LEVELS
 
 @dataclass(slots=True)
 class Tally:
-    """What attacks on the images of a scene took, put together.
+    """Accumulated cost of attacks on the images of a scene.
 
     Attributes:
-        images, idle: how many, and how many of them held nothing to attack.
+        images, idle: number of images, and of those without an object to attack.
         gradients, queries: forward and backward passes, and forward passes alone, over all images.
         before, after: sums of the losses.
-        used: sum over the images that were attacked of the share of the budget that was used: mean change over the
-            radius (L-infinity), or length over the radius (L2).
+        used: sum over the attacked images of the used share of the budget: mean change over the radius
+            (L-infinity), or length over the radius (L2).
         change: the largest change of an image, in the norm, 8-bit code values.
-        batch: the least number of images that had to be attacked at once for lack of memory, 0: none yet.
-        gradient_error: of the gradient against finite differences; None: not looked at.
+        batch: the smallest number of images attacked at once for lack of memory, 0: none yet.
+        gradient_error: of the gradient against finite differences; None: not checked.
         halved: how often a batch was halved for lack of memory.
-        coupling: relative change of an image's loss when another one is in its batch; None: not looked at.
+        coupling: relative change of an image's loss when another one is in its batch; None: not checked.
         access: of the attack.
     """
 
@@ -54,62 +54,64 @@ class Tally:
         self.queries += count * found.cost.queries
         self.before += float(found.before.double().sum())
         self.after += float(found.after.double().sum())
+        # Rounded to code values, as the written images are.
         change = ((found.images - clean).double() * LEVELS).round().abs().flatten(1)
         radius = max(budget.radius * LEVELS, 1e-9)
-        sizes, mean = change.amax(1), change.mean(1)
+        change_sizes, mean_change = change.amax(1), change.mean(1)
         if budget.norm == "l2":
-            sizes = mean = change.norm(dim=1)
-        self.change = max(self.change, float(sizes.max()))
-        self.used += float((mean / radius)[~found.idle].sum())
+            change_sizes = mean_change = change.norm(dim=1)
+        self.change = max(self.change, float(change_sizes.max()))
+        self.used += float((mean_change / radius)[~found.idle].sum())
         self.batch = min(self.batch or count, count)
 
     def absorb(self, notes: Mapping[str, Any]) -> None:
-        """Counts the images that another tally noted; the checks of gradient and batch stay its own."""
+        """Count the images of another tally; the checks of gradient and batch stay its own."""
         for name in ("images", "idle", "gradients", "queries", "before", "after", "used", "halved"):
             setattr(self, name, getattr(self, name) + notes[name])
         self.change = max(self.change, notes["change"])
         self.batch = min(self.batch or notes["batch"], notes["batch"])
 
     def notes(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return the tally as plain data."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
 def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What the scenes of a cell noted (see `Tally`) as columns of its record.
+    """Sum the notes of the scenes of a cell (see `Tally`) into columns of its record.
 
     Args:
         notes: of each scene.
 
     Returns:
-        access; images and idle; gradients, queries and mean losses before and after, an image; used, the mean share of
-        the budget; change_px, the largest change; batch; halved; gradient_error and coupling, the largest, None where
-        they were not looked at.
+        access; images and idle; gradients, queries and mean losses before and after, per image; used, the mean
+        share of the budget; change_px, the largest change; batch; halved; gradient_error and coupling, the
+        largest, None if not checked.
     """
-    some = [one for one in notes if one["images"]]
-    images = sum(one["images"] for one in some)
-    active = images - sum(one["idle"] for one in some)
+    active_notes = [note for note in notes if note["images"]]
+    images = sum(note["images"] for note in active_notes)
+    active_images = images - sum(note["idle"] for note in active_notes)
 
     def mean(name: str, count: int) -> float | None:
-        value = math.fsum(one[name] for one in some) / count if count else math.nan
-        return float(f"{value:.6g}") if math.isfinite(value) else None
+        # fsum is exact, so the order of the scenes cannot change the result.
+        average = math.fsum(active_note[name] for active_note in active_notes) / count if count else math.nan
+        return float(f"{average:.6g}") if math.isfinite(average) else None
 
     def largest(name: str) -> float | None:
-        known = [one[name] for one in some if one[name] is not None]
-        return float(f"{max(known):.6g}") if known else None
+        values = [active_note[name] for active_note in active_notes if active_note[name] is not None]
+        return float(f"{max(values):.6g}") if values else None
 
     return {
         "access": notes[0]["access"] if notes else "",
         "images": images,
-        "idle": images - active,
+        "idle": images - active_images,
         "gradients": mean("gradients", images),
         "queries": mean("queries", images),
         "loss_before": mean("before", images),
         "loss_after": mean("after", images),
-        "used": mean("used", active),
+        "used": mean("used", active_images),
         "change_px": largest("change"),
-        "batch": max((one["batch"] for one in some), default=0),
-        "halved": sum(one["halved"] for one in some),
+        "batch": max((note["batch"] for note in active_notes), default=0),
+        "halved": sum(note["halved"] for note in active_notes),
         "gradient_error": largest("gradient_error"),
         "coupling": largest("coupling"),
     }
@@ -124,13 +126,15 @@ def sum_members(noted: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     Returns:
         The columns of `sum_notes`.
     """
-    parts = [sum_notes(one) for one in noted]
-    found = dict(parts[0])
-    if len(parts) > 1:
+    member_sums = [sum_notes(member_notes) for member_notes in noted]
+    total = dict(member_sums[0])
+    if len(member_sums) > 1:
         for name in ("gradients", "queries"):
-            found[name] = sum(part[name] or 0.0 for part in parts)
+            total[name] = sum(member_sum[name] or 0.0 for member_sum in member_sums)
         for name in ("change_px", "gradient_error", "coupling"):
-            found[name] = max((part[name] for part in parts if part[name] is not None), default=None)
-        found |= dict.fromkeys(("loss_before", "loss_after", "used"))
-        found["idle"] = min(part["idle"] for part in parts)
-    return found
+            total[name] = max(
+                (member_sum[name] for member_sum in member_sums if member_sum[name] is not None), default=None
+            )
+        total |= dict.fromkeys(("loss_before", "loss_after", "used"))
+        total["idle"] = min(member_sum["idle"] for member_sum in member_sums)
+    return total

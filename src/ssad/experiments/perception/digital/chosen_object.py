@@ -1,4 +1,4 @@
-"""Which object an attack is about, where a suite chooses one: the nearest of each moment, or one of a whole drive."""
+"""Selection of the object of an attack: the nearest of each moment, or one of a whole drive."""
 
 from __future__ import annotations
 
@@ -15,32 +15,43 @@ NEAREST = "nearest"
 
 
 def chosen_object(scene: SceneData, sample: str, choice: str, classes: Sequence[str] = ()) -> int | None:
-    """The object of a moment that an attack is about.
+    """Return the object of a moment that an attack is about.
 
     Args:
         scene: The scene.
         sample: Token of the sample.
         choice: "nearest": the object nearest the ego that a camera sees. Otherwise the token of an instance.
-        classes: Names of the classes that are meant; empty: all that are scored.
+        classes: Names of the eligible classes; empty: all that are scored.
 
     Returns:
-        Its row in the annotations of the sample; None: there is none.
+        Its row in the annotations of the sample; None without such an object.
     """
-    found = scene.annotations(sample)
+    sample_annotations = scene.annotations(sample)
     if choice != NEAREST:
-        return found.instance.index(choice) if choice in found.instance else None
+        return sample_annotations.instance.index(choice) if choice in sample_annotations.instance else None
     names = classes or MMDET3D_CLASSES
-    frames = [f for f in scene.frames if f.sample_token == sample and f.modality == "camera" and f.key_frame]
-    rows = [k for k, category in enumerate(found.category) if CATEGORY_TO_CLASS.get(category) in names]
+    frames = [
+        scene_frame
+        for scene_frame in scene.frames
+        if scene_frame.sample_token == sample and scene_frame.modality == "camera" and scene_frame.key_frame
+    ]
+    rows = [
+        matching_row
+        for matching_row, category in enumerate(sample_annotations.category)
+        if CATEGORY_TO_CLASS.get(category) in names
+    ]
     if not frames or not rows:
         return None
-    gap = np.linalg.norm(found.centre[rows, :2] - frames[0].ego_to_world[:2, 3], axis=1)
-    ordered = (rows[k] for k in np.argsort(gap, kind="stable"))
-    return next((row for row in ordered if any(_seen(frame, found, row) for frame in frames)), None)
+    distances = np.linalg.norm(sample_annotations.centre[rows, :2] - frames[0].ego_to_world[:2, 3], axis=1)
+    nearest_first = (rows[matching_row] for matching_row in np.argsort(distances, kind="stable"))
+    return next(
+        (row for row in nearest_first if any(_seen(camera_frame, sample_annotations, row) for camera_frame in frames)),
+        None,
+    )
 
 
 def chosen_first(scene: SceneData, frame: SensorFrame, choice: str, classes: Sequence[str] = ()) -> Annotations:
-    """The annotations of a frame's sample, the chosen object first; none if the frame does not show it.
+    """Return the annotations of a frame's sample, the selected object first; none if the frame does not show it.
 
     Args:
         scene: The scene.
@@ -48,22 +59,24 @@ def chosen_first(scene: SceneData, frame: SensorFrame, choice: str, classes: Seq
         choice: See `chosen_object`.
         classes: See `chosen_object`.
     """
-    found = scene.annotations(frame.sample_token)
+    sample_annotations = scene.annotations(frame.sample_token)
     row = chosen_object(scene, frame.sample_token, choice, classes)
-    if row is None or not _seen(frame, found, row):
-        return found.take(np.arange(0))
-    return found.take(np.array([row, *(k for k in range(len(found)) if k != row)]))
+    if row is None or not _seen(frame, sample_annotations, row):
+        return sample_annotations.take(np.arange(0))
+    return sample_annotations.take(
+        np.array([row, *(other_row for other_row in range(len(sample_annotations)) if other_row != row)])
+    )
 
 
 def chosen_places(scene: SceneData, choice: str, classes: Sequence[str] = ()) -> dict[str, F64]:
-    """Where the chosen object is: its middle [3], m, by the token of each sample that has it.
+    """Return the middle [3] of the selected object, m, by the token of each sample that has it.
 
     Args:
         scene: The scene.
         choice: See `chosen_object`.
         classes: See `chosen_object`.
     """
-    rows = {one.token: chosen_object(scene, one.token, choice, classes) for one in scene.samples}
+    rows = {sample.token: chosen_object(scene, sample.token, choice, classes) for sample in scene.samples}
     return {token: scene.annotations(token).centre[row] for token, row in rows.items() if row is not None}
 
 

@@ -1,4 +1,4 @@
-"""A table of digital attacks as a suite says it, and the points that follow: what each system is shown."""
+"""A table of digital attacks of a suite, and the conditions that follow from it for each system."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ DRAWS = 4  # of a random defence that an attack knows, if the suite does not say
 
 
 class Method(Schema):
-    """An attack as a suite names it.
+    """Attack as a suite names it.
 
     Attributes:
         name: of the attack (`ssad list attacks`).
-        loss: what it ascends (default: what the attack is about).
+        loss: objective of the ascent (default: that of the attack).
         norm: of the budget.
         options: further settings, such as restarts.
-        precision: of the gradients, where it is not the suite's.
+        precision: of the gradients, if it differs from the suite's.
     """
 
     name: str = Field(min_length=1)
@@ -46,11 +46,11 @@ class Method(Schema):
 
 
 class Row(Method):
-    """An attack with its settings.
+    """Attack with its settings.
 
     Attributes:
-        radius: Radius in 8-bit code values, where it is not the suite's.
-        steps: Number of steps, where it is not the suite's.
+        radius: Radius in 8-bit code values, if it differs from the suite's.
+        steps: Number of steps, if it differs from the suite's.
         scenes: The attack runs on this many first scenes of each town; None: on all.
     """
 
@@ -67,17 +67,17 @@ class Guard(Schema):
 
 
 class Entry(Row):
-    """A row of a table.
+    """Row of a table.
 
     Attributes:
-        defence: what stands before the detector; the clean data are scored behind it as well.
-        aware: whether the attack knows the defence; it then ascends the loss through it, of a random one the mean over
-            `draws` draws (default: 4). An attack that does not know it is made against the bare detector.
+        defence: defence before the detector; the clean data are scored behind it as well.
+        aware: whether the attack knows the defence; it then ascends the loss through it, of a random one the mean
+            over `draws` draws (default: 4). An attack that does not know it is made against the bare detector.
         draws: see `aware`.
         classes: the classes whose objects are attacked; empty: all.
-        becomes: class -> class that its objects should be taken for.
-        object: the one object of each moment that is attacked: "nearest" (of `classes`, or of the classes that become
-            others, if they are given), or the token of an instance; None: all.
+        becomes: class -> target class of its objects.
+        object: the attacked object of each moment: "nearest" (of `classes`, or of the classes in `becomes`, if
+            they are given), or the token of an instance; None: all.
         members: of the attack `ensemble`: the attacks of which the worst is kept at each moment.
     """
 
@@ -92,7 +92,7 @@ class Entry(Row):
     @field_validator("defence", "members", mode="before")
     @classmethod
     def _named(cls, value: Any) -> Any:
-        """A name alone has nothing else said."""
+        """Turn a bare name into an entry with default settings."""
         return {"name": value} if isinstance(value, str) else named(value)
 
 
@@ -105,8 +105,10 @@ class Sweep(Method):
 
 
 def named(value: Any) -> Any:
-    """Names in a list of attacks as attacks with nothing else said."""
-    return [{"name": one} if isinstance(one, str) else one for one in value] if isinstance(value, list) else value
+    """Turn names in a list of attacks into entries with default settings."""
+    return (
+        [{"name": entry} if isinstance(entry, str) else entry for entry in value] if isinstance(value, list) else value
+    )
 
 
 class AttackTable(Schema):
@@ -114,12 +116,12 @@ class AttackTable(Schema):
 
     Attributes:
         name: of the suite.
-        attacks: names, or mappings with the keys of `Entry`.
+        attacks: names, or mappings with the keys of an attack entry.
         sweeps: curves.
-        transfer: attacks whose pictures, made against each detector, are shown to every other.
-        radius: 8-bit code values that a picture may be moved by, where an attack does not say it.
+        transfer: attacks whose images, made against each detector, are shown to every other.
+        radius: maximum change of an image in 8-bit code values, unless an attack sets it.
         steps: gradient steps, likewise.
-        batch: camera images that are attacked at once on a GPU; where memory does not suffice they are fewer.
+        batch: camera images that are attacked at once on a GPU; fewer if memory does not suffice.
         precision: of the gradients: bfloat16 is faster on a GPU. Losses that decide, and scores, are exact.
     """
 
@@ -138,13 +140,13 @@ class AttackTable(Schema):
     @field_validator("attacks", "sweeps", "transfer", mode="before")
     @classmethod
     def _named(cls, value: Any) -> Any:
-        """A name alone is an attack with nothing else said."""
+        """Turn a bare name into an entry with default settings."""
         return named(value)
 
 
 @dataclass(frozen=True)
 class Guarded:
-    """A defence with its settings: name, and options in order of their names."""
+    """Defence with its settings: name, and options in order of their names."""
 
     name: str
     options: tuple[tuple[str, Any], ...] = ()
@@ -157,15 +159,15 @@ class Guarded:
 
 @dataclass(frozen=True)
 class Point:
-    """What a system is shown: the clean data, or attacks (several: the worst of them at each moment).
+    """Condition of a system: the clean data, or attacks (several: the worst of them at each moment).
 
     Attributes:
-        specs: the attacks; none: clean data.
-        defence: before the detector.
+        specs: the attacks; empty: clean data.
+        defence: defence before the detector.
         aware: whether the attacks know it.
-        source: detector that is attacked, if it is not the one that is shown the pictures.
-        scenes: the first of each town; 0: all.
-        row: whether it stands in the main table.
+        source: attacked detector, if it is not the one that is shown the images.
+        scenes: number of first scenes of each town; 0: all.
+        row: whether it belongs to the main table.
     """
 
     specs: tuple[AttackSpec, ...] = ()
@@ -182,8 +184,8 @@ class Point:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """Columns of a record that tell what its system was shown."""
-        about = {
+        """Columns of a record that describe the condition."""
+        common = {
             "source": self.source,
             "defence": self.defence.text if self.defence else "",
             "aware": self.aware,
@@ -191,10 +193,10 @@ class Point:
             "row": self.row,
         }
         if not self.specs:
-            none = dict.fromkeys(("attack", "loss", "norm"))
-            return {**none, "radius": 0.0, "steps": 0, "options": "", "target": "", **about}
+            no_attack = dict.fromkeys(("attack", "loss", "norm"))
+            return {**no_attack, "radius": 0.0, "steps": 0, "options": "", "target": "", **common}
         spec = self.specs[0]
-        found = {
+        columns = {
             "attack": spec.attack,
             "loss": spec.loss if spec.attack != "noise" else None,
             "norm": spec.norm,
@@ -202,12 +204,15 @@ class Point:
             "steps": spec.steps,
             "options": _options(spec),
             "target": spec.target,
-            **about,
+            **common,
         }
         if len(self.specs) > 1:
-            members = ", ".join(" ".join(filter(None, [one.attack, one.loss, _options(one)])) for one in self.specs)
-            found |= {"attack": ENSEMBLE, "loss": None, "steps": 0, "options": f"of {members}"}
-        return found
+            members = ", ".join(
+                " ".join(filter(None, [member_spec.attack, member_spec.loss, _options(member_spec)]))
+                for member_spec in self.specs
+            )
+            columns |= {"attack": ENSEMBLE, "loss": None, "steps": 0, "options": f"of {members}"}
+        return columns
 
 
 def system_name(detector: str, guard: Guarded | None) -> str:
@@ -216,92 +221,105 @@ def system_name(detector: str, guard: Guarded | None) -> str:
 
 
 def guard_of(suite: AttackTable, entry: Entry) -> Guarded | None:
-    """The defence of a row; it is built in order to see whether it accepts its options.
+    """Return the defence of a row; it is built to check its options.
 
     Raises:
-        ConfigError: It does not, or there is no such defence.
+        ConfigError: Unknown defence, or an invalid option.
     """
     if entry.defence is None:
         if entry.aware:
             raise ConfigError(f"suite {suite.name}: attack {entry.name}: aware of which defence? it names none")
         return None
     make_defence(entry.defence.name, **entry.defence.options)
-    found = Guarded(entry.defence.name, tuple(sorted(entry.defence.options.items())))
-    if any(not isinstance(value, str | int | float) for _, value in found.options):
-        raise ConfigError(f"suite {suite.name}: defence {found.name}: options are numbers and words")
-    return found
+    defence = Guarded(entry.defence.name, tuple(sorted(entry.defence.options.items())))
+    if any(not isinstance(value, str | int | float) for _, value in defence.options):
+        raise ConfigError(f"suite {suite.name}: defence {defence.name}: options are numbers and words")
+    return defence
 
 
 def rows_of(suite: AttackTable) -> list[Point]:
-    """The rows of the tables.
+    """Return the rows of the tables.
 
     Raises:
-        ConfigError: An attack does not exist or refuses a setting, or one appears twice.
+        ConfigError: An attack does not exist, refuses a setting, or appears twice.
     """
-    found = []
-    for one in suite.attacks:
-        guard = guard_of(suite, one)
-        if bool(one.members) != (one.name == ENSEMBLE):
-            raise ConfigError(f"suite {suite.name}: attack {one.name}: an ensemble has members, no other attack has")
-        specs = [_spec(suite, member, member.radius or one.radius, member.steps) for member in one.members]
+    points = []
+    for entry in suite.attacks:
+        defence = guard_of(suite, entry)
+        if bool(entry.members) != (entry.name == ENSEMBLE):
+            raise ConfigError(f"suite {suite.name}: attack {entry.name}: an ensemble has members, no other attack has")
+        specs = [_spec(suite, member, member.radius or entry.radius, member.steps) for member in entry.members]
         if len({(spec.norm, spec.radius) for spec in specs}) > 1:
             raise ConfigError(f"suite {suite.name}: attack {ENSEMBLE}: its members have different budgets")
         if not specs:
-            draws = (one.draws or DRAWS) if guard and one.aware and hasattr(make_defence(guard.name), "drawn") else 0
-            classes, becomes = tuple(one.classes), tuple(sorted(one.becomes.items()))
-            for name in [*classes, *one.becomes, *one.becomes.values()]:
+            draws = (
+                (entry.draws or DRAWS)
+                if defence and entry.aware and hasattr(make_defence(defence.name), "drawn")
+                else 0
+            )
+            classes, becomes = tuple(entry.classes), tuple(sorted(entry.becomes.items()))
+            for name in [*classes, *entry.becomes, *entry.becomes.values()]:
                 if name not in MMDET3D_CLASSES:
                     raise unknown_name("class", name, MMDET3D_CLASSES)
-            if becomes and (one.loss or default_loss(one.name)) != "mislabel":
-                raise ConfigError(f"suite {suite.name}: attack {one.name}: becomes needs loss: mislabel")
+            if becomes and (entry.loss or default_loss(entry.name)) != "mislabel":
+                raise ConfigError(f"suite {suite.name}: attack {entry.name}: becomes needs loss: mislabel")
             spec = replace(
-                _spec(suite, one, one.radius, one.steps),
+                _spec(suite, entry, entry.radius, entry.steps),
                 classes=classes,
                 becomes=becomes,
                 draws=draws,
-                object=one.object or "",
+                object=entry.object or "",
             )
             if not spec.aim.everything and spec.loss in UNDIVIDED:
                 raise ConfigError(
-                    f"suite {suite.name}: attack {one.name}: loss {spec.loss} is of all objects; to attack some "
+                    f"suite {suite.name}: attack {entry.name}: loss {spec.loss} is of all objects; to attack some "
                     "choose loss: vanish, margin, hide or mislabel"
                 )
             specs = [spec]
-        found.append(
-            Point(tuple(specs), guard, bool(one.aware), "", one.scenes or 0, row=guard is None and not one.scenes)
+        points.append(
+            Point(
+                tuple(specs),
+                defence,
+                bool(entry.aware),
+                "",
+                entry.scenes or 0,
+                row=defence is None and not entry.scenes,
+            )
         )
-    if len(set(found)) != len(found):
+    if len(set(points)) != len(points):
         raise ConfigError(f"suite {suite.name}: attacks: one of them appears twice")
-    return found
+    return points
 
 
 def points_of(suite: AttackTable) -> list[Point]:
-    """All conditions that every detector is shown, each once, without the transfer of attacks to other detectors.
+    """Return all conditions of every detector, each once, without the transfer of attacks to other detectors.
 
     The clean data come first, then noise, rows and curves. Clean data on fewer scenes, or behind a defence, are
-    included where something else is compared with them.
+    included if another condition is compared with them.
 
     Raises:
-        ConfigError: An attack does not exist or refuses a setting, or an attack appears twice.
+        ConfigError: An attack does not exist, refuses a setting, or appears twice.
     """
-    rows, curves, moved = rows_of(suite), _swept(suite, suite.sweeps), transfers_of(suite)
-    bare = [
-        replace(one, specs=(replace(one.specs[0], draws=0),), defence=None, aware=False, row=False)
-        for one in rows
-        if one.defence
+    rows, sweep_points, transfer_points = rows_of(suite), _swept(suite, suite.sweeps), transfers_of(suite)
+    # An attack behind a defence is compared with the same attack on the bare detector.
+    undefended_points = [
+        replace(point, specs=(replace(point.specs[0], draws=0),), defence=None, aware=False, row=False)
+        for point in rows
+        if point.defence
     ]
-    return _with_controls([*rows, *curves, *bare, *moved])
+    return _with_controls([*rows, *sweep_points, *undefended_points, *transfer_points])
 
 
 def _with_controls(points: Sequence[Point]) -> list[Point]:
-    """Clean data and noise that points are compared with, and then these, each once."""
-    noise = [
-        replace(one, specs=(AttackSpec("noise", default_loss("noise"), one.specs[0].norm, one.specs[0].radius),))
-        for one in points
-        if one.defence is None
+    """Return the clean data and noise that points are compared with, and then the points, each once."""
+    noise_points = [
+        replace(point, specs=(AttackSpec("noise", default_loss("noise"), point.specs[0].norm, point.specs[0].radius),))
+        for point in points
+        if point.defence is None
     ]
-    clean = [Point(scenes=one.scenes, defence=one.defence) for one in points]
-    return list(dict.fromkeys([Point(row=True), *clean, *noise, *points]))
+    clean_points = [Point(scenes=point.scenes, defence=point.defence) for point in points]
+    # A dict keeps the first of equal points in order; a set would not.
+    return list(dict.fromkeys([Point(row=True), *clean_points, *noise_points, *points]))
 
 
 def bystander_points(suite: AttackTable) -> list[Point]:
@@ -310,8 +328,8 @@ def bystander_points(suite: AttackTable) -> list[Point]:
     Raises:
         ConfigError: An attack does not exist or refuses a setting.
     """
-    moved = transfers_of(suite)
-    return list(dict.fromkeys([*(Point(scenes=one.scenes) for one in moved), *moved]))
+    transfer_points = transfers_of(suite)
+    return list(dict.fromkeys([*(Point(scenes=point.scenes) for point in transfer_points), *transfer_points]))
 
 
 def hardened_points(suite: AttackTable) -> list[Point]:
@@ -320,54 +338,63 @@ def hardened_points(suite: AttackTable) -> list[Point]:
     Raises:
         ConfigError: An attack does not exist or refuses a setting.
     """
-    over_radii = [one.model_copy(update={"steps": []}) for one in suite.sweeps if one.radii]
-    return _with_controls([*(one for one in rows_of(suite) if one.row), *_swept(suite, over_radii)])
+    over_radii = [selected.model_copy(update={"steps": []}) for selected in suite.sweeps if selected.radii]
+    return _with_controls([*(selected for selected in rows_of(suite) if selected.row), *_swept(suite, over_radii)])
 
 
 def transfers_of(suite: AttackTable) -> list[Point]:
-    """The attacks whose pictures are shown to other detectors.
+    """Return the attacks whose images are shown to other detectors.
 
     Raises:
         ConfigError: An attack does not exist or refuses a setting.
     """
-    return [Point((_spec(suite, one, one.radius, one.steps),), scenes=one.scenes or 0) for one in suite.transfer]
+    return [Point((_spec(suite, row, row.radius, row.steps),), scenes=row.scenes or 0) for row in suite.transfer]
 
 
 def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int | None) -> AttackSpec:
-    """An attack with all its settings; it is built, to see whether it takes them. ConfigError."""
+    """Return an attack with all its settings; it is built to check them.
+
+    Raises:
+        ConfigError: It refuses a setting.
+    """
     options = dict(method.options)
     if steps is not None or takes(method.name, "steps"):
         options.setdefault("steps", suite.steps if steps is None else steps)
     loss = method.loss or default_loss(method.name)
     make_objective(loss)
     norm: Norm = method.norm
-    size = suite.radius if radius is None else radius
-    if not size > 0:
+    radius_value = suite.radius if radius is None else radius
+    if not radius_value > 0:
         raise ConfigError(
             f"suite {suite.name}: attack {method.name}: the radius must be above 0; clean data always run"
         )
     try:
         safeio.dump_json(options)
-        hash(spec := AttackSpec(method.name, loss, norm, float(size), tuple(sorted(options.items()))))
+        # Specs are dictionary keys and go to JSON; lists and objects would fail much later.
+        hash(spec := AttackSpec(method.name, loss, norm, float(radius_value), tuple(sorted(options.items()))))
     except (TypeError, ValueError):
         raise ConfigError(
             f"suite {suite.name}: attack {method.name}: options are numbers and words, not {options}"
         ) from None
-    made = spec.make()
-    graded = made.access == "white-box" or isinstance(made, UniversalFit)
-    return replace(spec, precision=method.precision or suite.precision) if graded else spec
+    attack = spec.make()
+    uses_gradient = attack.access == "white-box" or isinstance(attack, UniversalFit)
+    return replace(spec, precision=method.precision or suite.precision) if uses_gradient else spec
 
 
 def _swept(suite: AttackTable, sweeps: Sequence[Sweep]) -> list[Point]:
-    """The points of the curves; a radius of 0 is the clean data. ConfigError."""
-    found = []
-    for one in sweeps:
-        if not one.radii and not one.steps:
-            raise ConfigError(f"suite {suite.name}: sweeps: {one.name} has neither radii nor steps")
-        specs = [_spec(suite, one, radius, None) for radius in one.radii if radius > 0]
-        specs += [_spec(suite, one, None, steps) for steps in one.steps]
-        found += [Point((spec,), scenes=one.scenes or 0) for spec in specs]
-    return found
+    """Return the points of the curves; a radius of 0 is the clean data.
+
+    Raises:
+        ConfigError: A curve has neither radii nor steps.
+    """
+    points = []
+    for sweep in sweeps:
+        if not sweep.radii and not sweep.steps:
+            raise ConfigError(f"suite {suite.name}: sweeps: {sweep.name} has neither radii nor steps")
+        specs = [_spec(suite, sweep, radius, None) for radius in sweep.radii if radius > 0]
+        specs += [_spec(suite, sweep, None, steps) for steps in sweep.steps]
+        points += [Point((spec,), scenes=sweep.scenes or 0) for spec in specs]
+    return points
 
 
 def _options(spec: AttackSpec) -> str:

@@ -1,4 +1,4 @@
-"""Attacked pictures of a scene that is not finished, kept on disk so that a run that is stopped loses one at most."""
+"""Attacked images of an unfinished scene, stored on disk so that a stopped run loses one at most."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ FOLDER = "unfinished"
 
 @dataclass(frozen=True, slots=True)
 class SavedPictures:
-    """The pictures of one scene under one attack, a file each.
+    """Images of one scene under one attack, a file each.
 
     Attributes:
-        folder: where they lie.
+        folder: folder of the files.
     """
 
     folder: Path
 
     def read(self, token: str) -> tuple[U8, dict[str, Any]] | None:
-        """A picture [H, W, 3] and what its attack took; None if it is not there, or broken.
+        """Return an image [H, W, 3] and the cost of its attack; None if the file is missing or broken.
 
         Args:
-            token: Of the camera frame.
+            token: Token of the camera frame.
         """
         path = self._path(token)
         if not path.is_file():
             return None
         try:
-            kept = safeio.load_npz(path)
-            return np.asarray(kept["picture"], np.uint8), dict(safeio.parse_json(str(kept["notes"])))
+            stored = safeio.load_npz(path)
+            return np.asarray(stored["picture"], np.uint8), dict(safeio.parse_json(str(stored["notes"])))
+        # A broken file costs one attack: the image is simply made again.
         except (SSADError, KeyError, ValueError):
             return None
 
@@ -55,7 +56,7 @@ class SavedPictures:
         safeio.write_atomic(self._path(token), safeio.npz_bytes(columns))
 
     def forget(self) -> None:
-        """Remove all, with the folders above that are empty then: the scene is finished."""
+        """Remove all images, and the parent folders if they are empty then: the scene is finished."""
         shutil.rmtree(self.folder, ignore_errors=True)
         with suppress(OSError):
             self.folder.parent.rmdir()

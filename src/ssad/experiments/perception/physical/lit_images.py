@@ -1,4 +1,4 @@
-"""Recorded pictures at another hour, with lamps and shadows on their target: as functions of light, and in full."""
+"""Recorded images at another hour, with lamps and shadows on their target: as functions of light, and in full."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ QUALITY: Final = 92  # of JPEG, as it is recorded
 
 @dataclass(frozen=True, slots=True)
 class LitClip:
-    """A recorded picture at an hour.
+    """A recorded image at an hour.
 
     Attributes:
-        clip: The picture.
+        clip: The image.
         scene: Its street and bodies, and `BLIND`.
         cards: Index of `BLIND` in the scene.
     """
@@ -43,55 +43,56 @@ class LitClip:
 
     @property
     def target(self) -> Target:
-        """The size of the target."""
+        """Size of the target."""
         length, width, height = self.clip.row["target_size"]
         return Target(length, width, height)
 
     def render(self, edit: SceneEdit = NO_EDIT) -> U8:
-        """The picture [H, W, 3] with an edit, as the recorder would have written it."""
-        scene, first = self.scene, self.cards + 1
+        """Return the image [H, W, 3] with an edit, as the recorder would have written it."""
+        scene, first_card = self.scene, self.cards + 1
         if edit.cards:
             key = ("cards", *((card.away, card.outline.tobytes()) for card in edit.cards))
             scene = self.scene.kept(
                 key, lambda: Scene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device)
             )
-        view = edit.on(self.clip.view, TARGET, cards=range(first, first + len(edit.cards)))
-        picture = render_with(scene, [view], edit.textures, edit.masks)
-        return decode_image(encode_jpeg(picture.image[0], QUALITY, "420"))
+        view = edit.on(self.clip.view, TARGET, cards=range(first_card, first_card + len(edit.cards)))
+        rendering = render_with(scene, [view], edit.textures, edit.masks)
+        # Detectors see recordings through JPEG, so edited images must pass through it as well.
+        return decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
 
     def projected(self, edit: SceneEdit) -> TexturedClip:
         """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
-        picture = render(self.scene, [edit.on(self.clip.view, TARGET)])
-        arrays = seen_part(picture)
-        corner = int(arrays["corner"][0]), int(arrays["corner"][1])
-        image = decode_image(encode_jpeg(picture.image[0], QUALITY, "420"))
+        rendering = render(self.scene, [edit.on(self.clip.view, TARGET)])
+        visible = seen_part(rendering)
+        corner = int(visible["corner"][0]), int(visible["corner"][1])
+        image = decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
         return TexturedClip(
             self.clip.file,
             self.clip.row,
             self.clip.objects,
             image,
             corner,
-            arrays["radiance"],
-            float(arrays["exposure"]),
-            arrays["fragments"],
+            visible["radiance"],
+            float(visible["exposure"]),
+            visible["fragments"],
         )
 
     def lit(self, device: str | torch.device = "cpu") -> LitPicture:
-        """The picture as a function of the light on its target."""
+        """Return the image as a function of the light on its target."""
         rows, columns = _part(self.clip)
         return lit_picture(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
 
 
 def _part(clip: ClipView) -> tuple[slice, slice]:
     """The rows and columns around the target that light on it can change: its box, and half as much to each side."""
-    (x, y, wide, high) = next(one["bbox"] for one in clip.objects if one["target"])
+    (x, y, box_width, box_height) = next(annotation["bbox"] for annotation in clip.objects if annotation["target"])
     height, width = clip.view.camera.height, clip.view.camera.width
-    reach = max(wide, high) / 2 + MARGIN / 2
-    found = []
-    for low, side, most in ((y, high, height), (x, wide, width)):
-        first = max(int(low - reach), 0) // BLOCK * BLOCK
-        found.append(slice(first, min(int(low + side + reach) + 1, most) // 2 * 2))
-    return found[0], found[1]
+    half_extent = max(box_width, box_height) / 2 + MARGIN / 2
+    slices = []
+    for start, extent, limit in ((y, box_height, height), (x, box_width, width)):
+        first_pixel = max(int(start - half_extent), 0) // BLOCK * BLOCK
+        slices.append(slice(first_pixel, min(int(start + extent + half_extent) + 1, limit) // 2 * 2))
+    return slices[0], slices[1]
 
 
 def lit_clips(
@@ -117,32 +118,37 @@ def lit_clips(
         FormatError: No recording of this version.
         UnknownNameError: There is no such hour.
     """
+    # Reject an unknown hour before any scene is built.
     at_hour(Weather(), hour)
-    wanted = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
-    made: tuple[Scene, Scene] | None = None
-    for clip in clip_views(
+    file_names = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
+    scene_pair: tuple[Scene, Scene] | None = None
+    for recorded in clip_views(
         folder,
         split=split,
         device=device,
-        only=wanted,
+        only=file_names,
         hour=lambda weather, heading: at_hour(weather, hour, heading),
         stages=stages,
     ):
-        if made is None or made[0] is not clip.scene:
-            made = clip.scene, Scene(clip.scene.street, [*clip.scene.meshes, BLIND.mesh()], device=device)
-        yield LitClip(clip, made[1], len(clip.scene.meshes))
+        # Images of one drive share a scene, so the extended copy is built once per drive.
+        if scene_pair is None or scene_pair[0] is not recorded.scene:
+            scene_pair = (
+                recorded.scene,
+                Scene(recorded.scene.street, [*recorded.scene.meshes, BLIND.mesh()], device=device),
+            )
+        yield LitClip(recorded, scene_pair[1], len(recorded.scene.meshes))
 
 
 @dataclass(frozen=True, slots=True)
 class LitPictures:
-    """The first pictures of a recording at an hour, for a detector.
+    """The first images of a recording at an hour, for a detector.
 
     Attributes:
-        folder: What `record_clips` wrote.
+        folder: Folder that `record_clips` wrote.
         hour: See `HOURS`.
-        count: Number of pictures.
+        count: Number of images.
         classes: Names of the detector's classes, in its order.
-        device: Where they are rendered and shown.
+        device: Device that renders and shows them.
     """
 
     folder: Path
@@ -165,13 +171,13 @@ class LitPictures:
         return target_truth(clip.clip.row, clip.clip.objects, self.classes)
 
     def under(self, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Drive, picture [1, 3, H, W] in 0 to 1 and truth, with an edit around the target."""
-        for clip in self.clips():
-            image = torch.from_numpy(clip.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
-            yield drive_of(clip.clip.row), image, self.truth(clip)
+        """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, with an edit around the target."""
+        for lit_image in self.clips():
+            tensor = torch.from_numpy(lit_image.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
+            yield drive_of(lit_image.clip.row), tensor, self.truth(lit_image)
 
     def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
-        """The same without an edit."""
+        """Yield the same without an edit."""
         return self.under(NO_EDIT)
 
 
@@ -182,5 +188,5 @@ def _kept(folder: Path, hour: str, count: int, device: str) -> tuple[LitClip, ..
 
 @lru_cache(maxsize=2)
 def _stages(folder: Path, device: str) -> dict[Any, Any]:
-    """The scenes of a recording, which are the same at all hours."""
+    """Return the cache of the scenes of a recording, which are the same at all hours."""
     return {}

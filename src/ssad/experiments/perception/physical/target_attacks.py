@@ -1,4 +1,4 @@
-"""Textures and lights of a results folder: trained or searched on its recorded pictures, kept, and shown on them."""
+"""Textures and lights of a results folder: optimised on its recorded images, stored, and shown on them."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ from ssad.scenarios.static.physical.textures.printing import conspicuousness
 
 @dataclass(frozen=True, slots=True)
 class TargetAttacks:
-    """What a target wears and what shines on it, in the recordings of a folder.
+    """Textures on a target and lights on it, in the recordings of a folder.
 
     Attributes:
-        folder: Recordings are in data, textures and lights beside it.
-        target: As for `ssad record --target`; lights are for cars.
+        folder: Folder with recordings in data, and textures and lights beside it.
+        target: Target as for `ssad record --target`; lights are for cars.
         seed: Root of the random numbers of trainings and searches.
-        device: Where pictures are rendered and detectors are.
+        device: Device of renderer and detectors.
     """
 
     folder: Path
@@ -55,77 +55,86 @@ class TargetAttacks:
 
     @property
     def textures(self) -> TextureFolder:
-        """The textures that are kept."""
+        """The stored textures."""
         return TextureFolder(self.folder / "textures", self.seed, self.device)
 
     @property
     def lights(self) -> LightFolder:
-        """The lights that are kept."""
+        """The stored lights."""
         return LightFolder(self.folder / "lights", self.seed, self.device)
 
     def detector(self, name: str) -> Detector:
-        """A detector where it is needed."""
+        """Return a detector, loaded on first use."""
         return _detector(name, self.device)
 
     def clips(self, recording: str, count: int, detector: str) -> TargetClips:
-        """The first pictures of a recording as they are, or with a target that waits for a texture."""
-        made = self.detector(detector)
+        """Return the first images of a recording, clean or ready for a texture."""
+        victim = self.detector(detector)
         folder = self.folder / "data" / recording
-        return TargetClips(folder, count, tuple(made.classes), self.device, whole=made.task == "3d")
+        return TargetClips(folder, count, tuple(victim.classes), self.device, whole=victim.task == "3d")
 
     def texture(self, spec: TextureSpec) -> Tensor:
-        """A texture [3, H, W], sRGB; trained now if it has to be. ConfigError as for `TextureFolder.texture`."""
+        """Return a texture [3, H, W], sRGB; it is trained now if necessary.
+
+        Raises:
+            ConfigError: See `TextureFolder.texture`.
+        """
         surface = surface_of(self.target, spec.surface)
 
         def views() -> list[View]:
-            clips = [self.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
+            image_sets = [self.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
             if spec.around:
-                clips.append(self.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
-            return [view for one in clips for _, view in one.wearing(surface, solid=one.whole)]
+                image_sets.append(self.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
+            return [view for image_set in image_sets for _, view in image_set.wearing(surface, solid=image_set.whole)]
 
-        paint = paint_under(self.target, spec.surface)
+        base_paint = paint_under(self.target, spec.surface)
         return self.textures.texture(
-            spec, surface, views=views, detector=lambda: self.detector(spec.source), paint=paint
+            spec, surface, views=views, detector=lambda: self.detector(spec.source), paint=base_paint
         )
 
     def worn(self, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
         """Drive, picture and truth of clips under a texture."""
         colour = albedo_of(self.texture(spec)).to(self.device)  # may be trained now, so gradients are on
-        left = clips.wearing(surface_of(self.target, spec.surface))
-        while own := list(islice(left, 1 if self.device == "cpu" else TOGETHER)):
-            pictures = [view.picture for _, view in own]
+        remaining = clips.wearing(surface_of(self.target, spec.surface))
+        # One at a time on the CPU: the bits of an image must not depend on its batch.
+        while batch := list(islice(remaining, 1 if self.device == "cpu" else TOGETHER)):
+            prepared_images = [view.picture for _, view in batch]
             with torch.no_grad():
-                images = pictures[0].together(pictures, {0: colour.expand(len(own), *colour.shape)})
-            for (drive, view), image in zip(own, torch.split(images, 1), strict=True):
+                images = prepared_images[0].together(prepared_images, {0: colour.expand(len(batch), *colour.shape)})
+            for (drive, view), image in zip(batch, torch.split(images, 1), strict=True):
                 yield drive, image, view.truth
 
     def about(self, spec: TextureSpec) -> dict[str, Any]:
-        """What records say of a texture: its picture, how far its colours are from the paint, how it was trained."""
+        """Return the record of a texture: its file, the distance of its colours from the paint, and its training."""
         artefacts = {"texture": str(self.textures.picture(spec).relative_to(self.folder))}
         mask = torch.from_numpy(surface_of(self.target, spec.surface).mask.copy())
         albedo = albedo_of(self.texture(spec).detach())
-        away = conspicuousness(albedo, paint_under(self.target, spec.surface), mask)
-        return {"artefacts": artefacts, "delta_e": round(float(away), 2), **self.textures.history(spec)}
+        colour_distance = conspicuousness(albedo, paint_under(self.target, spec.surface), mask)
+        return {"artefacts": artefacts, "delta_e": round(float(colour_distance), 2), **self.textures.history(spec)}
 
     def light(self, spec: LightSpec) -> SceneEdit:
-        """A light as an edit of a scene; searched now if it has to be. ConfigError as for `LightFolder.edit`."""
+        """Return a light as an edit of a scene; it is searched now if necessary.
+
+        Raises:
+            ConfigError: See `LightFolder.edit`.
+        """
         car = parse_target(self.target)
         assert isinstance(car, TargetCar)
 
-        def pictures() -> LitPictures:
+        def training_images() -> LitPictures:
             return LitPictures.of(self.clips(spec.pair["train"], spec.pair["train_images"], spec.source), spec.hour)
 
         def projected(edit: SceneEdit) -> list[View]:
-            size = edit.textures[0].shape[1], edit.textures[0].shape[2]
-            own = pictures()
+            texture_size = edit.textures[0].shape[1], edit.textures[0].shape[2]
+            lit_set = training_images()
             return [
-                View(clip.projected(edit).prepare({0: size}, device=self.device), own.truth(clip))
-                for clip in own.clips()
+                View(lit_image.projected(edit).prepare({0: texture_size}, device=self.device), lit_set.truth(lit_image))
+                for lit_image in lit_set.clips()
             ]
 
         def views() -> list[LitView]:
-            own = pictures()
-            return [LitView(clip.lit(self.device), own.truth(clip)) for clip in own.clips()]
+            lit_set = training_images()
+            return [LitView(lit_image.lit(self.device), lit_set.truth(lit_image)) for lit_image in lit_set.clips()]
 
         return self.lights.edit(
             spec,
@@ -140,7 +149,7 @@ class TargetAttacks:
         return pictures.under(self.light(spec))
 
     def about_light(self, spec: LightSpec) -> dict[str, Any]:
-        """What records say of a light: where it is, and how it was searched."""
+        """Return the record of a light: its file and its search."""
         path = self.lights.picture(spec)
         artefacts = {"light": str((path if path.is_file() else self.lights.kept(spec)).relative_to(self.folder))}
         return {"artefacts": artefacts, **self.lights.history(spec)}
@@ -163,41 +172,49 @@ class TargetAttacks:
             sides: One view from each (azimuth in degrees); None: the first view.
             clean: Title of the pictures as they were recorded.
         """
-        made = self.detector(detector)
-        everything = replace(clips, count=len(replace(clips, count=1 << 30).rows()))
-        rows = everything.rows()
-        numbers = [k for side in sides for k in _from(rows, side)] or [0]
+        victim = self.detector(detector)
+        # A count beyond every recording counts its images.
+        all_images = replace(clips, count=len(replace(clips, count=1 << 30).rows()))
+        rows = all_images.rows()
+        view_numbers = [index for side in sides for index in _from(rows, side)] or [0]
 
-        def chosen(pictures: Iterator[tuple[str, Tensor, Truth]]) -> list[tuple[str, Tensor, Truth]]:
-            return [one for k, one in enumerate(islice(pictures, max(numbers) + 1)) if k in numbers]
+        def select(pictures: Iterator[tuple[str, Tensor, Truth]]) -> list[tuple[str, Tensor, Truth]]:
+            return [
+                view
+                for view_index, view in enumerate(islice(pictures, max(view_numbers) + 1))
+                if view_index in view_numbers
+            ]
 
-        worn = {title: chosen(self.worn(everything, spec)) for title, spec in textures.items()}
+        textured_views = {title: select(self.worn(all_images, spec)) for title, spec in textures.items()}
         sheets = []
-        for k, (_, image, truth) in enumerate(chosen(everything.clean())):
-            shown = [(clean, image), *((title, views[k][1]) for title, views in worn.items())]
-            columns = min(len(shown), COLUMNS)
-            sheets.append(target_sheet(made, shown, truth, self.device, columns))
+        for index, (_, image, truth) in enumerate(select(all_images.clean())):
+            titled_images = [
+                (clean, image),
+                *((title, selected[index][1]) for title, selected in textured_views.items()),
+            ]
+            columns = min(len(titled_images), COLUMNS)
+            sheets.append(target_sheet(victim, titled_images, truth, self.device, columns))
         return np.concatenate(sheets)
 
     def light_sheet(self, detector: str, recording: str, lights: Mapping[str, tuple[str, LightSpec | None]]) -> U8:
-        """The first picture of a recording under lights: by title the hour and the light (None: none)."""
-        made, shown = self.detector(detector), []
+        """Draw the first image of a recording under lights: by title the hour and the light (None: none)."""
+        victim, titled_images = self.detector(detector), []
         for title, (hour, spec) in lights.items():
-            own = LitPictures.of(self.clips(recording, 1, detector), hour)
-            ((_, image, truth),) = own.clean() if spec is None else self.under(own, spec)
-            shown.append((title, image))
-        return target_sheet(made, shown, truth, self.device)
+            lit_set = LitPictures.of(self.clips(recording, 1, detector), hour)
+            ((_, tensor, truth),) = lit_set.clean() if spec is None else self.under(lit_set, spec)
+            titled_images.append((title, tensor))
+        return target_sheet(victim, titled_images, truth, self.device)
 
 
 def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
-    """In a worker: render what the pictures of a part of a recording see of carriers, and keep it.
+    """Render and store the contribution of carriers to the images of a part, in a worker.
 
     Args:
         task: Folder of the recording, number of the part, target, `TextureSpec.surface` of each, device.
     """
-    folder, part, target, surfaces, device = task
+    folder, part_number, target, surfaces, device = task
     quiet_warp()
-    see_clips(folder, layers_of(target, surfaces), part=part, device=device)
+    see_clips(folder, layers_of(target, surfaces), part=part_number, device=device)
 
 
 def see_all(
@@ -209,16 +226,18 @@ def see_all(
     ray: str | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> None:
-    """Render once what the pictures of recordings see of carriers, all parts side by side; what is kept stays.
+    """Render the contribution of carriers to the images of recordings once, all parts side by side.
+
+    Stored images are kept.
 
     Raises:
         StoreError: Some parts failed.
     """
     tasks = [
-        (clips.out, part, target, surfaces, clips.device)
-        for clips in recordings
+        (recording.out, part_number, target, surfaces, recording.device)
+        for recording in recordings
         if surfaces
-        for part in unseen_parts(clips.out, layers_of(target, surfaces))
+        for part_number in unseen_parts(recording.out, layers_of(target, surfaces))
     ]
     if tasks:
         pool = open_pool(len(tasks), workers=workers, ray=ray, device=recordings[0].device)
@@ -232,33 +251,35 @@ def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer | Decal,
 
 @lru_cache(maxsize=4)
 def _detector(name: str, device: str) -> Detector:
-    """A detector, kept: trainings and tests leave it as it is."""
-    made: Detector = make_detector(name, device=device)
-    return made
+    """Return a cached detector: trainings and tests leave it unchanged."""
+    loaded: Detector = make_detector(name, device=device)
+    return loaded
 
 
 @lru_cache(maxsize=16)
 def surface_of(target: str, surface: str) -> Surface:
-    """Where a texture goes, from a target and `TextureSpec.surface`."""
+    """Return the surface of a texture, from a target and `TextureSpec.surface`."""
     row = safeio.parse_json(surface)
     return make_carrier(row["carrier"], row["options"]).on(parse_target(target).mesh())
 
 
 @lru_cache(maxsize=16)
 def paint_under(target: str, surface: str) -> Tensor:
-    """What a texture covers, linear RGB [3], from a target and `TextureSpec.surface`."""
-    made = parse_target(target)
-    return covered(surface_of(target, surface), made.mesh(), made.colour)
+    """Return the colour that a texture covers, linear RGB [3], from a target and `TextureSpec.surface`."""
+    parsed_target = parse_target(target)
+    return covered(surface_of(target, surface), parsed_target.mesh(), parsed_target.colour)
 
 
 def _from(rows: Sequence[Mapping[str, Any]], side: float | None) -> list[int]:
-    """The number of the first view from a side at some 10 m, by day; of any view where no side is wanted."""
+    """Return the number of the first view from a side at some 10 m, by day; of the first view if no side is given."""
     if side is None:
         return [0]
-    near = sorted({abs(float(row["distance"]) - 10.0) for row in rows})[0]
-    own = [
-        k
-        for k, row in enumerate(rows)
-        if float(row["azimuth"]) == side and abs(float(row["distance"]) - 10.0) == near and row["weather"] != "night"
+    distance_error = sorted({abs(float(row["distance"]) - 10.0) for row in rows})[0]
+    matches = [
+        index
+        for index, row in enumerate(rows)
+        if float(row["azimuth"]) == side
+        and abs(float(row["distance"]) - 10.0) == distance_error
+        and row["weather"] != "night"
     ]
-    return own[:1]
+    return matches[:1]

@@ -1,4 +1,4 @@
-"""`ssad export texture` and `ssad export light`: what a cell of a physical run shows, for use outside."""
+"""`ssad export texture` and `ssad export light`: the texture or light of a cell of a physical run, for other uses."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def export_shown_texture(
     """Write the texture of a row.
 
     Args:
-        attacks: Where it is kept.
+        attacks: Attacks of the run.
         row: Its spec, as of `TargetRow`.
-        out: Where to write.
-        name: What it is called.
-        dots: Of the print for each metre.
+        out: Folder to write to.
+        name: Name of the texture.
+        dots: Dots of the print per metre.
 
     Returns:
-        What was written (see `ssad.scenarios.static.physical.textures.export.export_texture`).
+        The written files (see `ssad.recording.texture_export.export_texture`).
 
     Raises:
         ConfigError: The row shows no texture.
@@ -41,11 +41,11 @@ def export_shown_texture(
     if spec.trained and not attacks.textures.kept(spec).is_file():
         raise StoreError(f"{attacks.folder}: the texture of {name} is not trained yet; run the suite")
 
-    def never() -> list[object]:
+    def fail_if_missing() -> list[object]:
         raise StoreError(f"{attacks.folder}: the texture of {name} is gone; run the suite again")
 
     surface = surface_of(attacks.target, spec.surface)
-    colour = attacks.textures.texture(spec, surface, views=never, detector=never)  # type: ignore[arg-type]
+    colour = attacks.textures.texture(spec, surface, views=fail_if_missing, detector=fail_if_missing)  # type: ignore[arg-type]
     return export_texture(out, Print(colour, spec.carrier, spec.options, attacks.target), dots=dots, name=name)
 
 
@@ -53,22 +53,22 @@ def export_shown_light(attacks: TargetAttacks, row: Mapping[str, Any], out: Path
     """Write the light attack of a row.
 
     Args:
-        attacks: Where it is kept.
+        attacks: Attacks of the run.
         row: Its spec, as of `TargetRow`.
-        out: Where to write.
-        name: What it is called.
+        out: Folder to write to.
+        name: Name of the light.
 
     Returns:
-        What was written (see `ssad.scenarios.static.physical.lights.export.export_light`).
+        The written files (see `ssad.recording.light_export.export_light`).
 
     Raises:
         ConfigError: The row shows no light.
         StoreError: The light has not been searched yet.
     """
-    light = row.get("light")
-    if light is None or light["attack"] is None:
+    light_row = row.get("light")
+    if light_row is None or light_row["attack"] is None:
         raise ConfigError(f"{name} shows no light; choose one of a light attack")
-    spec = LightSpec.of_row(light)
+    spec = LightSpec.of_row(light_row)
     if not attacks.lights.kept(spec).is_file():
         raise StoreError(f"{attacks.folder}: the light of {name} is not searched yet; run the suite")
     values, colour = attacks.lights.found(spec)

@@ -1,4 +1,4 @@
-"""Pictures of physical attacks: a target under several textures with what a detector finds."""
+"""Sheets of physical attacks: a target under several textures with the detections."""
 
 from __future__ import annotations
 
@@ -35,28 +35,35 @@ def target_sheet(
     Returns:
         [H, W, 3] RGB.
     """
-    tiles, box = [], truth.box[0].tolist()
+    tiles, target_box = [], truth.box[0].tolist()
     for title, image in shown:
-        found = clear_detections(detector, image.to(device), truth.intrinsic)
-        whole = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
-        left, top, side = _square(box, whole.shape[1], whole.shape[0])
+        detections = clear_detections(detector, image.to(device), truth.intrinsic)
+        full_image = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
+        left, top, side = _square(target_box, full_image.shape[1], full_image.shape[0])
         scale = WIDTH / side
-        picture = cv2.resize(whole[top : top + side, left : left + side], (WIDTH, WIDTH), interpolation=cv2.INTER_CUBIC)
-        for own, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
-            x0, y0, x1, y1 = (round((v - o) * scale) for v, o in zip(own, (left, top, left, top), strict=True))
-            cv2.rectangle(picture, (x0, y0), (x1, y1), FOUND, 3, cv2.LINE_AA)
-            text, place = f"{detector.classes[label]} {score:.2f}", (max(x0, 4), max(y0 - 6, 20))
+        crop = cv2.resize(
+            full_image[top : top + side, left : left + side], (WIDTH, WIDTH), interpolation=cv2.INTER_CUBIC
+        )
+        for detected_box, label, score in zip(
+            detections.box.tolist(), detections.label.tolist(), detections.score.tolist(), strict=True
+        ):
+            x0, y0, x1, y1 = (
+                round((edge - origin) * scale)
+                for edge, origin in zip(detected_box, (left, top, left, top), strict=True)
+            )
+            cv2.rectangle(crop, (x0, y0), (x1, y1), FOUND, 3, cv2.LINE_AA)
+            text, text_position = f"{detector.classes[label]} {score:.2f}", (max(x0, 4), max(y0 - 6, 20))
             for colour, width in (((0, 0, 0), 5), (FOUND, 2)):
-                cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
-        tiles.append(captioned(picture, title, WIDTH))
+                cv2.putText(crop, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
+        tiles.append(captioned(crop, title, WIDTH))
     while len(tiles) % columns:
         tiles.append(np.full_like(tiles[0], 255))
-    rows = [np.concatenate(tiles[k : k + columns], 1) for k in range(0, len(tiles), columns)]
+    rows = [np.concatenate(tiles[start : start + columns], 1) for start in range(0, len(tiles), columns)]
     return np.concatenate(rows)
 
 
 def _square(box: Sequence[float], width: int, height: int) -> tuple[int, int, int]:
-    """Left, top and side of the square around a box, inside the picture, px."""
+    """Return left, top and side of the square around a box, inside the image, px."""
     side = min(round(AROUND * max(box[2] - box[0], box[3] - box[1])), width, height)
     left = min(max(round(0.5 * (box[0] + box[2]) - side / 2), 0), width - side)
     top = min(max(round(0.5 * (box[1] + box[3]) - side / 2), 0), height - side)

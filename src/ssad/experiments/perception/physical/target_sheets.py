@@ -1,4 +1,4 @@
-"""Pictures for the report of a table of physical attacks: what a detector finds under textures and lights."""
+"""Images in the report of a table of physical attacks: detections under textures and lights."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.images import save_picture
-from ssad.experiments.perception.physical.target_attacks import TargetAttacks
 from ssad.detectors.drawing import LEAST
+from ssad.experiments.perception.physical.target_attacks import TargetAttacks
 from ssad.experiments.perception.physical.target_table import CLEAN, GRID, Pair, TargetTable, options_title
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.scenarios.static.physical import TextureSpec
@@ -20,57 +20,65 @@ Cells = Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]  # fields and spec
 
 
 def write_sheets(attacks: TargetAttacks, table: TargetTable, cells: Cells) -> None:
-    """Pictures of each test town under each texture, of the grid from four sides, and of lights; what is there stays.
+    """Write missing sheets of each test town under each texture, of the grid from four sides, and of lights.
 
     Args:
-        attacks: Textures and lights of a results folder; the pictures go to its folder `pictures`.
-        table: What was asked for.
-        cells: Fields and spec of each.
+        attacks: Textures and lights of a results folder; sheets go to its folder `pictures`.
+        table: The requested table.
+        cells: Fields and spec of each cell.
     """
-    folder, name = attacks.folder, table.detectors[0]
+    folder, detector_name = attacks.folder, table.detectors[0]
     captions: dict[str, str] = {}
     lights, path = _lights_shown(cells, table, attacks), folder / "pictures" / "lights.jpg"
     if lights and not path.is_file() and (folder / "data" / table.pairs[0].test / "annotations").is_dir():
-        save_picture(path, attacks.light_sheet(name, table.pairs[0].test, lights))
-    finds = f"What {name} finds (orange, score at least {LEAST[attacks.detector(name).task]:g}) in"
+        save_picture(path, attacks.light_sheet(detector_name, table.pairs[0].test, lights))
+    caption_start = (
+        f"What {detector_name} finds (orange, score at least {LEAST[attacks.detector(detector_name).task]:g}) in"
+    )
     if path.is_file():
-        captions[path.name] = f"{finds} a picture of {table.pairs[0].test} under each light."
+        captions[path.name] = f"{caption_start} a picture of {table.pairs[0].test} under each light."
     for pair in table.pairs:
-        chosen = _textures_shown(cells, attacks, pair, name)
-        trained = [(title, spec) for title, spec in chosen.items() if spec.source and not spec.of]
-        for view, text, sides, shown in (
-            ("drive", "from behind", (None,), chosen),
+        pair_textures = _textures_shown(cells, attacks, pair, detector_name)
+        trained = [
+            (title, texture_spec)
+            for title, texture_spec in pair_textures.items()
+            if texture_spec.source and not texture_spec.of
+        ]
+        for view, camera_side, sides, sheet_textures in (
+            ("drive", "from behind", (None,), pair_textures),
             (GRID, "from the front, the left, the rear and the right", SIDES, dict(trained[-1:])),
         ):
             path = folder / "pictures" / f"{view}-{pair.test.lower()}.jpg"
             recording = folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}"
-            clips = TargetClips(recording, 1, device=attacks.device)
-            if chosen and not path.is_file() and (clips.folder / "annotations").is_dir():
-                save_picture(path, attacks.sheet(name, clips, textures=shown, sides=sides, clean=CLEAN))
+            target_images = TargetClips(recording, 1, device=attacks.device)
+            if pair_textures and not path.is_file() and (target_images.folder / "annotations").is_dir():
+                save_picture(
+                    path, attacks.sheet(detector_name, target_images, textures=sheet_textures, sides=sides, clean=CLEAN)
+                )
             if path.is_file():
-                captions[path.name] = f"{finds} {pair.test}, clean and attacked, {text}."
+                captions[path.name] = f"{caption_start} {pair.test}, clean and attacked, {camera_side}."
     if captions:
         safeio.write_atomic(folder / "pictures" / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")
 
 
 def _textures_shown(cells: Cells, attacks: TargetAttacks, pair: Pair, detector: str) -> dict[str, TextureSpec]:
-    """The textures of a pair of towns that are there, one of each attack, by title."""
-    found: dict[str, TextureSpec] = {}
+    """Return the stored textures of a pair of towns, one of each attack, by title."""
+    textures: dict[str, TextureSpec] = {}
     for fields, spec in cells:
         if spec["attack"] is None or spec["pair"] != pair.model_dump() or spec["number"]:
             continue
         if fields["detector"] == detector and spec["source"] in ("", detector):
             texture = TextureSpec.of_row(spec)
             if not texture.trained or attacks.textures.kept(texture).is_file():
-                found.setdefault(f"{fields['attack']} ({fields['carrier']})", texture)
-    return found
+                textures.setdefault(f"{fields['attack']} ({fields['carrier']})", texture)
+    return textures
 
 
 def _lights_shown(cells: Cells, table: TargetTable, attacks: TargetAttacks) -> dict[str, tuple[str, LightSpec | None]]:
-    """The lights of the first detector and pair of towns that are there, by title, with their hours; None: no light."""
-    found: dict[str, tuple[str, LightSpec | None]] = {}
-    for fields, told in cells:
-        light: Mapping[str, Any] = told.get("light", {})
+    """Return the stored lights of the first detector and pair of towns by title, with their hours; None: no light."""
+    lights: dict[str, tuple[str, LightSpec | None]] = {}
+    for fields, cell_spec in cells:
+        light: Mapping[str, Any] = cell_spec.get("light", {})
         if not light or light["number"] or light["pair"] != table.pairs[0].model_dump():
             continue
         if fields["detector"] != table.detectors[0]:
@@ -78,5 +86,5 @@ def _lights_shown(cells: Cells, table: TargetTable, attacks: TargetAttacks) -> d
         spec = None if light["attack"] is None else LightSpec.of_row(light)
         if spec is None or attacks.lights.kept(spec).is_file():
             title = f"{fields['attack']}, {light['hour']} {options_title(light)}"
-            found.setdefault(title, (light["hour"], spec))
-    return found
+            lights.setdefault(title, (light["hour"], spec))
+    return lights

@@ -1,4 +1,4 @@
-"""A table of physical attacks as a suite says it: what is recorded, and rows as plain data."""
+"""A table of physical attacks of a suite: its recordings, and its rows as plain data."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ VIEWS = ("drive", GRID)
 
 
 class Pair(Schema):
-    """Where textures are trained and where they are tested: two towns, and numbers of pictures."""
+    """Two towns, for the training and the test of textures, and their numbers of images."""
 
     train: str
     test: str
@@ -39,7 +39,7 @@ class Pair(Schema):
 
     @model_validator(mode="after")
     def _held_out(self) -> Self:
-        """What a texture was trained on says nothing of other pictures."""
+        """Reject a test in the town of the training: it would say nothing about other images."""
         if self.train == self.test:
             raise ValueError(f"trained and tested in {self.train}: name another town for the test")
         return self
@@ -52,8 +52,8 @@ class Grid(Schema):
         distances: m.
         azimuths: degrees from the front to the left of the target.
         elevations: degrees.
-        weathers: kinds (`ssad.recorders.nuscenes.WEATHERS`).
-        towns: Of the tests that are seen from all around; None: all.
+        weathers: kinds (`ssad.recording.nuscenes_recorder.WEATHERS`).
+        towns: towns of the tests with a grid; None: all.
     """
 
     distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0, 30.0], min_length=1)
@@ -69,20 +69,20 @@ class Grid(Schema):
 
 
 class Entry(Schema):
-    """A row of the table.
+    """Row of the table.
 
     Attributes:
         name: an attack (`ssad.scenarios.static.physical`), or a control: random, noise, grey, shuffled.
         carrier: patch, camouflage or road, with its settings as `options`; default: the attack's own.
         options: of the carrier.
         settings: fields of `TextureAttack` that differ; titles name those in which two rows of one attack differ.
-        around: pictures from all around the target, in the town of the training, that the texture is trained on beside
-            those from behind.
-        of: of the control shuffled: the attack whose texture is shuffled. Of several it is the one with the same
-            `around` and with all that is said here of carrier, options, settings and texture; of several such, the one
-            that says nothing beyond what the others say too.
-        texture: a shipped texture, or the card of one (NAME.json): it is shown in place of training; carrier, options
-            and the detector that it was trained against are those of the card.
+        around: number of images from all around the target, in the town of the training, that the texture is
+            trained on beside those from behind.
+        of: for the control shuffled: the attack whose texture is shuffled. Among several rows of this attack it is
+            the one with the same `around` and with all values of carrier, options, settings and texture that are
+            set here; among several such rows, the one that sets nothing beyond the others.
+        texture: a shipped texture, or the card of one (NAME.json), that is shown instead of training one; carrier,
+            options and the detector of its training are those of the card.
     """
 
     name: str = Field(min_length=1)
@@ -98,8 +98,8 @@ class LightEntry(Schema):
     """Rows of the table for one light: searched, and with settings drawn at random.
 
     Attributes:
-        name: an attack (`ssad.scenarios.static.physical.lights`).
-        hour: noon, low_sun, night, or recorded: as the pictures were.
+        name: an attack (`ssad.scenarios.static.physical.noninvasive`).
+        hour: noon, low_sun, night, or recorded: as the images were.
         options: fields of the attack that differ.
         settings: of its search (`Budget`); of a projector, of `TextureAttack`.
     """
@@ -116,22 +116,23 @@ class TargetTable(Schema):
     Attributes:
         name: of the table.
         seed: root of all random numbers.
-        detectors: detectors with a class `car`, 2D or, for textures, 3D; of 3D detectors the hulls of their boxes in
-            the picture count.
+        detectors: detectors with a class `car`, 2D or, for textures, 3D; of 3D detectors the hulls of their boxes
+            in the image count.
         judges: further detectors, 2D or 3D, that no texture is trained against and that all are shown to.
         transfer: whether a texture is shown to the other detectors too.
-        target: a car, stop_sign or pedestrian, as for `ssad record --target`; what is no car is seen from all around.
+        target: a car, stop_sign or pedestrian, as for `ssad record --target`; the latter two are seen from all
+            around.
         pairs: towns.
-        attacks: names, or mappings with the keys of `Entry`.
+        attacks: names, or mappings with the keys of a texture entry.
         lights: names of light attacks, or mappings with the keys of `LightEntry`.
         epochs: of all trained textures, in place of their own; None: their own.
         window: side of the part around the target that trainings show to a 2D detector, px, a multiple of 32; None:
-            whole pictures, as for 3D detectors always. A window of 192 takes a sixth of the time.
+            whole images, as for 3D detectors always. A window of 192 takes a sixth of the time.
         seeds: of each control that is drawn at random.
         grid: views from all around, beside those from behind; None: none.
-        behind: m from the camera to a car that drives.
-        distances: m from the camera to a target that is no car.
-        size: of the pictures, px a side.
+        behind: distance from the camera to a driving car, m.
+        distances: distances from the camera to any other target, m.
+        size: side of the images, px.
     """
 
     name: str
@@ -154,23 +155,23 @@ class TargetTable(Schema):
     @field_validator("attacks", "lights", mode="before")
     @classmethod
     def _named(cls, value: Any) -> Any:
-        """A name alone is an attack with nothing else said."""
+        """Turn a bare name into an entry with default settings."""
         return named(value)
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        """There must be something to test."""
+        """Reject a table without attacks and lights."""
         if not self.attacks and not self.lights:
             raise ValueError("name attacks, lights or both")
         return self
 
     @property
     def place(self) -> float | list[float]:
-        """Where the camera is: m behind a car, or the distances of what is no car."""
+        """Place of the camera: m behind a car, or the distances of other targets."""
         return self.behind if isinstance(parse_target(self.target), TargetCar) else self.distances
 
     def seen_around(self, pair: Pair) -> bool:
-        """Whether the grid is seen in the test of a pair."""
+        """Return True if the test of a pair includes the grid."""
         return self.grid is not None and (self.grid.towns is None or pair.test in self.grid.towns)
 
     def recordings(self, folder: Path, device: str) -> list[Clips]:
@@ -183,12 +184,13 @@ class TargetTable(Schema):
         images: dict[str, int] = {}
         for pair in self.pairs:
             for town, count in ((pair.train, pair.train_images), (pair.test, pair.test_images)):
+                # A town may train one pair and test another; one recording serves both.
                 images[town] = max(images.get(town, 0), count)
         target = target_of(self)
-        usual = partial(Clips, held_out=(), target=target, size=self.size, seed=self.seed, device=device)
+        make_recording = partial(Clips, held_out=(), target=target, size=self.size, seed=self.seed, device=device)
         mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
         found = [
-            usual(
+            make_recording(
                 folder / "data" / town,
                 ((town, count),),
                 mode=mode,
@@ -200,7 +202,7 @@ class TargetTable(Schema):
         if self.grid is not None:
             grid = self.grid
             found += [
-                usual(
+                make_recording(
                     folder / "data" / f"{town}-grid",
                     ((town, grid.count),),
                     mode="orbit",
@@ -211,20 +213,20 @@ class TargetTable(Schema):
                 )
                 for town in dict.fromkeys(pair.test for pair in self.pairs if self.seen_around(pair))
             ]
-        further = max((entry.around for entry in self.attacks), default=0)
-        for town in dict.fromkeys(pair.train for pair in self.pairs) if further else ():
-            found.append(usual(folder / "data" / f"{town}-around", ((town, further),), mode="orbit"))
+        around_count = max((entry.around for entry in self.attacks), default=0)
+        for town in dict.fromkeys(pair.train for pair in self.pairs) if around_count else ():
+            found.append(make_recording(folder / "data" / f"{town}-around", ((town, around_count),), mode="orbit"))
         return found
 
 
 @dataclass(frozen=True, slots=True)
 class TargetRow:
-    """What a detector is shown, as plain data.
+    """One condition of a detector, as plain data.
 
     Attributes:
-        title: Of the cell.
+        title: Title of the cell.
         fields: Columns of its record.
-        spec: What it takes to make it: see `TextureSpec.of_row`, or `light` for `LightSpec.of_row`.
+        spec: Data to build it from: see `TextureSpec.of_row`, or `light` for `LightSpec.of_row`.
     """
 
     title: str
@@ -233,23 +235,24 @@ class TargetRow:
 
 
 def rows_of(table: TargetTable) -> Iterator[TargetRow]:
-    """All rows of a table: textures, each beside the clean pictures, then lights.
+    """Yield all rows of a table: textures, each beside the clean images, then lights.
 
     Raises:
-        UnknownNameError: There is no such attack.
+        UnknownNameError: Unknown attack.
         ConfigError: An attack or a carrier has no such setting.
     """
-    rows = [row_of(table, entry) for entry in table.attacks]
-    for row in rows:
+    entry_rows = [row_of(table, entry) for entry in table.attacks]
+    for row in entry_rows:
         try:
+            # A carrier that does not fit should fail before anything is recorded.
             make_carrier(row["carrier"], row["options"]).on(target_of(table).mesh())
         except ConfigError as error:
             raise ConfigError(f"attack {row['attack']}: {error}") from None
-    titled = [({"attack": None}, CLEAN), *((row, _title(table, row, rows)) for row in rows)]
+    titled_rows = [({"attack": None}, CLEAN), *((row, _title(table, row, entry_rows)) for row in entry_rows)]
     for pair, view, detector in product(table.pairs, VIEWS, [*table.detectors, *table.judges]):
         if view == GRID and not table.seen_around(pair):
             continue
-        for row, title in titled if rows or not table.lights else []:
+        for row, title in titled_rows if entry_rows or not table.lights else []:
             yield from _texture_rows(table, pair, view, detector, row, title)
     yield from _light_rows(table)
 
@@ -259,13 +262,13 @@ def _texture_rows(  # noqa: PLR0917
 ) -> Iterator[TargetRow]:
     """A texture before a detector, from each detector that it is trained against, and with each seed."""
     attack = row["attack"]
-    trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
-    moved = trained and ((table.transfer and row["of"] is None) or detector in table.judges)
-    sources = [row["source"]] if "file" in row else table.detectors if moved else [detector]
+    is_trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
+    is_transferred = is_trained and ((table.transfer and row["of"] is None) or detector in table.judges)
+    sources = [row["source"]] if "file" in row else table.detectors if is_transferred else [detector]
     seeds = range(table.seeds) if attack in ("random", "noise", "shuffled") else (0,)
     for source, seed in product(sources, seeds):
         spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, "around": 0, **row}
-        spec["source"] = source if trained else ""
+        spec["source"] = source if is_trained else ""
         fields = {
             "test": pair.test,
             "train": pair.train,
@@ -276,13 +279,13 @@ def _texture_rows(  # noqa: PLR0917
             "source": spec["source"],
             "number": seed,
         }
-        words = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
-        title = "/".join(map(str, words)) + (f"/{GRID}" if view == GRID else "")
+        title_parts = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
+        title = "/".join(map(str, title_parts)) + (f"/{GRID}" if view == GRID else "")
         yield TargetRow(title, fields, spec)
 
 
 def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
-    """For each hour the clean pictures, then each light and its controls."""
+    """Yield, for each hour, the clean images, then each light and its controls."""
     check_lights(table)
     for pair, detector in product(table.pairs, table.detectors):
         rows: list[dict[str, Any]] = [
@@ -290,10 +293,10 @@ def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
             for hour in dict.fromkeys(entry.hour for entry in table.lights)
         ]
         for entry in table.lights:
-            own = {"of": None, "options": entry.options, "settings": entry.settings, "hour": entry.hour}
-            rows.append({"attack": entry.name, **own})
+            common = {"of": None, "options": entry.options, "settings": entry.settings, "hour": entry.hour}
+            rows.append({"attack": entry.name, **common})
             rows += [
-                {**own, "attack": RANDOM, "of": entry.name, "settings": {}, "number": number}
+                {**common, "attack": RANDOM, "of": entry.name, "settings": {}, "number": number}
                 for number in range(table.seeds)
             ]
         for row in rows:
@@ -309,45 +312,49 @@ def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
                 "source": source,
                 "number": light["number"],
             }
-            words = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
-            yield TargetRow("/".join(map(str, words)), fields, {"attack": None, "light": light})
+            title_parts = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
+            yield TargetRow("/".join(map(str, title_parts)), fields, {"attack": None, "light": light})
 
 
 def _title(table: TargetTable, row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    """What tables call a row: such as "shuffled vanishing, all sides", "das, stealth 0.5" or "vanishing, rate 0.01"."""
+    """Return the name of a row in tables, such as "shuffled vanishing, all sides" or "vanishing, rate 0.01"."""
 
-    def place(one: Mapping[str, Any]) -> tuple[str, str, bool]:
+    def row_identity(one: Mapping[str, Any]) -> tuple[str, str, bool]:
         return one["of"] or one["attack"], carrier_title(one), bool(one["around"])
 
     def sources(one: Mapping[str, Any]) -> set[str]:
         return {one["source"]} if "file" in one else set(table.detectors)
 
-    alike = [_said(table, one) for one in rows if place(one) == place(row) and sources(one) & sources(row)]
-    name, _, around = place(row)
-    sides, shuffled = ", all sides" if around else "", "shuffled " if row["of"] else ""
-    return f"{shuffled}{name}{sides}{_differing(_said(table, row), alike)}"
+    similar_settings = [
+        _said(table, other_row)
+        for other_row in rows
+        if row_identity(other_row) == row_identity(row) and sources(other_row) & sources(row)
+    ]
+    name, _, around = row_identity(row)
+    side_text, prefix = ", all sides" if around else "", "shuffled " if row["of"] else ""
+    return f"{prefix}{name}{side_text}{_differing(_said(table, row), similar_settings)}"
 
 
 def _said(table: TargetTable, row: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides a row beside its attack, its carrier and what the whole table says."""
-    usual = {"epochs": table.epochs, "window": table.window}
-    more = {"around": row["around"] or None, "texture": row.get("file")}
-    return {key: value for key, value in {**row["settings"], **more}.items() if value != usual.get(key)}
+    """Return the settings of a row beyond its attack, its carrier and the defaults of the table."""
+    table_defaults = {"epochs": table.epochs, "window": table.window}
+    further = {"around": row["around"] or None, "texture": row.get("file")}
+    return {key: value for key, value in {**row["settings"], **further}.items() if value != table_defaults.get(key)}
 
 
 def _differing(own: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
     """Stealth, and what others do not say alike: such as ", rate 0.01"."""
-    told = (
+    differences = (
         (key, value)
         for key, value in own.items()
-        if (key == "stealth" and value) or any(one.get(key) != value for one in others)
+        if (key == "stealth" and value) or any(other.get(key) != value for other in others)
     )
-    return "".join(f", {key} {_words(value)}" for key, value in told)
+    return "".join(f", {key} {_words(value)}" for key, value in differences)
 
 
 def _words(value: Any) -> str:
     if isinstance(value, Mapping):
-        return " ".join(f"{key} {_words(one)}" for key, one in value.items())
+        return " ".join(f"{key} {_words(nested)}" for key, nested in value.items())
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -356,64 +363,77 @@ def _light_title(table: TargetTable, row: Mapping[str, Any]) -> str:
         return CLEAN
     if row["of"]:
         return f"{RANDOM} {row['of']}"
-    place = row["attack"], row["hour"], row["options"]
-    alike = [one.settings for one in table.lights if (one.name, one.hour, one.options) == place]
-    return f"{row['attack']}{_differing(row['settings'], alike)}"
+    light_identity = row["attack"], row["hour"], row["options"]
+    similar_settings = [
+        other_entry.settings
+        for other_entry in table.lights
+        if (other_entry.name, other_entry.hour, other_entry.options) == light_identity
+    ]
+    return f"{row['attack']}{_differing(row['settings'], similar_settings)}"
 
 
 def options_title(row: Mapping[str, Any]) -> str:
-    """The options of a light, in words."""
+    """Format the options of a light."""
     return ",".join(f"{key}={value}" for key, value in row["options"].items()) or "as it is"
 
 
 def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
-    """A row as plain data: attack, carrier, options, settings, of.
+    """Return an entry as plain data: attack, carrier, options, settings, of.
 
     Raises:
-        UnknownNameError, ConfigError: No such attack, or settings that it does not have.
+        UnknownNameError, ConfigError: Unknown attack, or unknown settings.
     """
     if (entry.name == "shuffled") != (entry.of is not None):
         raise ConfigError(f"suite {table.name}: shuffled, and it alone, says of which attack (of: NAME)")
     if entry.of is not None:
         return {**_shuffled(table, entry), "attack": "shuffled", "of": entry.of}
     carrier = entry.carrier or default_carrier(entry.name)
-    found: dict[str, Any] = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}}
-    found |= {"of": None, "around": entry.around}
+    row: dict[str, Any] = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}}
+    row |= {"of": None, "around": entry.around}
     if entry.texture is not None:
-        return found | _ready(table, entry)
+        return row | _ready(table, entry)
     if entry.name not in CONTROLS:
         settings = {"epochs": table.epochs, "window": table.window}
         settings = {key: value for key, value in settings.items() if value is not None} | entry.settings
         make_physical(entry.name, **settings)
-        return found | {"settings": settings}
+        return row | {"settings": settings}
     if entry.settings or entry.around:
         raise ConfigError(f"suite {table.name}: {entry.name} is not trained and has no settings")
-    return found
+    return row
 
 
 def _shuffled(table: TargetTable, entry: Entry) -> dict[str, Any]:
     """The row whose texture is shuffled (see `Entry.of`). ConfigError: there is none, or more than one."""
     rows = [
-        row_of(table, one)
-        for one in table.attacks
-        if (one.name, one.around) == (entry.of, entry.around) and one.name not in CONTROLS
+        row_of(table, candidate)
+        for candidate in table.attacks
+        if (candidate.name, candidate.around) == (entry.of, entry.around) and candidate.name not in CONTROLS
     ]
-    fit = [
+    matching_rows = [
         row
         for row in rows
         if entry.carrier in (None, row["carrier"])
         and entry.texture in (None, row.get("file"))
         and _within({**entry.options, **entry.settings}, {**row["options"], **row["settings"]})
     ]
-    said = [{"carrier": row["carrier"], **row["options"], **_said(table, row)} for row in fit]
-    plain = [row for row, own in zip(fit, said, strict=True) if all(_within(own, other) for other in said)]
-    if not plain:
-        known = "; ".join(f"{carrier_title(row)}{_differing(_said(table, row), [{}])}" for row in fit or rows)
-        which = f"; {'several fit' if fit else 'none fits'}, say carrier, options, settings or texture of one: {known}"
-        raise ConfigError(
-            f"suite {table.name}: shuffled of '{entry.of}': there must be one such attack{which if rows else ''}"
+    row_settings = [{"carrier": row["carrier"], **row["options"], **_said(table, row)} for row in matching_rows]
+    plainest = [
+        row
+        for row, candidate_settings in zip(matching_rows, row_settings, strict=True)
+        if all(_within(candidate_settings, other_settings) for other_settings in row_settings)
+    ]
+    if not plainest:
+        choices = "; ".join(
+            f"{carrier_title(row)}{_differing(_said(table, row), [{}])}" for row in matching_rows or rows
         )
-    return plain[0]
+        hint = (
+            f"; {'several fit' if matching_rows else 'none fits'}, say carrier, options, settings or "
+            f"texture of one: {choices}"
+        )
+        raise ConfigError(
+            f"suite {table.name}: shuffled of '{entry.of}': there must be one such attack{hint if rows else ''}"
+        )
+    return plainest[0]
 
 
 def _within(some: Mapping[str, Any], more: Mapping[str, Any]) -> bool:
@@ -422,7 +442,7 @@ def _within(some: Mapping[str, Any], more: Mapping[str, Any]) -> bool:
 
 
 def check_lights(table: TargetTable) -> None:
-    """ConfigError, UnknownNameError: an attack, an hour or a setting that does not exist."""
+    """Raise ConfigError or UnknownNameError for an attack, an hour or a setting that does not exist."""
     for entry in table.lights:
         attack = make_light(entry.name, entry.options)
         at_hour(Weather(), entry.hour)
@@ -433,13 +453,17 @@ def check_lights(table: TargetTable) -> None:
 
 
 def carrier_title(row: Mapping[str, Any]) -> str:
-    """The carrier of a row and its options, in words: such as "patch, height 0.86, width 1.9"; "" for no texture."""
+    """Format the carrier of a row and its options, such as "patch, height 0.86, width 1.9"; "" for no texture."""
     options = sorted((row.get("options") or {}).items())
     return ", ".join([row.get("carrier", ""), *(f"{key} {value}" for key, value in options)])
 
 
 def _ready(table: TargetTable, entry: Entry) -> dict[str, Any]:
-    """What the card of a texture says of a row. ConfigError: the suite says otherwise."""
+    """Return the fields of a row that the card of a texture sets.
+
+    Raises:
+        ConfigError: The suite contradicts the card.
+    """
     assert entry.texture is not None
     colour, card = load_texture(entry.texture)
     if entry.carrier or entry.options or entry.settings or entry.around:
@@ -452,12 +476,16 @@ def _ready(table: TargetTable, entry: Entry) -> dict[str, Any]:
     size = make_carrier(card.carrier, card.options).on(target_of(table).mesh()).size
     if tuple(colour.shape[1:]) != size:
         raise ConfigError(f"texture {entry.texture}: {list(colour.shape[1:])} texels, its surface has {list(size)}")
-    about = {"carrier": card.carrier, "options": dict(card.options), "source": card.source}
-    return about | {"file": entry.texture, "hash": card.hash}
+    card_fields = {"carrier": card.carrier, "options": dict(card.options), "source": card.source}
+    return card_fields | {"file": entry.texture, "hash": card.hash}
 
 
 def target_of(table: TargetTable) -> Target:
-    """The target of a table. ConfigError: what it asks for is only there for cars."""
+    """Return the target of a table.
+
+    Raises:
+        ConfigError: The table requests lights or `around` for a target other than a car.
+    """
     target = parse_target(table.target)
     if not isinstance(target, TargetCar) and (table.lights or any(entry.around for entry in table.attacks)):
         raise ConfigError(f"suite {table.name}: target {table.target}: lights and around are for cars")

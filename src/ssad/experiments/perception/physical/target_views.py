@@ -1,4 +1,4 @@
-"""Recorded clips as detectors are shown them: clean, or with a target that waits for a texture."""
+"""Recorded images as input of detectors: clean, or with a target that is ready for a texture."""
 
 from __future__ import annotations
 
@@ -24,15 +24,14 @@ from ssad.scenarios.static.physical import Surface, View
 
 @dataclass(frozen=True, slots=True)
 class TargetClips:
-    """The first pictures of a recording, for a detector.
+    """The first images of a recording, for a detector.
 
     Attributes:
-        folder: What `record_clips` wrote.
-        count: Number of pictures.
+        folder: Folder that `record_clips` wrote.
+        count: Number of images.
         classes: Names of the detector's classes, in its order.
-        device: Where pictures are rendered and shown.
-        whole: Whether true boxes are those around the whole 3D boxes, as 3D detectors give them, and not around what is
-            seen.
+        device: Device that renders and shows them.
+        whole: Whether true boxes surround the whole 3D boxes, as 3D detectors give them, and not the visible parts.
     """
 
     folder: Path
@@ -42,37 +41,46 @@ class TargetClips:
     whole: bool = False
 
     def rows(self) -> list[Mapping[str, Any]]:
-        """What the annotation file says of each picture. FormatError: no recording of this version."""
+        """Return the annotation entry of each image.
+
+        Raises:
+            FormatError: The folder holds no recording of this version.
+        """
         return [row for row, _ in clip_rows(self.folder)[: self.count]]
 
     def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Drive, picture [1, 3, H, W] in 0 to 1 and truth, as they were recorded. FormatError as for `rows`."""
+        """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, as recorded.
+
+        Raises:
+            FormatError: See `rows`.
+        """
         for row, objects in clip_rows(self.folder)[: self.count]:
-            image = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
+            tensor = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
             yield (
                 drive_of(row),
-                image.permute(2, 0, 1)[None].float() / 255,
+                tensor.permute(2, 0, 1)[None].float() / 255,
                 target_truth(row, objects, self.classes, whole=self.whole),
             )
 
     def wearing(self, surface: Surface, *, solid: bool = False) -> Iterator[tuple[str, View]]:
-        """Drive and picture with a target that waits for a texture, one after another.
+        """Yield drive and image with a target that is ready for a texture, one after another.
 
         Args:
-            surface: What the target wears.
-            solid: Whether the truth is the target alone, with its 3D box: what a training against a 3D detector needs.
+            surface: Surface of the texture on the target.
+            solid: Whether the truth is the target alone, with its 3D box, as a training against a 3D detector
+                needs.
 
         Raises:
-            FormatError: No recording of this version.
-            ConfigError: None of the pictures shows any of the texture; said after the last.
+            FormatError: The folder holds no recording of this version.
+            ConfigError: None of the images shows any of the texture; raised after the last.
         """
-        seen = False
-        for clip in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
-            wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
-            seen |= bool(len(wearing.taps[0].pixel))
-            truth = target_truth(clip.row, clip.objects, self.classes, whole=self.whole)
-            yield drive_of(clip.row), View(wearing, solid_target(clip.row, truth) if solid else truth)
-        if not seen:
+        is_visible = False
+        for textured in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
+            prepared = textured.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
+            is_visible |= bool(len(prepared.taps[0].pixel))
+            truth = target_truth(textured.row, textured.objects, self.classes, whole=self.whole)
+            yield drive_of(textured.row), View(prepared, solid_target(textured.row, truth) if solid else truth)
+        if not is_visible:
             raise ConfigError(
                 f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
                 "the camera sees, or another camera"
@@ -93,37 +101,42 @@ def target_truth(
     Raises:
         ConfigError: The detector does not know the target's class.
     """
-    ordered = sorted(objects, key=lambda one: not one["target"])
-    names = [CLASSES[int(one["category_id"]) - 1] for one in ordered]
+    ordered = sorted(objects, key=lambda entry: not entry["target"])
+    names = [CLASSES[int(entry["category_id"]) - 1] for entry in ordered]
     if names[0] not in classes:
         raise ConfigError(f"a detector without a class {names[0]} cannot find the target")
-    known = [k for k, name in enumerate(names) if name in classes]
-    x, y, width, height = np.array([ordered[k]["hull" if whole else "bbox"] for k in known], np.float64).T
+    known_rows = [row_index for row_index, name in enumerate(names) if name in classes]
+    x, y, width, height = np.array(
+        [ordered[row_index]["hull" if whole else "bbox"] for row_index in known_rows], np.float64
+    ).T
     return Truth(
-        torch.tensor([list(classes).index(names[k]) for k in known]),
+        torch.tensor([list(classes).index(names[row_index]) for row_index in known_rows]),
         torch.from_numpy(np.stack([x, y, x + width, y + height], 1)).float(),
         intrinsic=torch.tensor(row["intrinsic"], dtype=torch.float32),
-        crowd=torch.tensor([bool(ordered[k]["iscrowd"]) for k in known]),
+        crowd=torch.tensor([bool(ordered[row_index]["iscrowd"]) for row_index in known_rows]),
     )
 
 
 def solid_target(row: Mapping[str, Any], truth: Truth) -> Truth:
-    """The target of a picture alone, with its 3D box, of which velocity and attribute are unknown.
+    """Return the target of an image alone, with its 3D box; velocity and attribute are unknown.
 
     Args:
-        row: Of the picture: poses of camera (x right, y down, z forward) and target in the world, its size, m.
-        truth: What `target_truth` says of it.
+        row: Annotation entry of the image: poses of camera (x right, y down, z forward) and target in the world,
+            its size, m.
+        truth: Truth of the image from `target_truth`.
 
     Returns:
         One object; its box is in the camera's frame, m and rad, centred at the middle of its height.
     """
-    turn = np.linalg.inv(np.array(row["pose"])) @ np.array(row["target_pose"])
+    target_to_camera = np.linalg.inv(np.array(row["pose"])) @ np.array(row["target_pose"])
     length, width, height = row["target_size"]
-    centre = turn[:3, 3] + 0.5 * height * turn[:3, 2]  # a pose is that of the middle of the bottom
+    centre = (
+        target_to_camera[:3, 3] + 0.5 * height * target_to_camera[:3, 2]
+    )  # a pose is that of the middle of the bottom
     solid = Solids(
         torch.tensor(centre[None], dtype=torch.float32),
         torch.tensor([[length, height, width]], dtype=torch.float32),
-        torch.tensor(camera_yaw(turn[None, :3, 0]), dtype=torch.float32),
+        torch.tensor(camera_yaw(target_to_camera[None, :3, 0]), dtype=torch.float32),
         torch.full((1, 2), torch.nan),
         torch.tensor([NO_ATTRIBUTE]),
     )
@@ -131,5 +144,5 @@ def solid_target(row: Mapping[str, Any], truth: Truth) -> Truth:
 
 
 def drive_of(row: Mapping[str, Any]) -> str:
-    """Name of the drive that a picture is of."""
+    """Return the name of the drive of an image."""
     return f"{row['part']}/{row['attempt']}"

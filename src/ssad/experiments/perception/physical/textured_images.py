@@ -1,7 +1,8 @@
-"""Recorded pictures as functions of the texture that their target wears: rendered once, kept on disk.
+"""Recorded images as functions of the texture on their target: rendered once, stored on disk.
 
-What pixels see of a texture does not depend on it. So a picture is rendered once with layers on its target; from then
-on it is shown with any texture in a few milliseconds, with gradients, also by a later process.
+The contribution of a texture to the pixels does not depend on its values. An image is therefore rendered once with
+layers on its target; from then on it can be shown with any texture in a few milliseconds, with gradients, also by a
+later process.
 """
 
 from __future__ import annotations
@@ -68,43 +69,48 @@ class TexturedClip:
         sensor: Sensor = SENSOR,
         device: str | torch.device = "cpu",
     ) -> Wearing:
-        """The picture, ready to be shown with textures of certain sizes.
+        """Prepare the image for textures of certain sizes.
 
         Args:
-            sizes: Number of each texture -> its height and width, or one side, texels. All that the target wears.
+            sizes: Number of each texture -> its height and width, or one side, texels. It must cover all textures.
             masks: Number of a texture -> which texels are on the surface (see `paint_mask`).
-            quality: Of JPEG, as it was recorded; None: not compressed.
-            sensor: The camera's.
-            device: Where pictures are made.
+            quality: JPEG quality, as recorded; None: no compression.
+            sensor: Sensor of the camera.
+            device: Device of the images.
 
         Raises:
-            ConfigError: A texture that the target wears has no size, or bad sizes and masks.
+            ConfigError: A texture of the target has no size, or bad sizes and masks.
         """
-        worn = set(np.unique(self.fragments["texture"]).tolist())
-        if not worn <= set(sizes):
-            raise ConfigError(f"{self.file}: no size for texture {min(worn - set(sizes))}, which its target wears")
+        texture_numbers = set(np.unique(self.fragments["texture"]).tolist())
+        if not texture_numbers <= set(sizes):
+            raise ConfigError(
+                f"{self.file}: no size for texture {min(texture_numbers - set(sizes))}, which its target wears"
+            )
         masks = masks or {}
         (top, left), (height, width) = self.corner, self.image.shape[:2]
-        part = (top, top + self.radiance.shape[0]), (left, left + self.radiance.shape[1])
-        taps = {k: _moved(taps_of(self, size, texture=k, mask=masks.get(k)), part, width) for k, size in sizes.items()}
-        touched = torch.cat([one.pixel for one in taps.values()])
-        window = Window.around(touched, (1, height, width), sensor, quality=quality)
-        radiance = _cut(torch.tensor(self.radiance), part, window.read[0])
-        before = torch.tensor(self.image).to(device).permute(2, 0, 1)
-        own = {k: one.to(device) for k, one in taps.items()}
-        return Wearing(window, radiance.to(device), self.exposure, own, before)
+        rectangle = (top, top + self.radiance.shape[0]), (left, left + self.radiance.shape[1])
+        taps = {
+            number: _moved(taps_of(self, texture_size, texture=number, mask=masks.get(number)), rectangle, width)
+            for number, texture_size in sizes.items()
+        }
+        touched_pixels = torch.cat([texture_taps.pixel for texture_taps in taps.values()])
+        window = Window.around(touched_pixels, (1, height, width), sensor, quality=quality)
+        radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
+        recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
+        device_taps = {number: texture_taps.to(device) for number, texture_taps in taps.items()}
+        return Wearing(window, radiance.to(device), self.exposure, device_taps, recorded_image)
 
 
 @dataclass(frozen=True, slots=True)
 class Wearing:
-    """A picture that waits for textures.
+    """Image that is ready for textures.
 
     Attributes:
-        window: What is developed anew.
-        part: Radiance of what the window reads, without the textures [h, w, 3].
-        exposure: What radiance is multiplied by.
-        taps: What pixels of the picture see of each texture, by its number.
-        before: The whole picture as it was recorded, uint8 [3, H, W].
+        window: Part of the image that is developed anew.
+        part: Radiance that the window reads, without the textures [h, w, 3].
+        exposure: Factor on the radiance.
+        taps: Contribution of each texture to the pixels of the image, by its number.
+        before: The whole image as recorded, uint8 [3, H, W].
     """
 
     window: Window
@@ -114,7 +120,7 @@ class Wearing:
     before: Tensor
 
     def show(self, textures: Mapping[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
-        """The picture with textures on its target, [1, 3, H, W].
+        """Return the image with textures on its target, [1, 3, H, W].
 
         Args:
             textures: Number -> linear albedo [3, h, w] in 0 to 1.
@@ -123,8 +129,8 @@ class Wearing:
         Raises:
             ConfigError: See `together`.
         """
-        given = {number: texture[None] for number, texture in textures.items()}
-        return Wearing.together([self], given, None if noise is None else [noise])
+        batched_textures = {number: texture[None] for number, texture in textures.items()}
+        return Wearing.together([self], batched_textures, None if noise is None else [noise])
 
     @classmethod
     def together(
@@ -152,28 +158,28 @@ class Wearing:
     @staticmethod
     def lit(pictures: Sequence[Wearing], textures: Mapping[int, Tensor]) -> tuple[Tensor, Window]:
         """The first half of `together`: the radiance [B, h, w, 3] that a window of all pictures reads."""
-        first, number = pictures[0].window, len(pictures)
+        first_window, batch_size = pictures[0].window, len(pictures)
         missing = sorted(set(pictures[0].taps) - set(textures))
         if missing:
             raise ConfigError(f"no texture {missing[0]}")
-        window = first
-        if number > 1:
+        window = first_window
+        if batch_size > 1:
             window = Window.of(
-                [one.window.changed[0] for one in pictures],
-                (number, *first.shape[1:]),
-                first.sensor,
-                quality=first.quality,
-                subsampling=first.subsampling,
+                [prepared.window.changed[0] for prepared in pictures],
+                (batch_size, *first_window.shape[1:]),
+                first_window.sensor,
+                quality=first_window.quality,
+                subsampling=first_window.subsampling,
             )
-        (rows, columns), (_, _, wide) = window.read[0], first.shape
-        size = rows[1] - rows[0], columns[1] - columns[0]
-        radiance = pictures[0].part.new_zeros((number, *size, 3))
-        for own, one, read in zip(radiance, pictures, window.read, strict=True):
-            there, here = _overlap(one.window.read[0], read)
-            own[there] = one.part[here]
-        corners = [(read[0][0], read[1][0]) for read in window.read]
+        (rows, columns), (_, _, image_width) = window.read[0], first_window.shape
+        window_size = rows[1] - rows[0], columns[1] - columns[0]
+        radiance = pictures[0].part.new_zeros((batch_size, *window_size, 3))
+        for window_radiance, prepared, read_rectangle in zip(radiance, pictures, window.read, strict=True):
+            target_slices, source_slices = _overlap(prepared.window.read[0], read_rectangle)
+            window_radiance[target_slices] = prepared.part[source_slices]
+        corners = [(read_rectangle[0][0], read_rectangle[1][0]) for read_rectangle in window.read]
         for layer in pictures[0].taps:
-            taps = joined([one.taps[layer] for one in pictures], corners, wide, size)
+            taps = joined([prepared.taps[layer] for prepared in pictures], corners, image_width, window_size)
             radiance = retexture(taps, textures[layer], radiance)
         return radiance, window
 
@@ -182,87 +188,103 @@ class Wearing:
         pictures: Sequence[Wearing], radiance: Tensor, window: Window, noise: Sequence[torch.Generator] | None
     ) -> Tensor:
         """The second half of `together`: what lens, sensor and JPEG make of it, in the whole pictures."""
-        sample = None
+        noise_sample = None
         if noise is not None:
             mosaic = window.sensor.mosaic
-            sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
-            large = large_draws(noise, radiance.device)
-            for own, one, read, draws in zip(sample, pictures, window.read, large, strict=True):
-                there, here = _overlap(one.window.read[0], read)
-                shape = one.part.shape[:2] if mosaic else one.part.shape
-                own[there] = torch.randn(shape, generator=draws, device=draws.device)[here]
-        exposure = torch.tensor([one.exposure for one in pictures]).to(radiance)
-        before = torch.stack([one.before for one in pictures])
-        return window.paste(window.develop(radiance, exposure, sample), before)
+            noise_sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
+            generators = large_draws(noise, radiance.device)
+            for image_noise, prepared, read_rectangle, rng in zip(
+                noise_sample, pictures, window.read, generators, strict=True
+            ):
+                target_slices, source_slices = _overlap(prepared.window.read[0], read_rectangle)
+                # Noise is drawn for the image's own window, so that it does not depend on the batch.
+                window_shape = prepared.part.shape[:2] if mosaic else prepared.part.shape
+                image_noise[target_slices] = torch.randn(window_shape, generator=rng, device=rng.device)[source_slices]
+        exposure = torch.tensor([prepared.exposure for prepared in pictures]).to(radiance)
+        recorded_images = torch.stack([prepared.before for prepared in pictures])
+        return window.paste(window.develop(radiance, exposure, noise_sample), recorded_images)
 
 
 def _overlap(own: Rectangle, wanted: Rectangle) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """Where the pixels that two rectangles share lie in the wanted one, and in one's own."""
-    shared = [(max(a[0], b[0]), min(a[1], b[1])) for a, b in zip(own, wanted, strict=True)]
-    there, here = (
-        tuple(slice(low - one[0], max(low, high) - one[0]) for (low, high), one in zip(shared, sides, strict=True))
+    intersection = [
+        (max(own_span[0], wanted_span[0]), min(own_span[1], wanted_span[1]))
+        for own_span, wanted_span in zip(own, wanted, strict=True)
+    ]
+    wanted_slices, own_slices = (
+        tuple(
+            slice(start - span[0], max(start, stop) - span[0])
+            for (start, stop), span in zip(intersection, sides, strict=True)
+        )
         for sides in (wanted, own)
     )
-    return there, here
+    return wanted_slices, own_slices
 
 
 def _cut(values: Tensor, own: Rectangle, wanted: Rectangle) -> Tensor:
     """What values [h, w, ...] of a rectangle are in another one; 0 outside of their own."""
     if own == wanted:
         return values
-    there, here = _overlap(own, wanted)
-    found = values.new_zeros((*(high - low for low, high in wanted), *values.shape[2:]))
-    found[there] = values[here]
-    return found
+    wanted_slices, own_slices = _overlap(own, wanted)
+    window_values = values.new_zeros((*(stop - start for start, stop in wanted), *values.shape[2:]))
+    window_values[wanted_slices] = values[own_slices]
+    return window_values
 
 
 def _moved(taps: Taps, own: Rectangle, width: int) -> Taps:
     """Taps into a rectangle as taps into the whole picture, which is so wide."""
-    (rows, columns), wide = own, own[1][1] - own[1][0]
-    return replace(taps, pixel=(taps.pixel // wide + rows[0]) * width + taps.pixel % wide + columns[0])
+    (rows, columns), rectangle_width = own, own[1][1] - own[1][0]
+    return replace(
+        taps, pixel=(taps.pixel // rectangle_width + rows[0]) * width + taps.pixel % rectangle_width + columns[0]
+    )
 
 
 def textured_clips(
     folder: Path, layers: Sequence[Layer | Decal] = (Layer(0),), *, split: str = "all", device: str = "cpu"
 ) -> Iterator[TexturedClip]:
-    """The pictures of a recording whose targets wear layers, in order; each is rendered once and then kept.
+    """Yield the images of a recording whose targets have layers, in order; each is rendered once and then stored.
 
     Args:
-        folder: What `record_clips` wrote; what is rendered is kept in its folder `.seen`.
-        layers: What the targets wear.
+        folder: Folder that `record_clips` wrote; results are stored in its folder `.seen`.
+        layers: Layers and decals of the targets.
         split: train, test or all.
-        device: Where to render.
+        device: Device that renders.
 
     Raises:
-        FormatError: No recording of this version, or a kept file is broken.
-        StoreError: Nothing can be written there.
+        FormatError: The folder holds no recording of this version, or a stored file is broken.
+        StoreError: The folder cannot be written to.
     """
-    kept = _kept_in(folder, layers, split)
+    cache_folder = _kept_in(folder, layers, split)
     rows = clip_rows(folder, split)
-    missing = {row["file_name"] for row, _ in rows if not (kept / f"{row['file_name']}.npz").is_file()}
-    views = clip_views(folder, split=split, device=device, only=missing)
+    missing_files = {row["file_name"] for row, _ in rows if not (cache_folder / f"{row['file_name']}.npz").is_file()}
+    missing_views = clip_views(folder, split=split, device=device, only=missing_files)
     for row, objects in rows:
         file = row["file_name"]
-        if file in missing:
-            safeio.make_folder(kept)
-            safeio.save_npz(kept / f"{file}.npz", _kept(next(views), layers))
-        arrays = safeio.load_npz(kept / f"{file}.npz")
+        if file in missing_files:
+            safeio.make_folder(cache_folder)
+            # The views come in the order of the rows, so the next one belongs to this row.
+            safeio.save_npz(cache_folder / f"{file}.npz", _kept(next(missing_views), layers))
+        cached = safeio.load_npz(cache_folder / f"{file}.npz")
         image = read_image(folder / "images" / file)
-        corner = int(arrays["corner"][0]), int(arrays["corner"][1])
-        exposure = float(arrays["exposure"])
-        yield TexturedClip(file, row, objects, image, corner, arrays["radiance"], exposure, arrays["fragments"])
+        corner = int(cached["corner"][0]), int(cached["corner"][1])
+        exposure = float(cached["exposure"])
+        yield TexturedClip(file, row, objects, image, corner, cached["radiance"], exposure, cached["fragments"])
 
 
 def unseen_parts(folder: Path, variants: Sequence[Sequence[Layer | Decal]]) -> list[int]:
-    """The parts of a recording of which not all is kept that is seen of each of several sets of layers.
+    """Return the parts of a recording that are not fully cached for each of several sets of layers.
 
     Raises:
-        FormatError: No recording of this version.
+        FormatError: The folder holds no recording of this version.
     """
-    kept = [_kept_in(folder, layers, "all") for layers in variants]
-    there = [{path.name for path in one.glob("*.npz")} for one in kept]
-    missing = (row["part"] for row, _ in clip_rows(folder) if any(f"{row['file_name']}.npz" not in k for k in there))
-    return list(dict.fromkeys(missing))
+    cache_folders = [_kept_in(folder, layers, "all") for layers in variants]
+    cached_names = [{path.name for path in cache_folder.glob("*.npz")} for cache_folder in cache_folders]
+    missing_parts = (
+        row["part"]
+        for row, _ in clip_rows(folder)
+        if any(f"{row['file_name']}.npz" not in names for names in cached_names)
+    )
+    return list(dict.fromkeys(missing_parts))
 
 
 def see_clips(folder: Path, variants: Sequence[Sequence[Layer | Decal]], *, part: int, device: str = "cpu") -> None:
@@ -278,19 +300,21 @@ def see_clips(folder: Path, variants: Sequence[Sequence[Layer | Decal]], *, part
         FormatError: No recording of this version.
         StoreError: Nothing can be written there.
     """
-    kept = [_kept_in(folder, layers, "all") for layers in variants]
-    for one in kept:
-        safeio.make_folder(one)
-    wanted = {row["file_name"] for row, _ in clip_rows(folder) if row["part"] == part}
-    for clip in clip_views(folder, device=device, only=wanted):
-        for one, layers in zip(kept, variants, strict=True):
-            if not (one / f"{clip.file}.npz").is_file():
-                safeio.save_npz(one / f"{clip.file}.npz", _kept(clip, layers))
+    cache_folders = [_kept_in(folder, layers, "all") for layers in variants]
+    for cache_folder in cache_folders:
+        safeio.make_folder(cache_folder)
+    file_names = {row["file_name"] for row, _ in clip_rows(folder) if row["part"] == part}
+    for recorded in clip_views(folder, device=device, only=file_names):
+        # All sets of layers in one pass: building the scene of a view costs more than rendering it.
+        for cache_folder, layers in zip(cache_folders, variants, strict=True):
+            if not (cache_folder / f"{recorded.file}.npz").is_file():
+                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _kept(recorded, layers))
 
 
 def _kept_in(folder: Path, layers: Sequence[Layer | Decal], split: str) -> Path:
-    """Where what is seen of layers is kept."""
+    """Return the cache folder of a set of layers."""
     keys = [_layer_key(layer) for layer in layers]
+    # The source is part of the key: another version may render other bits.
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
@@ -317,12 +341,12 @@ def _span(places: Any, most: int) -> tuple[int, int]:
     """Where a part begins and ends that holds all places and their margin; a block if there are none."""
     if not len(places):
         return 0, min(BLOCK, most)
-    low = max(int(places.min()) - MARGIN, 0) // BLOCK * BLOCK
-    return low, min(int(places.max()) + MARGIN + 1, most)
+    start = max(int(places.min()) - MARGIN, 0) // BLOCK * BLOCK
+    return start, min(int(places.max()) + MARGIN + 1, most)
 
 
 def _layer_key(layer: Layer | Decal) -> tuple[object, ...]:
-    """All that decides what of a layer or decal is seen."""
+    """Return all properties of a layer or decal that decide its contribution."""
     mask = None if layer.mask is None else (layer.mask.shape, hashlib.sha256(layer.mask.tobytes()).hexdigest())
     if isinstance(layer, Decal):
         return layer.texture, layer.pose.tolist(), layer.size, layer.depth, layer.tag, layer.opacity, mask
@@ -331,9 +355,9 @@ def _layer_key(layer: Layer | Decal) -> tuple[object, ...]:
 
 @cache
 def _drawing() -> str:
-    """A hash of the source: what another version rendered is not used."""
-    root = Path(ssad.__file__).parent
-    whole = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        whole.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return whole.hexdigest()
+    """Return a hash of the source, which invalidates the caches of other versions."""
+    source_root = Path(ssad.__file__).parent
+    hasher = hashlib.sha256()
+    for path in sorted(source_root.rglob("*.py")):
+        hasher.update(path.relative_to(source_root).as_posix().encode() + path.read_bytes())
+    return hasher.hexdigest()

@@ -1,4 +1,4 @@
 """Warp kernels of the camera: one source for CPU and CUDA.
 
-No `from __future__ import annotations` here: Warp reads the annotations as types.
+Modules with kernels must not import annotations from `__future__`, because Warp reads annotations as types.
 """

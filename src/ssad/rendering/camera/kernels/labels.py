@@ -1,4 +1,4 @@
-"""How many pixels a thing covers when nothing else is there, by the rule that gives a pixel its tag."""
+"""Count of the pixels that an object covers alone, by the rule that gives a pixel its tag."""
 
 import warp as wp
 
@@ -15,27 +15,28 @@ def cover(
     pixels: wp.array(dtype=int),
     hits: wp.array(dtype=int),
 ):
-    """Counts in view b, within its first shape[b] (rows, columns) pixels: pixels of the thing, and covered samples.
+    """Count the pixels of the object and the covered samples in crop b, within shape[b] (rows, columns) pixels.
 
-    As in shading, a pixel belongs to the triangle with most samples, and to the thing before the sky in a tie.
+    As in shading, a pixel belongs to the triangle with most samples, and in a tie to the object before the sky.
     """
-    b, y, x = wp.tid()
-    if y >= shape[b, 0] or x >= shape[b, 1]:
+    crop, y, x = wp.tid()
+    if y >= shape[crop, 0] or x >= shape[crop, 1]:
         return
     count = scale * scale
-    sky = int(0)
-    best = int(0)
-    for s in range(count):
-        key = samples[b, y * scale + s / scale, x * scale + s % scale] & LAST
+    sky_count = int(0)
+    best_count = int(0)
+    for sample in range(count):
+        key = samples[crop, y * scale + sample / scale, x * scale + sample % scale] & LAST
         if key == NONE:
-            sky += 1
+            sky_count += 1
         else:
-            same = int(1)
-            for e in range(s + 1, count):
-                if (samples[b, y * scale + e / scale, x * scale + e % scale] & LAST) == key:
-                    same += 1
-            best = wp.max(best, same)
-    if sky < count:
-        wp.atomic_add(hits, b, count - sky)
-        if best >= sky:
-            wp.atomic_add(pixels, b, 1)
+            same_count = int(1)
+            for other in range(sample + 1, count):
+                if (samples[crop, y * scale + other / scale, x * scale + other % scale] & LAST) == key:
+                    same_count += 1
+            best_count = wp.max(best_count, same_count)
+    if sky_count < count:
+        wp.atomic_add(hits, crop, count - sky_count)
+        # A tie between object and sky counts for the object.
+        if best_count >= sky_count:
+            wp.atomic_add(pixels, crop, 1)

@@ -1,4 +1,4 @@
-"""Textures on bodies and decals in the world: where they are, and how opaque."""
+"""Textures on bodies and decals in the world: position and opacity."""
 
 import warp as wp
 
@@ -7,16 +7,16 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Fragment:
-    """A piece of a textured surface, or of a surface onto which a lamp projects a texture, within a pixel.
+    """Piece of a textured surface, or of a surface onto which a lamp projects a texture, within a pixel.
 
     Attributes:
         place: View, row and column in one number.
         slot: Slot of the triangle.
-        texture: Which texture.
-        u: Place in the texture's rectangle, 0 to 1.
+        texture: Index of the texture.
+        u: Position in the texture's rectangle, 0 to 1.
         v: The same downwards.
         area: Share of the texture that the pixel spans.
-        light: What the pixel gains per unit of the texture's colour, RGB.
+        light: Gain of the pixel per unit of the texture's colour, RGB.
     """
 
     place: int
@@ -30,13 +30,13 @@ class Fragment:
 
 @wp.struct
 class Layer:
-    """A texture on a body.
+    """Texture on a body.
 
     Attributes:
-        texture: Which texture.
+        texture: Index of the texture.
         box: Rectangle of the atlas that it covers: u0, v0, u1, v1.
         opacity: 0 to 1.
-        mask: Where its opacities begin in `Layers.masks`; -1 where the opacity is even.
+        mask: First entry of its opacities in `Layers.masks`; -1 where the opacity is even.
         columns: Columns of the mask.
         rows: Rows of the mask.
     """
@@ -51,10 +51,10 @@ class Layer:
 
 @wp.struct
 class Decal:
-    """A texture on whatever lies within a box in the world.
+    """Texture on all surfaces within a box in the world.
 
     Attributes:
-        texture: Which texture.
+        texture: Index of the texture.
         place: Middle of the box, m.
         across: Unit vector across the texture, divided by half its width.
         down: Unit vector down the texture, divided by half its height.
@@ -105,23 +105,24 @@ class Layers:
 
 @wp.func
 def opacity(masks: wp.array(dtype=float), start: int, columns: int, rows: int, u: float, v: float) -> float:
-    """The opacity of a mask at (u, v) in 0..1, between its texels."""
+    """Return the opacity of a mask at (u, v) in 0..1, interpolated between its texels."""
     x = wp.clamp(u * float(columns) - 0.5, 0.0, float(columns - 1))
     y = wp.clamp(v * float(rows) - 0.5, 0.0, float(rows - 1))
+    # Keep the right neighbour inside; a mask of one column has none.
     i = wp.min(int(x), wp.max(columns - 2, 0))
     j = wp.min(int(y), wp.max(rows - 2, 0))
-    right = wp.min(i + 1, columns - 1)
-    below = wp.min(j + 1, rows - 1)
+    next_column = wp.min(i + 1, columns - 1)
+    next_row = wp.min(j + 1, rows - 1)
     x = x - float(i)
     y = y - float(j)
-    upper = masks[start + j * columns + i] * (1.0 - x) + masks[start + j * columns + right] * x
-    lower = masks[start + below * columns + i] * (1.0 - x) + masks[start + below * columns + right] * x
+    upper = masks[start + j * columns + i] * (1.0 - x) + masks[start + j * columns + next_column] * x
+    lower = masks[start + next_row * columns + i] * (1.0 - x) + masks[start + next_row * columns + next_column] * x
     return upper * (1.0 - y) + lower * y
 
 
 @wp.func
 def on_layer(all: Layers, layer: Layer, uv: wp.vec2) -> wp.vec3:
-    """u, v in a layer's texture and its opacity there, 0 beside it."""
+    """Return u, v in a layer's texture and its opacity there, 0 outside it."""
     box = layer.box
     u = (uv[0] - box[0]) / (box[2] - box[0])
     v = (uv[1] - box[1]) / (box[3] - box[1])
@@ -135,12 +136,13 @@ def on_layer(all: Layers, layer: Layer, uv: wp.vec2) -> wp.vec3:
 
 @wp.func
 def on_decal(all: Layers, decal: Decal, p: wp.vec3, n: wp.vec3, tag: int) -> wp.vec3:
-    """u, v in a decal's texture and its opacity there, 0 beside it and on what is turned away."""
-    to = p - decal.place
-    u = 0.5 + 0.5 * wp.dot(to, decal.across)
-    v = 0.5 + 0.5 * wp.dot(to, decal.down)
-    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0 or wp.abs(wp.dot(to, decal.ahead)) > decal.depth:
+    """Return u, v in a decal's texture and its opacity there, 0 outside it and on surfaces that face away."""
+    offset = p - decal.place
+    u = 0.5 + 0.5 * wp.dot(offset, decal.across)
+    v = 0.5 + 0.5 * wp.dot(offset, decal.down)
+    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0 or wp.abs(wp.dot(offset, decal.ahead)) > decal.depth:
         return wp.vec3(u, v, 0.0)
+    # `ahead` points into the surface, so a surface that wears the decal has a normal against it.
     if wp.dot(n, decal.ahead) >= 0.0 or (decal.tag >= 0 and decal.tag != tag):
         return wp.vec3(u, v, 0.0)
     share = decal.opacity

@@ -1,7 +1,7 @@
-"""Rays of a LiDAR against the triangles of a street and of things: what each beam meets first.
+"""Rays of a LiDAR against the triangles of a street and of objects: the first hit of each beam.
 
-A thing is tested in its own frame, where its mesh was indexed once; rays of one column (azimuth) share the list of
-things that they can meet. Glass lets a beam through unless its number says otherwise.
+An object is tested in its own frame, where its mesh was indexed once; rays of one column (azimuth) share the list of
+objects that they can hit. Glass passes a beam unless its random number reflects it.
 """
 
 import warp as wp
@@ -9,12 +9,12 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 PANES = wp.constant(3)  # panes of glass that a beam can pass
-PAST = wp.constant(1.0e-3)  # m behind a pane, where the beam goes on
+PAST = wp.constant(1.0e-3)  # m behind a pane, where the beam continues
 
 
 @wp.struct
 class Target:
-    """A thing that beams can meet.
+    """Object that beams can hit.
 
     Attributes:
         mesh: Id of its mesh.
@@ -60,67 +60,71 @@ def cast(
     albedo: wp.array2d(dtype=float),
     tag: wp.array2d(dtype=int),
 ):
-    """Distance (m, 0: nothing within reach), cosine of incidence, albedo and tag for each azimuth and beam.
+    """Compute distance (m, 0: no hit), cosine of incidence, albedo and tag for each azimuth and beam.
 
-    street: mesh of the street or 0; eye: sensor in the world; starts [A + 1] into `listed`: the targets of a column;
-    directions [A, B] unit, world; offsets [A] of the sensor from `eye`, m, and times [A], s, when a column is fired;
-    material: that of each face, the street's first; echo: luminance of materials, negative where paint; clear: 1 for
-    glass; chance [A, B, 3] in 0..1; glass: share of beams that a pane returns.
+    street: mesh of the street or 0; eye: sensor in the world; starts [A + 1] into `listed`: the targets of a
+    column; directions [A, B] unit, world; offsets [A] of the sensor from `eye`, m, and times [A], s, when a
+    column is fired; material: that of each face, the street's first; echo: luminance of materials, negative
+    where paint; clear: 1 for glass; chance [A, B, 3] in 0..1; glass: share of beams that a pane returns.
     """
-    a, b = wp.tid()
-    ray = directions[a, b]
-    shift = offsets[a]
-    time = times[a]
-    from_ = float(0.0)
-    found = float(0.0)
+    column, beam = wp.tid()
+    ray = directions[column, beam]
+    column_offset = offsets[column]
+    fire_time = times[column]
+    start = float(0.0)
+    hit_distance = float(0.0)
     for pane in range(PANES + 1):
         best = reach
         face = int(-1)
-        slope = float(0.0)
-        shade = float(0.0)
-        name = int(0)
-        for k in range(starts[a], starts[a + 1]):
-            n = listed[k]
-            move = shift - targets[n].velocity * time
-            # nearest approach to the middle of the bounding sphere
-            away = targets[n].centre - move
-            along = wp.dot(away, ray)
-            radius = targets[n].radius
-            off = wp.dot(away, away) - along * along
-            if off <= radius * radius and along + radius > from_ and along - radius < best:
-                turn = targets[n].turn
-                towards = turn * ray
-                q = wp.mesh_query_ray(
-                    targets[n].mesh, targets[n].place + turn * move + towards * from_, towards, best - from_
+        hit_cosine = float(0.0)
+        hit_albedo = float(0.0)
+        hit_tag = int(0)
+        for entry in range(starts[column], starts[column + 1]):
+            target = listed[entry]
+            sensor_offset = column_offset - targets[target].velocity * fire_time
+            # Nearest approach to the centre of the bounding sphere.
+            to_centre = targets[target].centre - sensor_offset
+            axial_distance = wp.dot(to_centre, ray)
+            radius = targets[target].radius
+            squared_miss = wp.dot(to_centre, to_centre) - axial_distance * axial_distance
+            # The bounding sphere rejects most targets without a query of their mesh.
+            if squared_miss <= radius * radius and axial_distance + radius > start and axial_distance - radius < best:
+                rotation = targets[target].turn
+                local_ray = rotation * ray
+                query = wp.mesh_query_ray(
+                    targets[target].mesh,
+                    targets[target].place + rotation * sensor_offset + local_ray * start,
+                    local_ray,
+                    best - start,
                 )
-                if q.result:
-                    best = from_ + q.t
-                    face = targets[n].first + q.face
-                    slope = wp.abs(wp.dot(q.normal, towards))
-                    shade = targets[n].paint
-                    name = targets[n].tag
+                if query.result:
+                    best = start + query.t
+                    face = targets[target].first + query.face
+                    hit_cosine = wp.abs(wp.dot(query.normal, local_ray))
+                    hit_albedo = targets[target].paint
+                    hit_tag = targets[target].tag
         if street != wp.uint64(0):
-            q = wp.mesh_query_ray(street, eye + shift + ray * from_, ray, best - from_)
-            if q.result:
-                best = from_ + q.t
-                face = q.face
-                slope = wp.abs(wp.dot(q.normal, ray))
-                name = 0
+            query = wp.mesh_query_ray(street, eye + column_offset + ray * start, ray, best - start)
+            if query.result:
+                best = start + query.t
+                face = query.face
+                hit_cosine = wp.abs(wp.dot(query.normal, ray))
+                hit_tag = 0
         if face < 0:
             break
-        m = material[face]
-        through = int(0)
-        if clear[m] == 1 and pane < PANES:
-            if chance[a, b, pane] >= glass:
-                through = 1
-        if through == 1:
-            from_ = best + PAST
+        surface = material[face]
+        passes = int(0)
+        if clear[surface] == 1 and pane < PANES:
+            if chance[column, beam, pane] >= glass:
+                passes = 1
+        if passes == 1:
+            start = best + PAST
         else:
-            found = best
-            if echo[m] >= 0.0:
-                shade = echo[m]
-            cosine[a, b] = slope
-            albedo[a, b] = shade
-            tag[a, b] = name
+            hit_distance = best
+            if echo[surface] >= 0.0:
+                hit_albedo = echo[surface]
+            cosine[column, beam] = hit_cosine
+            albedo[column, beam] = hit_albedo
+            tag[column, beam] = hit_tag
             break
-    distance[a, b] = found
+    distance[column, beam] = hit_distance

@@ -1,6 +1,6 @@
-"""Light that is near: lamps, and what keeps the light of the sky from the ground below and beside it.
+"""Nearby light: lamps, and bodies that occlude the sky from the ground below and beside them.
 
-Both are found through a grid of squares around the camera, so that a pixel asks only those that can reach it.
+A grid of cells around the camera limits each pixel to the lamps and bodies that can reach it.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ CELL = wp.constant(8.0)  # m
 
 @wp.struct
 class Lamp:
-    """A lamp in the world.
+    """Lamp in the world.
 
     Attributes:
         place: Position, m.
@@ -46,15 +46,15 @@ class Lamp:
 
 @wp.struct
 class Occluder:
-    """A body that stands on the ground and keeps the light of the sky from it.
+    """Body that stands on the ground and occludes the sky from it.
 
     Attributes:
         place: Position, m.
         heading: Cosine and sine.
-        half: Half length and half width of what it covers, m.
+        half: Half length and half width of the covered ground, m.
         under: Height of its underside, m.
         middle: Height of its middle, m.
-        reach: Distance from its place beyond which it hides nothing, m.
+        reach: Distance from its position beyond which it hides nothing, m.
     """
 
     place: wp.vec3
@@ -71,9 +71,9 @@ class Near:
 
     Attributes:
         lamps: All lamps.
-        lamp_start: Where the lamps of a square begin in `lamp_list`, in row `view * CELLS * CELLS + cell`; the next row
-            says where they end.
-        lamp_list: Indices of the lamps that can reach each square.
+        lamp_start: First entry of a cell in `lamp_list`, in row `view * CELLS * CELLS + cell`; the next row
+            holds the end.
+        lamp_list: Indices of the lamps that can reach each cell.
         occluders: All occluders.
         occluder_start: The same as `lamp_start`, for occluders.
         occluder_list: The same as `lamp_list`, for occluders.
@@ -91,7 +91,8 @@ class Near:
 
 @wp.func
 def cell_of(p: wp.vec3, eye: wp.vec3) -> int:
-    """The square of the grid around the camera in which a point lies, -1 outside."""
+    """Return the cell of the grid around the camera that contains a point, -1 outside."""
+    # The grid moves with the camera; 32 squares of 8 m reach 128 m to each side.
     column = int(wp.floor((p[0] - eye[0]) / CELL)) + CELLS / 2
     row = int(wp.floor((p[1] - eye[1]) / CELL)) + CELLS / 2
     if column < 0 or row < 0 or column >= CELLS or row >= CELLS:
@@ -101,18 +102,19 @@ def cell_of(p: wp.vec3, eye: wp.vec3) -> int:
 
 @wp.func
 def corner(x: float, y: float, height: float) -> float:
-    """Share of the sky that a horizontal rectangle from straight above to (x, y) at a height hides, signed."""
-    a = wp.sqrt(height * height + x * x)
-    b = wp.sqrt(height * height + y * y)
-    return (x / a * wp.atan(y / a) + y / b * wp.atan(x / b)) * 0.15915494
+    """Return the signed share of the sky that a horizontal rectangle from straight above to (x, y) hides."""
+    x_slant = wp.sqrt(height * height + x * x)
+    y_slant = wp.sqrt(height * height + y * y)
+    return (x / x_slant * wp.atan(y / x_slant) + y / y_slant * wp.atan(x / y_slant)) * 0.15915494
 
 
 @wp.func
 def hidden(half: wp.vec2, x: float, y: float, height: float) -> float:
-    """Share of the light of an even sky that a rectangle at a height above a point keeps from flat ground there.
+    """Return the share of an even sky's light that a rectangle above a point keeps from flat ground there.
 
     The configuration factor between an element and a parallel rectangle (Howell, catalog of factors, B-4).
     """
+    # A rectangle in the plane of the ground would divide by zero.
     height = max(height, 0.02)
     return (
         corner(half[0] - x, half[1] - y, height)
@@ -124,26 +126,26 @@ def hidden(half: wp.vec2, x: float, y: float, height: float) -> float:
 
 @wp.func
 def openness(near: Near, row: int, p: wp.vec3) -> float:
-    """Share of the sky's light that bodies leave to flat ground at a point."""
-    free = float(1.0)
-    for at in range(near.occluder_start[row], near.occluder_start[row + 1]):
-        body = near.occluders[near.occluder_list[at]]
+    """Return the share of the sky's light that bodies leave to flat ground at a point."""
+    open_share = float(1.0)
+    for entry in range(near.occluder_start[row], near.occluder_start[row + 1]):
+        body = near.occluders[near.occluder_list[entry]]
         if p[2] < body.place[2] + body.under:
             dx = p[0] - body.place[0]
             dy = p[1] - body.place[1]
             if dx * dx + dy * dy < body.reach * body.reach:
                 x = dx * body.heading[0] + dy * body.heading[1]
                 y = dy * body.heading[0] - dx * body.heading[1]
-                low = hidden(body.half, x, y, body.place[2] + body.under - p[2])
-                high = hidden(body.half, x, y, body.place[2] + body.middle - p[2])
+                underside_share = hidden(body.half, x, y, body.place[2] + body.under - p[2])
+                middle_share = hidden(body.half, x, y, body.place[2] + body.middle - p[2])
                 fade = wp.clamp((1.0 - wp.sqrt(dx * dx + dy * dy) / body.reach) * 3.0, 0.0, 1.0)
-                free = free * (1.0 - fade * wp.max(low, high))
-    return wp.max(free, 0.0)
+                open_share = open_share * (1.0 - fade * wp.max(underside_share, middle_share))
+    return wp.max(open_share, 0.0)
 
 
 @wp.func
 def passes(shadows: wp.array3d(dtype=wp.uint64), layer: int, row: int, column: int, depth: float) -> float:
-    """1 where a texel of a lamp's shadow map holds nothing nearer to the lamp (depth: inverse, 1/m)."""
+    """Return 1 if a texel of a lamp's shadow map holds nothing nearer to the lamp (depth: inverse, 1/m), else 0."""
     key = shadows[layer, row, column]
     if key == NONE or wp.cast(wp.uint32(key >> wp.uint64(32)), float) <= depth:
         return 1.0
@@ -152,38 +154,42 @@ def passes(shadows: wp.array3d(dtype=wp.uint64), layer: int, row: int, column: i
 
 @wp.func
 def lamp_shadow(shadows: wp.array3d(dtype=wp.uint64), layer: int, x: float, y: float, z: float) -> float:
-    """Share of a lamp that reaches a point: x and y in -1..1 of its spread, z m ahead; four texels, weighted."""
+    """Return the share of a lamp's light that reaches a point.
+
+    x and y are in -1..1 of the lamp's spread, z m ahead. Four texels are weighted bilinearly.
+    """
     size = shadows.shape[1]
     u = (0.5 * x + 0.5) * float(size) - 0.5
     v = (0.5 * y + 0.5) * float(size) - 0.5
+    # The clamp keeps all four texels inside the map.
     i = wp.clamp(int(wp.floor(u)), 0, size - 2)
     j = wp.clamp(int(wp.floor(v)), 0, size - 2)
     u = wp.clamp(u - float(i), 0.0, 1.0)
     v = wp.clamp(v - float(j), 0.0, 1.0)
     depth = 1.0 / z
-    low = passes(shadows, layer, j, i, depth) * (1.0 - u) + passes(shadows, layer, j, i + 1, depth) * u
-    high = passes(shadows, layer, j + 1, i, depth) * (1.0 - u) + passes(shadows, layer, j + 1, i + 1, depth) * u
-    return low * (1.0 - v) + high * v
+    upper_row = passes(shadows, layer, j, i, depth) * (1.0 - u) + passes(shadows, layer, j, i + 1, depth) * u
+    lower_row = passes(shadows, layer, j + 1, i, depth) * (1.0 - u) + passes(shadows, layer, j + 1, i + 1, depth) * u
+    return upper_row * (1.0 - v) + lower_row * v
 
 
 @wp.func
 def lamp_at(
     lamps: wp.array(dtype=Lamp), k: int, shadows: wp.array3d(dtype=wp.uint64), p: wp.vec3, n: wp.vec3, fog: float
 ) -> float:
-    """Irradiance / pi that a lamp, were its light 1, gives a point with a normal."""
-    to = p - lamps[k].place
-    turned = wp.dot(n, to)
-    ahead = wp.dot(to, lamps[k].ahead)
-    # most lamps that can reach the square leave the point dark: these tests cost least
-    if turned >= 0.0 or ahead <= 0.02:
+    """Return the irradiance / pi that a lamp with light 1 gives a point with a normal."""
+    offset = p - lamps[k].place
+    facing = wp.dot(n, offset)
+    ahead = wp.dot(offset, lamps[k].ahead)
+    # Most lamps that can reach the cell leave the point dark: these tests are the cheapest.
+    if facing >= 0.0 or ahead <= 0.02:
         return 0.0
-    square = wp.max(wp.dot(to, to), 1.0e-4)
-    distance = wp.sqrt(square)
+    squared_distance = wp.max(wp.dot(offset, offset), 1.0e-4)
+    distance = wp.sqrt(squared_distance)
     reach = lamps[k].reach
     if distance >= reach:
         return 0.0
-    x = wp.dot(to, lamps[k].across) / ahead
-    y = wp.dot(to, lamps[k].down) / ahead
+    x = wp.dot(offset, lamps[k].across) / ahead
+    y = wp.dot(offset, lamps[k].down) / ahead
     weight = float(1.0)
     if lamps[k].square == 1:
         if wp.abs(x) > 1.0 or wp.abs(y) > 1.0:
@@ -198,26 +204,26 @@ def lamp_at(
     layer = lamps[k].layer
     if layer >= 0:
         weight = weight * lamp_shadow(shadows, layer, x, y, ahead - 0.02 - 0.004 * ahead)
-    # the last third of the reach fades, so that no edge shows
+    # The last third of the reach fades, so that no edge is visible.
     weight = weight * wp.clamp(3.0 * (1.0 - distance / reach), 0.0, 1.0)
     if fog > 0.0:
         weight = weight * wp.exp(-fog * distance)
-    # a plane across the axis is lit evenly: the intensity grows with the cube of the secant
+    # A plane across the axis is lit evenly: the intensity grows with the cube of the secant.
     secant = distance / ahead
-    return weight * (secant * secant * secant * (-turned / distance) / square)
+    return weight * (secant * secant * secant * (-facing / distance) / squared_distance)
 
 
 @wp.func
 def spot_of(lamp: Lamp, p: wp.vec3, n: wp.vec3) -> wp.vec3:
-    """Where a lamp lights a point.
+    """Return the position of a point in a lamp's spread and the scale of the spread there.
 
-    Returns x and y in the lamp's spread (-1 to 1), and the share of the spread that an area of 1 m^2 at the point
+    x and y are in the lamp's spread (-1 to 1), z is the share of the spread that an area of 1 m^2 at the point
     takes.
     """
-    to = p - lamp.place
-    square = wp.max(wp.dot(to, to), 1.0e-4)
-    distance = wp.sqrt(square)
-    ahead = wp.dot(to, lamp.ahead)
+    offset = p - lamp.place
+    squared_distance = wp.max(wp.dot(offset, offset), 1.0e-4)
+    distance = wp.sqrt(squared_distance)
+    ahead = wp.dot(offset, lamp.ahead)
     secant = distance / ahead
-    bundle = secant * secant * secant * (-wp.dot(n, to) / distance) / square
-    return wp.vec3(wp.dot(to, lamp.across) / ahead, wp.dot(to, lamp.down) / ahead, bundle / lamp.spread)
+    plane_share = secant * secant * secant * (-wp.dot(n, offset) / distance) / squared_distance
+    return wp.vec3(wp.dot(offset, lamp.across) / ahead, wp.dot(offset, lamp.down) / ahead, plane_share / lamp.spread)

@@ -1,4 +1,4 @@
-"""Surfaces: their materials, and patterns finer than their triangles."""
+"""Materials of surfaces, and procedural patterns finer than their triangles."""
 
 import warp as wp
 
@@ -17,14 +17,14 @@ GLASS = wp.constant(6)
 
 @wp.struct
 class Surface:
-    """A material.
+    """Material of a surface.
 
     Attributes:
         colour: Linear albedo.
         specular: Share of the light that is mirrored.
-        gloss: How strong and sharp the mirror image is, 0 to 1.
+        gloss: Strength and sharpness of the mirror image, 0 to 1.
         emission: Emission by day.
-        night: What the night adds to the emission.
+        night: Additional emission at night.
         paint: 1 where it takes the paint of its body.
         lamp: 1 where it shines only while the lamps of its body are on.
         pattern: Such as `BRICK`.
@@ -42,19 +42,22 @@ class Surface:
 
 @wp.func
 def octave(uv: wp.vec2, rate: float, depth: float, fine: float) -> float:
-    """Smooth noise around 1 with amplitude `depth` and `rate` cells per metre.
+    """Return smooth noise around 1 with amplitude `depth` and `rate` cells per metre.
 
     It fades out where a pixel (`fine` m) is larger than a third of a cell.
     """
-    keep = wp.clamp(2.0 - 3.0 * fine * rate, 0.0, 1.0)
-    if keep <= 0.0:
+    visibility = wp.clamp(2.0 - 3.0 * fine * rate, 0.0, 1.0)
+    if visibility <= 0.0:
         return 1.0
-    return 1.0 + keep * depth * (cloudy(uv[0] * rate, uv[1] * rate) - 0.5)
+    return 1.0 + visibility * depth * (cloudy(uv[0] * rate, uv[1] * rate) - 0.5)
 
 
 @wp.func
 def textured(surface: Surface, albedo: wp.vec3, uv: wp.vec2, fine: float) -> wp.vec3:
-    """Albedo with the pattern of the material; `fine` is metres a pixel, so that what is too small fades out."""
+    """Return the albedo with the pattern of the material.
+
+    `fine` is metres a pixel; detail that is smaller fades out.
+    """
     if surface.pattern == PLAIN or surface.pattern == GLASS:
         return albedo
     factor = float(1.0)
@@ -64,26 +67,27 @@ def textured(surface: Surface, albedo: wp.vec3, uv: wp.vec2, fine: float) -> wp.
         factor = octave(uv, 0.31, 0.3, fine) * octave(uv, 1.3, 0.5, fine)
         factor = factor * octave(uv, 9.0, 0.6, fine) * octave(uv, 31.0, 0.4, fine)
     else:
-        wide = float(0.25)
-        tall = float(0.08)
-        joint = float(0.012)
+        width = float(0.25)
+        height = float(0.08)
+        joint_width = float(0.012)
         if surface.pattern == SLAB:
-            wide = 0.6
-            tall = 0.6
-            joint = 0.015
+            width = 0.6
+            height = 0.6
+            joint_width = 0.015
         if surface.pattern == TILE:
-            wide = 0.3
-            tall = 0.22
-            joint = 0.02
-        row = wp.floor(uv[1] / tall)
-        x = uv[0] / wide
+            width = 0.3
+            height = 0.22
+            joint_width = 0.02
+        row = wp.floor(uv[1] / height)
+        x = uv[0] / width
         if surface.pattern != SLAB:
+            # Every second course is shifted by half a brick.
             x = x + 0.5 * (row - 2.0 * wp.floor(row * 0.5))
         column = wp.floor(x)
-        keep = wp.clamp(1.5 - fine / tall * 2.0, 0.0, 1.0)
-        factor = 1.0 + (speck(int(column), int(row)) - 0.5) * 0.35 * keep
-        edge = wp.min((x - column) * wide, (uv[1] / tall - row) * tall)
-        if edge < joint:
-            factor = factor * (1.0 - 0.35 * keep)
+        visibility = wp.clamp(1.5 - fine / height * 2.0, 0.0, 1.0)
+        factor = 1.0 + (speck(int(column), int(row)) - 0.5) * 0.35 * visibility
+        edge_distance = wp.min((x - column) * width, (uv[1] / height - row) * height)
+        if edge_distance < joint_width:
+            factor = factor * (1.0 - 0.35 * visibility)
         factor = factor * octave(uv, 0.27, 0.22, fine) * octave(uv, 11.0, 0.14, fine)
     return albedo * factor

@@ -1,4 +1,4 @@
-"""The visibility pass: which triangle is seen at each sample.
+"""Visibility pass: the visible triangle at each sample.
 
 A draw is a range of faces under one matrix (object to camera) in one view. Each face has two slots, since clipping at
 the near plane can make two triangles of it. A sample keeps the largest key, inverse depth above slot: the result does
@@ -14,12 +14,13 @@ REGISTERS = 64  # a CUDA thread's, at most: more threads are resident, and 128 v
 
 NONE = wp.constant(wp.uint64(0))
 LOW = wp.constant(0.21)  # m above the ground (or a body's base): what is lower casts no shadow
+# The slot is stored as LAST - slot, so that of equal depths the lower slot wins.
 LAST = wp.constant(wp.uint64(4294967295))
 
 
 @wp.struct
 class Triangle:
-    """Corners as (x, y, inverse depth) in samples; its view; its slot, which names it there."""
+    """Corners as (x, y, inverse depth) in samples; its view; its slot, which identifies it in the view."""
 
     a: wp.vec3
     b: wp.vec3
@@ -30,30 +31,30 @@ class Triangle:
 
 @wp.func
 def shown(p: wp.vec3, lens: wp.vec4, scale: float, ortho: int) -> wp.vec3:
-    """A point of the camera frame as (x, y, inverse depth) in samples."""
-    near = 1.0 / p[2]
-    shrink = near
+    """Project a point of the camera frame to (x, y, inverse depth) in samples."""
+    inverse_depth = 1.0 / p[2]
+    perspective = inverse_depth
     if ortho == 1:
         # linear in depth, as a parallel projection must interpolate
-        near = (1.0e3 - p[2]) * 1.0e-3
-        shrink = 1.0
-    x = (lens[0] * p[0] * shrink + lens[2] + 0.5) * scale
-    y = (lens[1] * p[1] * shrink + lens[3] + 0.5) * scale
-    return wp.vec3(x, y, near)
+        inverse_depth = (1.0e3 - p[2]) * 1.0e-3
+        perspective = 1.0
+    x = (lens[0] * p[0] * perspective + lens[2] + 0.5) * scale
+    y = (lens[1] * p[1] * perspective + lens[3] + 0.5) * scale
+    return wp.vec3(x, y, inverse_depth)
 
 
 @wp.func
 def cut(p: wp.vec3, q: wp.vec3, near: float) -> wp.vec3:
-    """Where the edge from p to q meets the near plane."""
+    """Return the point where the edge from p to q meets the near plane."""
     t = (near - p[2]) / (q[2] - p[2])
     return wp.vec3(p[0] + (q[0] - p[0]) * t, p[1] + (q[1] - p[1]) * t, near)
 
 
 @wp.func
 def outside(t: Triangle, width: float, height: float) -> int:
-    """1 unless the triangle faces the camera and its extent meets the picture."""
+    """Return 1 unless the triangle faces the camera and its extent meets the image."""
     area = (t.b[0] - t.a[0]) * (t.c[1] - t.a[1]) - (t.b[1] - t.a[1]) * (t.c[0] - t.a[0])
-    # y points down in samples: a face that is counter-clockwise seen from outside has a negative area
+    # y points down in samples: a face that is counter-clockwise seen from outside has a negative area.
     if area >= 0.0:
         return 1
     if wp.max(t.a[0], wp.max(t.b[0], t.c[0])) < 0.0 or wp.min(t.a[0], wp.min(t.b[0], t.c[0])) > width:
@@ -65,7 +66,8 @@ def outside(t: Triangle, width: float, height: float) -> int:
 
 @wp.func
 def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
-    """Where an edge crosses a row: x, the same number for both triangles that share the edge."""
+    """Return the x where an edge crosses a row; both triangles that share the edge get the same number."""
+    # The order of the end points fixes the rounding, so that shared edges leave no gap.
     if p[1] < q[1] or (p[1] == q[1] and p[0] < q[0]):
         return p[0] + (y - p[1]) * ((q[0] - p[0]) / (q[1] - p[1]))
     return q[0] + (y - q[1]) * ((p[0] - q[0]) / (p[1] - q[1]))
@@ -73,40 +75,43 @@ def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
 
 @wp.func
 def fill_row(t: Triangle, y: int, samples: wp.array3d(dtype=wp.uint64), gx: float, gy: float):
-    """Enters a triangle into one row of samples."""
-    yc = float(y) + 0.5
-    low = float(1.0e9)
-    high = float(-1.0e9)
-    if (t.a[1] <= yc) != (t.b[1] <= yc):
-        x = crossing(t.a, t.b, yc)
-        low = wp.min(low, x)
-        high = wp.max(high, x)
-    if (t.b[1] <= yc) != (t.c[1] <= yc):
-        x = crossing(t.b, t.c, yc)
-        low = wp.min(low, x)
-        high = wp.max(high, x)
-    if (t.c[1] <= yc) != (t.a[1] <= yc):
-        x = crossing(t.c, t.a, yc)
-        low = wp.min(low, x)
-        high = wp.max(high, x)
-    low = wp.clamp(low, -1.0, float(samples.shape[2]) + 1.0)
-    high = wp.clamp(high, -1.0, float(samples.shape[2]) + 1.0)
-    first = wp.max(int(wp.ceil(low - 0.5)), 0)
-    last = wp.min(int(wp.ceil(high - 0.5)), samples.shape[2])
+    """Enter a triangle into one row of samples."""
+    sample_y = float(y) + 0.5
+    left = float(1.0e9)
+    right = float(-1.0e9)
+    if (t.a[1] <= sample_y) != (t.b[1] <= sample_y):
+        x = crossing(t.a, t.b, sample_y)
+        left = wp.min(left, x)
+        right = wp.max(right, x)
+    if (t.b[1] <= sample_y) != (t.c[1] <= sample_y):
+        x = crossing(t.b, t.c, sample_y)
+        left = wp.min(left, x)
+        right = wp.max(right, x)
+    if (t.c[1] <= sample_y) != (t.a[1] <= sample_y):
+        x = crossing(t.c, t.a, sample_y)
+        left = wp.min(left, x)
+        right = wp.max(right, x)
+    left = wp.clamp(left, -1.0, float(samples.shape[2]) + 1.0)
+    right = wp.clamp(right, -1.0, float(samples.shape[2]) + 1.0)
+    # Samples lie at the centres: column x is covered if low <= x + 0.5 < high.
+    first = wp.max(int(wp.ceil(left - 0.5)), 0)
+    last = wp.min(int(wp.ceil(right - 0.5)), samples.shape[2])
     if first >= last:
         return
-    start = t.a[2] + gy * (yc - t.a[1]) + gx * (0.5 - t.a[0])
-    tail = LAST - wp.uint64(t.slot)
+    row_start = t.a[2] + gy * (sample_y - t.a[1]) + gx * (0.5 - t.a[0])
+    slot_bits = LAST - wp.uint64(t.slot)
     for x in range(first, last):
-        near = wp.max(start + gx * float(x), 1.0e-9)
-        key = (wp.uint64(wp.cast(near, wp.uint32)) << wp.uint64(32)) | tail
+        # Positive floats order like their bits, so the key can compare them as integers.
+        inverse_depth = wp.max(row_start + gx * float(x), 1.0e-9)
+        key = (wp.uint64(wp.cast(inverse_depth, wp.uint32)) << wp.uint64(32)) | slot_bits
+        # Cheap test first: an atomic operation is only needed where the key can win.
         if key > samples[t.view, y, x]:
             wp.atomic_max(samples, t.view, y, x, key)
 
 
 @wp.func
 def slopes(t: Triangle) -> wp.vec2:
-    """Change of inverse depth for one sample to the right and one down."""
+    """Return the change of inverse depth for one sample to the right and one down."""
     ux = t.b[0] - t.a[0]
     uy = t.b[1] - t.a[1]
     vx = t.c[0] - t.a[0]
@@ -119,7 +124,7 @@ def slopes(t: Triangle) -> wp.vec2:
 
 @wp.func
 def rows_of(t: Triangle, height: int) -> wp.vec2i:
-    """First row and last + 1 whose sample centres the triangle can cover."""
+    """Return the first row and last + 1 whose sample centres the triangle can cover."""
     top = wp.clamp(wp.min(t.a[1], wp.min(t.b[1], t.c[1])), -1.0, float(height) + 1.0)
     bottom = wp.clamp(wp.max(t.a[1], wp.max(t.b[1], t.c[1])), -1.0, float(height) + 1.0)
     return wp.vec2i(wp.max(int(wp.ceil(top - 0.5)), 0), wp.min(int(wp.ceil(bottom - 0.5)), height))
@@ -130,15 +135,15 @@ def enter(
     t: Triangle, largest: float, samples: wp.array3d(dtype=wp.uint64), large: wp.array(dtype=Triangle),
     count: wp.array(dtype=int),
 ):  # fmt: skip
-    """Enters a triangle into the samples, or lists it in `large` if it is large and there is room, see `fill`."""
+    """Enter a triangle into the samples, or list it in `large` if it is large and there is room, see `fill`."""
     if outside(t, float(samples.shape[2]), float(samples.shape[1])) == 1:
         return
     rows = rows_of(t, samples.shape[1])
-    wide = wp.max(t.a[0], wp.max(t.b[0], t.c[0])) - wp.min(t.a[0], wp.min(t.b[0], t.c[0]))
-    if float(rows[1] - rows[0]) * wp.min(wide, float(samples.shape[2])) > largest:
-        place = wp.atomic_add(count, 0, 1)
-        if place < large.shape[0]:
-            large[place] = t
+    width = wp.max(t.a[0], wp.max(t.b[0], t.c[0])) - wp.min(t.a[0], wp.min(t.b[0], t.c[0]))
+    if float(rows[1] - rows[0]) * wp.min(width, float(samples.shape[2])) > largest:
+        position = wp.atomic_add(count, 0, 1)
+        if position < large.shape[0]:
+            large[position] = t
             return
     slope = slopes(t)
     for y in range(rows[0], rows[1]):
@@ -165,12 +170,12 @@ def fill(
     large: wp.array(dtype=Triangle),
     count: wp.array(dtype=int),
 ):
-    """Projects each listed face, clipped, and enters it into the samples unless it is turned away.
+    """Project each listed face, clip it, and enter it into the samples unless it faces away.
 
-    Triangles whose extent has more than `largest` samples are listed in `large` instead as long as there is room.
+    Triangles whose extent has more than `largest` samples are listed in `large` instead while there is room.
 
-    owners: the draw and the face of each index. A parallel projection is light: the ground casts no shadow. Each draw
-    has `lanes` threads, which take its faces in turn.
+    owners: the draw and the face of each index. A parallel projection is the sun: the ground casts no shadow.
+    Each draw has `lanes` threads, which take its faces in turn.
     """
     draw, lane = wp.tid()
     view = views[draw]
@@ -184,52 +189,52 @@ def fill(
         v = vertices[faces[face, 1]]
         w = vertices[faces[face, 2]]
         if ortho == 0 or wp.max(u[2], wp.max(v[2], w[2])) >= LOW:
-            m = matrices[draw]  # here and not before the loop: fewer registers, and no slower
+            to_camera = matrices[draw]  # inside the loop: fewer registers, and no slower
             focal = lens[view]
-            p = wp.transform_point(m, u)
-            q = wp.transform_point(m, v)
-            r = wp.transform_point(m, w)
-            # rotate the corners so that the first is in front whenever one is
+            p = wp.transform_point(to_camera, u)
+            q = wp.transform_point(to_camera, v)
+            r = wp.transform_point(to_camera, w)
+            # Rotate the corners so that the first is in front whenever one is.
             if p[2] < plane:
                 if q[2] >= plane:
-                    o = p
+                    swapped = p
                     p = q
                     q = r
-                    r = o
+                    r = swapped
                 elif r[2] >= plane:
-                    o = p
+                    swapped = p
                     p = r
                     r = q
-                    q = o
+                    q = swapped
             if p[2] >= plane:
-                t = Triangle()
-                t.view = view
-                t.slot = 2 * index
-                t.a = shown(p, focal, scale, ortho)
+                triangle = Triangle()
+                triangle.view = view
+                triangle.slot = 2 * index
+                triangle.a = shown(p, focal, scale, ortho)
                 if q[2] >= plane:
-                    t.b = shown(q, focal, scale, ortho)
+                    triangle.b = shown(q, focal, scale, ortho)
                     if r[2] >= plane:
-                        t.c = shown(r, focal, scale, ortho)
+                        triangle.c = shown(r, focal, scale, ortho)
                     else:
-                        t.c = shown(cut(q, r, plane), focal, scale, ortho)
+                        triangle.c = shown(cut(q, r, plane), focal, scale, ortho)
                 else:
-                    t.b = shown(cut(p, q, plane), focal, scale, ortho)
+                    triangle.b = shown(cut(p, q, plane), focal, scale, ortho)
                     if r[2] >= plane:
-                        t.c = shown(cut(r, q, plane), focal, scale, ortho)
+                        triangle.c = shown(cut(r, q, plane), focal, scale, ortho)
                     else:
-                        t.c = shown(cut(p, r, plane), focal, scale, ortho)
+                        triangle.c = shown(cut(p, r, plane), focal, scale, ortho)
                 pieces = int(1)
                 if (q[2] >= plane) != (r[2] >= plane):
-                    pieces = 2  # one corner behind the plane: what is left has four
+                    pieces = 2  # one corner behind the plane: four corners remain
                 for piece in range(pieces):
                     if piece == 1:
-                        t.slot += 1
-                        t.b = t.c
+                        triangle.slot += 1
+                        triangle.b = triangle.c
                         if q[2] >= plane:
-                            t.c = shown(cut(p, r, plane), focal, scale, ortho)
+                            triangle.c = shown(cut(p, r, plane), focal, scale, ortho)
                         else:
-                            t.c = shown(r, focal, scale, ortho)
-                    enter(t, largest, samples, large, count)
+                            triangle.c = shown(r, focal, scale, ortho)
+                    enter(triangle, largest, samples, large, count)
 
 
 @wp.kernel(cuda_max_registers=REGISTERS)
@@ -239,12 +244,12 @@ def fill_large(
     lanes: int,
     samples: wp.array3d(dtype=wp.uint64),
 ):
-    """The listed large triangles: `lanes` threads each, every one takes each so-manieth row."""
-    n, lane = wp.tid()
-    if n >= wp.min(count[0], large.shape[0]):
+    """Fill the listed large triangles with `lanes` threads each, every thread taking each `lanes`-th row."""
+    entry, lane = wp.tid()
+    if entry >= wp.min(count[0], large.shape[0]):
         return
-    t = large[n]
-    rows = rows_of(t, samples.shape[1])
-    slope = slopes(t)
+    triangle = large[entry]
+    rows = rows_of(triangle, samples.shape[1])
+    slope = slopes(triangle)
     for y in range(rows[0] + lane, rows[1], lanes):
-        fill_row(t, y, samples, slope[0], slope[1])
+        fill_row(triangle, y, samples, slope[0], slope[1])

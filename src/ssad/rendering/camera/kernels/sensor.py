@@ -1,4 +1,4 @@
-"""The sensor: linear light to photosites, photosites to 8 bits. See `ssad.rendering.camera.sensor` for the chain."""
+"""Sensor: linear light to photosites, and photosites to 8 bits. See `ssad.camera.sensor` for the chain."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Response:
-    """A view's sensor.
+    """Sensor of a view.
 
     Attributes:
         exposure: Factor of the light.
@@ -32,32 +32,33 @@ class Response:
 
 @wp.func
 def mirrored(index: int, count: int) -> int:
-    """An index no further out than the picture, mirrored at its outermost pixel."""
+    """Return an index mirrored into the image at its outermost pixel."""
     inside = wp.abs(index)
     if inside >= count:
+        # The outermost pixel is not repeated, which keeps the order of the mosaic.
         inside = 2 * count - 2 - inside
     return wp.max(inside, 0)
 
 
 @wp.func
 def code_of(curve: wp.array(dtype=wp.uint8), light: float) -> wp.uint8:
-    """The camera's curve, listed over the square root of light in 0..4."""
-    v = wp.sqrt(wp.clamp(light, 0.0, 3.999)) * 0.5 * float(curve.shape[0])
-    return curve[int(v)]
+    """Look up the camera's curve, listed over the square root of light in 0..4."""
+    position = wp.sqrt(wp.clamp(light, 0.0, 3.999)) * 0.5 * float(curve.shape[0])
+    return curve[int(position)]
 
 
 @wp.func
 def filled(response: Response, light: float, normal: float) -> float:
-    """What a photosite holds: light with noise, and no more than fits."""
-    spread = wp.sqrt(response.photons * wp.max(light, 0.0) + response.dark * response.dark)
-    return wp.min(light + spread * normal, response.full)
+    """Return the content of a photosite: light with noise, at most the full value."""
+    deviation = wp.sqrt(response.photons * wp.max(light, 0.0) + response.dark * response.dark)
+    return wp.min(light + deviation * normal, response.full)
 
 
 @wp.func
 def spread_row(
     radiance: wp.array3d(dtype=wp.vec3), b: int, y: int, left: int, x: int, right: int, c: int, response: Response
 ) -> float:
-    """One colour of a row, spread along it."""
+    """Return one colour of a row, spread along it."""
     return response.centre * radiance[b, y, x][c] + response.side * (radiance[b, y, left][c] + radiance[b, y, right][c])
 
 
@@ -74,7 +75,7 @@ def site(
     c: int,
     response: Response,
 ) -> float:
-    """What the photosite of colour c at y, x holds."""
+    """Return the content of the photosite of colour c at y, x."""
     light = response.centre * spread_row(radiance, b, y, left, x, right, c, response)
     light += response.side * (
         spread_row(radiance, b, above, left, x, right, c, response)
@@ -82,6 +83,7 @@ def site(
     )
     light = light * response.exposure
     if response.dark > 0.0:
+        # Seeded by the position: noise does not depend on the order of the threads.
         state = wp.rand_init(response.seed, y * radiance.shape[2] + x)
         return filled(response, light, wp.randn(state))
     return wp.min(light, response.full)
@@ -91,12 +93,12 @@ def site(
 def expose(
     radiance: wp.array3d(dtype=wp.vec3), responses: wp.array(dtype=Response), raw: wp.array3d(dtype=float)
 ):  # fmt: skip
-    """Light to photosites raw [B, H, W], for views with a mosaic.
+    """Expose photosites raw [B, H, W] to light, for views with a mosaic.
 
     Each thread handles a square of four, so that no thread has to choose its colour.
     """
-    b, row, column = wp.tid()
-    response = responses[b]
+    view, row, column = wp.tid()
+    response = responses[view]
     if response.mosaic == 0:
         return
     height = radiance.shape[1]
@@ -105,16 +107,18 @@ def expose(
     x = 2 * column
     above = mirrored(y - 1, height)
     left = mirrored(x - 1, width)
-    y1 = mirrored(y + 1, height)
-    x1 = mirrored(x + 1, width)
-    raw[b, y, x] = site(radiance, b, y, x, above, y1, left, x1, 0, response)
+    below = mirrored(y + 1, height)
+    right = mirrored(x + 1, width)
+    raw[view, y, x] = site(radiance, view, y, x, above, below, left, right, 0, response)
     if x + 1 < width:
-        raw[b, y, x1] = site(radiance, b, y, x1, above, y1, x, mirrored(x + 2, width), 1, response)
+        raw[view, y, right] = site(radiance, view, y, right, above, below, x, mirrored(x + 2, width), 1, response)
     if y + 1 < height:
-        y2 = mirrored(y + 2, height)
-        raw[b, y1, x] = site(radiance, b, y1, x, y, y2, left, x1, 1, response)
+        second_below = mirrored(y + 2, height)
+        raw[view, below, x] = site(radiance, view, below, x, y, second_below, left, right, 1, response)
         if x + 1 < width:
-            raw[b, y1, x1] = site(radiance, b, y1, x1, y, y2, x, mirrored(x + 2, width), 2, response)
+            raw[view, below, right] = site(
+                radiance, view, below, right, y, second_below, x, mirrored(x + 2, width), 2, response
+            )
 
 
 @wp.kernel
@@ -124,13 +128,13 @@ def develop(
     curve: wp.array(dtype=wp.uint8),
     out: wp.array4d(dtype=wp.uint8),
 ):
-    """Photosites to 8 bits out [B, H, W, 3], for views with a mosaic.
+    """Develop photosites to 8 bits out [B, H, W, 3], for views with a mosaic.
 
-    First the missing colours are interpolated (Malvar, He and Cutler 2004), then the curve is applied. Each thread
-    handles a square of four.
+    First the missing colours are interpolated (Malvar, He and Cutler 2004), then the curve is applied. Each
+    thread handles a square of four.
     """
-    b, row, column = wp.tid()
-    if responses[b].mosaic == 0:
+    view, row, column = wp.tid()
+    if responses[view].mosaic == 0:
         return
     height = raw.shape[1]
     width = raw.shape[2]
@@ -146,60 +150,60 @@ def develop(
     x3 = mirrored(x2 + 1, width)
     x4 = mirrored(x2 + 2, width)
     x5 = mirrored(x2 + 3, width)
-    # the 6 x 6 photosites around the square, but for its far corners; letters by colour
-    g01 = raw[b, y0, x3]
-    r00 = raw[b, y0, x2]
-    b10 = raw[b, y1, x1]
-    g10 = raw[b, y1, x2]
-    b11 = raw[b, y1, x3]
-    g11 = raw[b, y1, x4]
-    r20 = raw[b, y2, x0]
-    g20 = raw[b, y2, x1]
-    r21 = raw[b, y2, x2]
-    g21 = raw[b, y2, x3]
-    r22 = raw[b, y2, x4]
-    g22 = raw[b, y2, x5]
-    g30 = raw[b, y3, x0]
-    b30 = raw[b, y3, x1]
-    g31 = raw[b, y3, x2]
-    b31 = raw[b, y3, x3]
-    g32 = raw[b, y3, x4]
-    b32 = raw[b, y3, x5]
-    g40 = raw[b, y4, x1]
-    r41 = raw[b, y4, x2]
-    g41 = raw[b, y4, x3]
-    r42 = raw[b, y4, x4]
-    g51 = raw[b, y5, x2]
-    b51 = raw[b, y5, x3]
+    # The 6 x 6 photosites around the square, except the far corners; the letter is the colour.
+    g01 = raw[view, y0, x3]
+    r00 = raw[view, y0, x2]
+    b10 = raw[view, y1, x1]
+    g10 = raw[view, y1, x2]
+    b11 = raw[view, y1, x3]
+    g11 = raw[view, y1, x4]
+    r20 = raw[view, y2, x0]
+    g20 = raw[view, y2, x1]
+    r21 = raw[view, y2, x2]
+    g21 = raw[view, y2, x3]
+    r22 = raw[view, y2, x4]
+    g22 = raw[view, y2, x5]
+    g30 = raw[view, y3, x0]
+    b30 = raw[view, y3, x1]
+    g31 = raw[view, y3, x2]
+    b31 = raw[view, y3, x3]
+    g32 = raw[view, y3, x4]
+    b32 = raw[view, y3, x5]
+    g40 = raw[view, y4, x1]
+    r41 = raw[view, y4, x2]
+    g41 = raw[view, y4, x3]
+    r42 = raw[view, y4, x4]
+    g51 = raw[view, y5, x2]
+    b51 = raw[view, y5, x3]
     # red's site
     green = 0.5 * r21 + 0.25 * (g20 + g21 + g10 + g31) - 0.125 * (r20 + r22 + r00 + r41)
     blue = 0.75 * r21 + 0.25 * (b10 + b11 + b30 + b31) - 0.1875 * (r20 + r22 + r00 + r41)
-    out[b, y2, x2, 0] = code_of(curve, r21)
-    out[b, y2, x2, 1] = code_of(curve, green)
-    out[b, y2, x2, 2] = code_of(curve, blue)
+    out[view, y2, x2, 0] = code_of(curve, r21)
+    out[view, y2, x2, 1] = code_of(curve, green)
+    out[view, y2, x2, 2] = code_of(curve, blue)
     if x2 + 1 < width:
         # green's, red left and right
         near = 0.625 * g21 - 0.125 * (g10 + g11 + g31 + g32)
         red = near + 0.5 * (r21 + r22) - 0.125 * (g20 + g22) + 0.0625 * (g01 + g41)
         blue = near + 0.5 * (b11 + b31) - 0.125 * (g01 + g41) + 0.0625 * (g20 + g22)
-        out[b, y2, x3, 0] = code_of(curve, red)
-        out[b, y2, x3, 1] = code_of(curve, g21)
-        out[b, y2, x3, 2] = code_of(curve, blue)
+        out[view, y2, x3, 0] = code_of(curve, red)
+        out[view, y2, x3, 1] = code_of(curve, g21)
+        out[view, y2, x3, 2] = code_of(curve, blue)
     if y2 + 1 < height:
         # green's, red above and below
         near = 0.625 * g31 - 0.125 * (g20 + g21 + g40 + g41)
         red = near + 0.5 * (r21 + r41) - 0.125 * (g10 + g51) + 0.0625 * (g30 + g32)
         blue = near + 0.5 * (b30 + b31) - 0.125 * (g30 + g32) + 0.0625 * (g10 + g51)
-        out[b, y3, x2, 0] = code_of(curve, red)
-        out[b, y3, x2, 1] = code_of(curve, g31)
-        out[b, y3, x2, 2] = code_of(curve, blue)
+        out[view, y3, x2, 0] = code_of(curve, red)
+        out[view, y3, x2, 1] = code_of(curve, g31)
+        out[view, y3, x2, 2] = code_of(curve, blue)
     if x2 + 1 < width and y2 + 1 < height:
         # blue's
         green = 0.5 * b31 + 0.25 * (g31 + g32 + g21 + g41) - 0.125 * (b30 + b32 + b11 + b51)
         red = 0.75 * b31 + 0.25 * (r21 + r22 + r41 + r42) - 0.1875 * (b30 + b32 + b11 + b51)
-        out[b, y3, x3, 0] = code_of(curve, red)
-        out[b, y3, x3, 1] = code_of(curve, green)
-        out[b, y3, x3, 2] = code_of(curve, b31)
+        out[view, y3, x3, 0] = code_of(curve, red)
+        out[view, y3, x3, 1] = code_of(curve, green)
+        out[view, y3, x3, 2] = code_of(curve, b31)
 
 
 @wp.kernel
@@ -209,30 +213,35 @@ def develop_plain(
     curve: wp.array(dtype=wp.uint8),
     out: wp.array4d(dtype=wp.uint8),
 ):
-    """Light to 8 bits, for views without a mosaic: every photosite has three colours. out [B, H, W, 3]."""
-    b, y, x = wp.tid()
-    response = responses[b]
+    """Develop light to 8 bits out [B, H, W, 3], for views without a mosaic: every photosite has three colours."""
+    view, y, x = wp.tid()
+    response = responses[view]
     if response.mosaic == 1:
         return
     height = radiance.shape[1]
     width = radiance.shape[2]
-    light = radiance[b, y, x]
+    light = radiance[view, y, x]
     if response.side > 0.0:
         left = mirrored(x - 1, width)
         right = mirrored(x + 1, width)
         above = mirrored(y - 1, height)
         below = mirrored(y + 1, height)
-        across = radiance[b, y, left] + radiance[b, y, right]
-        over = (
-            radiance[b, above, left] + radiance[b, above, right] + radiance[b, below, left] + radiance[b, below, right]
+        horizontal = radiance[view, y, left] + radiance[view, y, right]
+        diagonal = (
+            radiance[view, above, left]
+            + radiance[view, above, right]
+            + radiance[view, below, left]
+            + radiance[view, below, right]
         )
-        along = radiance[b, above, x] + radiance[b, below, x]
-        light = light * (response.centre * response.centre) + (across + along) * (response.centre * response.side)
-        light += over * (response.side * response.side)
+        vertical = radiance[view, above, x] + radiance[view, below, x]
+        light = light * (response.centre * response.centre) + (horizontal + vertical) * (
+            response.centre * response.side
+        )
+        light += diagonal * (response.side * response.side)
     light = light * response.exposure
     if response.dark > 0.0:
         state = wp.rand_init(response.seed, y * width + x)
-        for c in range(3):
-            light[c] = filled(response, light[c], wp.randn(state))
-    for c in range(3):
-        out[b, y, x, c] = code_of(curve, wp.min(light[c], response.full))
+        for channel in range(3):
+            light[channel] = filled(response, light[channel], wp.randn(state))
+    for channel in range(3):
+        out[view, y, x, channel] = code_of(curve, wp.min(light[channel], response.full))

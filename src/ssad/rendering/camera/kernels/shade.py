@@ -1,8 +1,8 @@
-"""Shading: what light comes from each sample, averaged to pixels. Linear in the colour of every surface.
+"""Shading: light from each sample, averaged to pixels; linear in the colour of every surface.
 
-One evaluation a pixel and triangle, at the mean of the samples that the triangle covers. Sun with two shadow maps (one
-fine, where it matters), sky and ground as ambient light that bodies keep from the ground below them, lamps, a mirror
-term for glass, paint and wet roads, fog by distance.
+One evaluation a pixel and triangle, at the mean of the samples that the triangle covers. Sun with two shadow maps
+(one fine, around the focus), ambient light of sky and ground with contact occlusion, lamps, a mirror term for glass,
+paint and wet roads, fog by distance.
 """
 
 import warp as wp
@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Geometry:
-    """What a scene is made of, see `ssad.rendering.camera.scene.Scene`."""
+    """Arrays of a scene, as in `ssad.camera.scene.Scene`."""
 
     vertices: wp.array(dtype=wp.vec3)
     faces: wp.array2d(dtype=int)
@@ -64,19 +64,20 @@ class SunShadows:
 
 @wp.struct
 class Output:
-    """What `shade` writes.
+    """Outputs of `shade`.
 
     Attributes:
         radiance: [B, H, W].
         tag: [B, H, W].
         depth: [B, H, W], m.
         fragments: Pieces of textured surfaces.
-        found: How many fragments were found.
-        surface: 1 where the following four are wanted, [B, H, W] each; they describe what covers most of a pixel.
+        found: Number of fragments.
+        surface: 1 if the following four are exported, [B, H, W] each; they describe the surface that covers
+            most of a pixel.
         albedo: Linear.
         normal: Unit vectors, world.
         irradiance: Of all light, over pi.
-        gain: What the pixel's radiance gains per unit of albedo.
+        gain: Gain of the pixel's radiance per unit of albedo.
     """
 
     radiance: wp.array3d(dtype=wp.vec3)
@@ -93,7 +94,7 @@ class Output:
 
 @wp.struct
 class Hit:
-    """Where a ray meets a face.
+    """Intersection of a ray with a face.
 
     Attributes:
         draw: Its draw.
@@ -135,7 +136,7 @@ class Lit:
 
 @wp.struct
 class Seen:
-    """What a surface sends to the camera: its colour, and what it gains per unit of albedo."""
+    """Light that a surface sends to the camera: its colour, and its gain per unit of albedo."""
 
     colour: wp.vec3
     gain: wp.vec3
@@ -143,7 +144,7 @@ class Seen:
 
 @wp.func
 def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column: int, depth: float) -> float:
-    """1 where the texel holds nothing nearer to the light."""
+    """Return 1 if the texel holds nothing nearer to the light, else 0."""
     if wp.cast(wp.uint32(shadows[view, row, column] >> wp.uint64(32)), float) <= depth:
         return 1.0
     return 0.0
@@ -151,9 +152,9 @@ def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column
 
 @wp.func
 def sunlit(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
-    """Share of the sun that reaches a point, from four texels of a shadow map, weighted; -1 outside the map.
+    """Return the share of the sun that reaches a point, from four weighted texels of a shadow map.
 
-    p: the point in texels, and in metres along the light.
+    p: the point in texels, and in metres along the light. Points outside the map give -1.
     """
     size = shadows.shape[1]
     if size < 4:
@@ -167,15 +168,18 @@ def sunlit(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: fl
     u = x - float(i)
     v = y - float(j)
     depth = (1.0e3 - p[2] + bias) * 1.0e-3
-    low = open_texel(shadows, view, j, i, depth) * (1.0 - u) + open_texel(shadows, view, j, i + 1, depth) * u
-    high = open_texel(shadows, view, j + 1, i, depth) * (1.0 - u) + open_texel(shadows, view, j + 1, i + 1, depth) * u
-    return low * (1.0 - v) + high * v
+    upper_row = open_texel(shadows, view, j, i, depth) * (1.0 - u) + open_texel(shadows, view, j, i + 1, depth) * u
+    lower_row = (
+        open_texel(shadows, view, j + 1, i, depth) * (1.0 - u) + open_texel(shadows, view, j + 1, i + 1, depth) * u
+    )
+    return upper_row * (1.0 - v) + lower_row * v
 
 
 @wp.func
 def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
-    """Share of the sun that reaches a point with a normal: by the fine map where it has the point."""
+    """Return the share of the sun that reaches a point with a normal, by the fine map if it contains the point."""
     texel = shadows.fine_texel
+    # The offset along the normal keeps a surface from shading itself.
     share = sunlit(shadows.fine, view, wp.transform_point(shadows.to_fine[view], p + n * (texel * 1.5)), texel)
     if share < 0.0:
         texel = shadows.wide_texel
@@ -187,39 +191,42 @@ def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
 
 @wp.func
 def hit_of(geometry: Geometry, drawn: Drawn, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
-    """Where a ray (camera frame, z = 1) meets the plane of a slot's face, no further out than its edges."""
+    """Intersect a ray (camera frame, z = 1) with the plane of a slot's face, clamped to its edges."""
     hit = Hit()
     owner = drawn.owners[slot / 2]
     hit.draw = owner[0]
     hit.face = owner[1]
     face = hit.face
-    m = drawn.matrices[hit.draw]
-    a = wp.transform_point(m, geometry.vertices[geometry.faces[face, 0]])
-    b = wp.transform_point(m, geometry.vertices[geometry.faces[face, 1]])
-    c = wp.transform_point(m, geometry.vertices[geometry.faces[face, 2]])
+    to_camera = drawn.matrices[hit.draw]
+    a = wp.transform_point(to_camera, geometry.vertices[geometry.faces[face, 0]])
+    b = wp.transform_point(to_camera, geometry.vertices[geometry.faces[face, 1]])
+    c = wp.transform_point(to_camera, geometry.vertices[geometry.faces[face, 2]])
     ab = b - a
     ac = c - a
     plane = wp.cross(ab, ac)
     along = wp.dot(plane, ray)
+    # A face seen edge-on: the negative sign is that of a face turned to the camera.
     if wp.abs(along) < 1.0e-12:
         along = -1.0e-12
     hit.z = wp.clamp(wp.dot(plane, a) / along, 0.05, 2.0e3)
-    # in shares of the corners
-    inside = ray * hit.z - a
-    square = wp.dot(plane, plane)
-    sb = wp.clamp(wp.dot(wp.cross(inside, ac), plane) / square, 0.0, 1.0)
-    sc = wp.clamp(wp.dot(wp.cross(ab, inside), plane) / square, 0.0, 1.0 - sb)
-    sa = 1.0 - sb - sc
-    hit.uv = geometry.uvs[face, 0] * sa + geometry.uvs[face, 1] * sb + geometry.uvs[face, 2] * sc
-    bent = geometry.normals[face, 0] * sa + geometry.normals[face, 1] * sb + geometry.normals[face, 2] * sc
-    hit.normal = wp.normalize(wp.transform_vector(pose, wp.transform_vector(m, bent)))
+    # barycentric coordinates, clamped: the mean of a pixel's samples can lie outside the face
+    offset = ray * hit.z - a
+    squared_area = wp.dot(plane, plane)
+    b_share = wp.clamp(wp.dot(wp.cross(offset, ac), plane) / squared_area, 0.0, 1.0)
+    c_share = wp.clamp(wp.dot(wp.cross(ab, offset), plane) / squared_area, 0.0, 1.0 - b_share)
+    a_share = 1.0 - b_share - c_share
+    hit.uv = geometry.uvs[face, 0] * a_share + geometry.uvs[face, 1] * b_share + geometry.uvs[face, 2] * c_share
+    corner_normal = (
+        geometry.normals[face, 0] * a_share + geometry.normals[face, 1] * b_share + geometry.normals[face, 2] * c_share
+    )
+    hit.normal = wp.normalize(wp.transform_vector(pose, wp.transform_vector(to_camera, corner_normal)))
     length = wp.length(ray)
     hit.distance = hit.z * length
     hit.place = wp.transform_point(pose, ray * hit.z)
-    hit.slant = wp.max(wp.abs(along) / (wp.sqrt(square) * length), 0.05)
-    ua = geometry.uvs[face, 1] - geometry.uvs[face, 0]
-    ub = geometry.uvs[face, 2] - geometry.uvs[face, 0]
-    hit.stretch = wp.abs(ua[0] * ub[1] - ua[1] * ub[0]) / wp.sqrt(square)
+    hit.slant = wp.max(wp.abs(along) / (wp.sqrt(squared_area) * length), 0.05)
+    uv_ab = geometry.uvs[face, 1] - geometry.uvs[face, 0]
+    uv_ac = geometry.uvs[face, 2] - geometry.uvs[face, 0]
+    hit.stretch = wp.abs(uv_ab[0] * uv_ac[1] - uv_ab[1] * uv_ac[0]) / wp.sqrt(squared_area)
     return hit
 
 
@@ -227,7 +234,7 @@ def hit_of(geometry: Geometry, drawn: Drawn, slot: int, ray: wp.vec3, pose: wp.m
 def lit_at(
     light: Light, shadows: SunShadows, near: Near, view: int, row: int, p: wp.vec3, n: wp.vec3, open_: float
 ) -> Lit:
-    """All light on a point with a normal, but for lamps that project a texture."""
+    """Return all light on a point with a normal, except from lamps that project a texture."""
     lit = Lit()
     lit.open_ = open_
     facing = wp.dot(n, light.sun)
@@ -235,14 +242,15 @@ def lit_at(
         lit.sun = facing * sun_at(shadows, view, p, n)
     up = 0.5 + 0.5 * n[2]
     lit.light = light.sun_colour * lit.sun
+    # Ambient light: hemispheres of sky and ground, weighted by how far the normal points up.
     lit.light += (light.zenith * (0.65 * up) + light.horizon * (0.35 * up)) * open_ + light.ground * (1.0 - up)
     if row >= 0:
-        for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
-            k = near.lamp_list[at]
-            if near.lamps[k].texture < 0:
-                given = lamp_at(near.lamps, k, near.shadows, p, n, light.fog)
-                if given > 0.0:
-                    lit.light += near.lamps[k].light * (given * open_)
+        for entry in range(near.lamp_start[row], near.lamp_start[row + 1]):
+            lamp_index = near.lamp_list[entry]
+            if near.lamps[lamp_index].texture < 0:
+                irradiance = lamp_at(near.lamps, lamp_index, near.shadows, p, n, light.fog)
+                if irradiance > 0.0:
+                    lit.light += near.lamps[lamp_index].light * (irradiance * open_)
     return lit
 
 
@@ -258,8 +266,8 @@ def seen_from(
     lit: Lit,
     away: wp.vec3,
 ) -> Seen:
-    """What a lit surface sends back along a unit ray: its own colour, what it mirrors, fog."""
-    seen = Seen()
+    """Return the light that a lit surface sends back along a unit ray: its own colour, reflections, and fog."""
+    result = Seen()
     n = hit.normal
     p = hit.place
     colour = wp.cw_mul(albedo, lit.light) + surface.colour * glow
@@ -271,61 +279,64 @@ def seen_from(
     wet = int(0)
     if light.wet > 0.0 and n[2] > 0.9:
         wet = 1
-        # a film of water: darker, and a mirror the better the deeper it stands
-        film = light.wet * wp.clamp(0.25 + 1.5 * (cloudy(p[0] * 0.35, p[1] * 0.35) - 0.3), 0.0, 1.0)
-        dark = 1.0 - 0.45 * light.wet
-        colour = colour * dark
-        gain = gain * dark
+        # A film of water darkens the surface, and mirrors better the deeper it is.
+        water_film = light.wet * wp.clamp(0.25 + 1.5 * (cloudy(p[0] * 0.35, p[1] * 0.35) - 0.3), 0.0, 1.0)
+        darkening = 1.0 - 0.45 * light.wet
+        colour = colour * darkening
+        gain = gain * darkening
         mirror = wp.max(mirror, 0.02)
-        gloss = wp.max(gloss, 0.35 * light.wet + 0.6 * film)
-    sharp = float(1.0)
+        gloss = wp.max(gloss, 0.35 * light.wet + 0.6 * water_film)
+    sharpness = float(1.0)
     if wet == 1:
-        sharp = 0.1
-    back = away - n * (2.0 * wp.dot(n, away))
-    glance = 1.0 - wp.max(-wp.dot(n, away), 0.0)
-    fresnel = glance * glance * glance * glance * glance
-    # no step where the mirror begins to count: the first hundredths are given away
-    share = wp.max((mirror + (1.0 - mirror) * fresnel) * gloss - 0.02, 0.0) / 0.98
-    if share > 0.0:
-        colour = colour * (1.0 - share) + surroundings(light, back, p, sharp) * (share * lit.open_)
-        gain = gain * (1.0 - share)
+        sharpness = 0.1
+    mirror_ray = away - n * (2.0 * wp.dot(n, away))
+    grazing = 1.0 - wp.max(-wp.dot(n, away), 0.0)
+    fresnel = grazing * grazing * grazing * grazing * grazing
+    # Subtracting the first 2 % avoids a step where the mirror term begins.
+    mirror_share = wp.max((mirror + (1.0 - mirror) * fresnel) * gloss - 0.02, 0.0) / 0.98
+    if mirror_share > 0.0:
+        colour = colour * (1.0 - mirror_share) + surroundings(light, mirror_ray, p, sharpness) * (
+            mirror_share * lit.open_
+        )
+        gain = gain * (1.0 - mirror_share)
     if gloss > 0.2:
         power = 8.0 + 400.0 * gloss * gloss
-        bright = (mirror + fresnel) * gloss * 6.0
+        highlight = (mirror + fresnel) * gloss * 6.0
         if lit.sun > 0.0:
-            colour += light.sun_colour * (wp.pow(wp.max(wp.dot(back, light.sun), 0.0), power) * bright)
+            colour += light.sun_colour * (wp.pow(wp.max(wp.dot(mirror_ray, light.sun), 0.0), power) * highlight)
         if light.lamps > 0.0 and row >= 0:
-            # a lamp seen in the mirror, drawn long on a wet road as by its small waves
-            rough = power
+            # The mirror image of a lamp is stretched on a wet road, as by small waves.
+            lobe_power = power
             if wet == 1:
-                rough = 60.0
-            # what is turned further away than this shines by less than a thousandth: no power of it is taken
-            least = 0.99 * wp.pow(0.001, 1.0 / rough)
-            for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
-                k = near.lamp_list[at]
-                if near.lamps[k].texture < 0:
-                    toward = wp.normalize(near.lamps[k].place - p)
-                    along = wp.dot(back, toward)
-                    if along > least:
-                        shine = wp.pow(along, rough)
+                lobe_power = 60.0
+            # Smaller cosines contribute less than a thousandth: skip the power function.
+            min_cosine = 0.99 * wp.pow(0.001, 1.0 / lobe_power)
+            for entry in range(near.lamp_start[row], near.lamp_start[row + 1]):
+                lamp_index = near.lamp_list[entry]
+                if near.lamps[lamp_index].texture < 0:
+                    toward = wp.normalize(near.lamps[lamp_index].place - p)
+                    alignment = wp.dot(mirror_ray, toward)
+                    if alignment > min_cosine:
+                        shine = wp.pow(alignment, lobe_power)
                         if shine > 0.001:
-                            given = lamp_at(near.lamps, k, near.shadows, p, toward, light.fog)
-                            colour += near.lamps[k].light * (given * shine * bright * 0.5)
+                            irradiance = lamp_at(near.lamps, lamp_index, near.shadows, p, toward, light.fog)
+                            colour += near.lamps[lamp_index].light * (irradiance * shine * highlight * 0.5)
     if light.fog > 0.0:
-        clear = wp.exp(-light.fog * hit.distance)
-        colour = colour * clear + light.horizon * (1.0 - clear)
-        gain = gain * clear
-    seen.colour = colour
-    seen.gain = gain
-    return seen
+        transmission = wp.exp(-light.fog * hit.distance)
+        colour = colour * transmission + light.horizon * (1.0 - transmission)
+        gain = gain * transmission
+    result.colour = colour
+    result.gain = gain
+    return result
 
 
 @wp.func
 def keep(out: Output, fragment: Fragment):
-    """Lists a fragment as long as there is room."""
-    at = wp.atomic_add(out.found, 0, 1)
-    if at < out.fragments.shape[0]:
-        out.fragments[at] = fragment
+    """List a fragment if there is room."""
+    # Fragments beyond the room are still counted, so that `render` can report the overflow.
+    position = wp.atomic_add(out.found, 0, 1)
+    if position < out.fragments.shape[0]:
+        out.fragments[position] = fragment
 
 
 @wp.func
@@ -341,36 +352,37 @@ def project(
     open_: float,
     fog: float,
 ):
-    """Lists what lamps that project a texture add to a pixel.
+    """List the fragments of lamps that project a texture onto a pixel.
 
-    through: share of the light that the surface sends on to the camera; span: area of the surface in the pixel, m^2.
+    through: share of the light that the surface sends on to the camera; span: area of the surface in the pixel,
+    m^2.
     """
-    for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
-        k = near.lamp_list[at]
-        if near.lamps[k].texture >= 0:
-            given = lamp_at(near.lamps, k, near.shadows, hit.place, hit.normal, fog)
-            if given > 0.0:
-                lamp = near.lamps[k]
+    for entry in range(near.lamp_start[row], near.lamp_start[row + 1]):
+        lamp_index = near.lamp_list[entry]
+        if near.lamps[lamp_index].texture >= 0:
+            irradiance = lamp_at(near.lamps, lamp_index, near.shadows, hit.place, hit.normal, fog)
+            if irradiance > 0.0:
+                lamp = near.lamps[lamp_index]
                 spot = spot_of(lamp, hit.place, hit.normal)
                 piece = fragment
                 piece.texture = lamp.texture
                 piece.u = 0.5 + 0.5 * spot[0]
                 piece.v = 0.5 + 0.5 * spot[1]
                 piece.area = spot[2] * span
-                piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (given * open_)
+                piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (irradiance * open_)
                 keep(out, piece)
 
 
 @wp.func
 def left_by(all: Layers, view: int, draw: int, wearable: int, hit: Hit, tag: int) -> float:
-    """Share of a surface's own colour that its layers and the decals leave."""
-    left = float(1.0)
+    """Return the share of a surface's own colour that its layers and the decals leave."""
+    remaining = float(1.0)
     if wearable == 1:
-        for k in range(all.start[draw], all.start[draw + 1]):
-            left = left * (1.0 - on_layer(all, all.layers[k], hit.uv)[2])
-    for k in range(all.decal_start[view], all.decal_start[view + 1]):
-        left = left * (1.0 - on_decal(all, all.decals[k], hit.place, hit.normal, tag)[2])
-    return left
+        for index in range(all.start[draw], all.start[draw + 1]):
+            remaining = remaining * (1.0 - on_layer(all, all.layers[index], hit.uv)[2])
+    for index in range(all.decal_start[view], all.decal_start[view + 1]):
+        remaining = remaining * (1.0 - on_decal(all, all.decals[index], hit.place, hit.normal, tag)[2])
+    return remaining
 
 
 @wp.func
@@ -386,35 +398,39 @@ def wear(
     gain: wp.vec3,
     span: float,
 ):
-    """Lists what decals and layers add to a pixel, from the uppermost down; span: area of the surface in it, m^2."""
-    left = float(1.0)
+    """List the fragments of decals and layers in a pixel, from the top down.
+
+    span: area of the surface in the pixel, m^2.
+    """
+    remaining = float(1.0)
     count = all.decal_start[view + 1] - all.decal_start[view]
-    for k in range(count):
-        decal = all.decals[all.decal_start[view + 1] - 1 - k]
-        at = on_decal(all, decal, hit.place, hit.normal, tag)
-        if at[2] > 0.0:
+    # From the top down: each texture hides part of the ones below it.
+    for index in range(count):
+        decal = all.decals[all.decal_start[view + 1] - 1 - index]
+        lookup = on_decal(all, decal, hit.place, hit.normal, tag)
+        if lookup[2] > 0.0:
             piece = fragment
             piece.texture = decal.texture
-            piece.u = at[0]
-            piece.v = at[1]
+            piece.u = lookup[0]
+            piece.v = lookup[1]
             piece.area = span * wp.abs(wp.dot(hit.normal, decal.ahead)) / decal.area
-            piece.light = gain * (left * at[2])
+            piece.light = gain * (remaining * lookup[2])
             keep(out, piece)
-            left = left * (1.0 - at[2])
+            remaining = remaining * (1.0 - lookup[2])
     if wearable == 1:
         count = all.start[draw + 1] - all.start[draw]
-        for k in range(count):
-            layer = all.layers[all.start[draw + 1] - 1 - k]
-            at = on_layer(all, layer, hit.uv)
-            if at[2] > 0.0:
+        for index in range(count):
+            layer = all.layers[all.start[draw + 1] - 1 - index]
+            lookup = on_layer(all, layer, hit.uv)
+            if lookup[2] > 0.0:
                 piece = fragment
                 piece.texture = layer.texture
-                piece.u = at[0]
-                piece.v = at[1]
+                piece.u = lookup[0]
+                piece.v = lookup[1]
                 piece.area = hit.stretch / ((layer.box[2] - layer.box[0]) * (layer.box[3] - layer.box[1])) * span
-                piece.light = gain * (left * at[2])
+                piece.light = gain * (remaining * lookup[2])
                 keep(out, piece)
-                left = left * (1.0 - at[2])
+                remaining = remaining * (1.0 - lookup[2])
 
 
 @wp.func
@@ -434,55 +450,56 @@ def shade_pixel(
     y: int,
     x: int,
 ):
-    """Shades one pixel, see `shade`."""
+    """Shade one pixel, see `shade`."""
     total = wp.vec3(0.0, 0.0, 0.0)
     best = int(0)
-    most = int(-1)
-    far = float(wp.inf)
+    best_tag = int(-1)
+    best_depth = float(wp.inf)
     count = scale * scale
-    step = 1.0 / float(scale)
+    sample_size = 1.0 / float(scale)
     eye = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
-    # the lower half of a key names the triangle, 0 the sky
-    top = y * scale
-    left = x * scale
-    name = drawn.samples[view, top, left] & LAST
-    different = int(0)
+    # The lower half of a key identifies the triangle, 0 the sky.
+    top_row = y * scale
+    left_column = x * scale
+    first_key = drawn.samples[view, top_row, left_column] & LAST
+    different_count = int(0)
     for dy in range(scale):
         for dx in range(scale):
-            if (drawn.samples[view, top + dy, left + dx] & LAST) != name:
-                different += 1
-    rounds = count
-    if different == 0:
-        rounds = 1
-    for s in range(rounds):
-        key = name
+            if (drawn.samples[view, top_row + dy, left_column + dx] & LAST) != first_key:
+                different_count += 1
+    # Most pixels show one triangle: a single evaluation is enough.
+    evaluations = count
+    if different_count == 0:
+        evaluations = 1
+    for sample in range(evaluations):
+        key = first_key
         covered = count
-        px = 0.5 * float(count * (scale - 1))
-        py = px
-        fresh = int(1)
-        if different > 0:
-            # a triangle is shaded where it comes first
-            key = drawn.samples[view, top + s / scale, left + s % scale] & LAST
+        sum_x = 0.5 * float(count * (scale - 1))
+        sum_y = sum_x
+        is_first = int(1)
+        if different_count > 0:
+            # A triangle is shaded at its first sample.
+            key = drawn.samples[view, top_row + sample / scale, left_column + sample % scale] & LAST
             covered = int(0)
-            px = float(0.0)
-            py = float(0.0)
-            e = int(0)
+            sum_x = float(0.0)
+            sum_y = float(0.0)
+            other = int(0)
             for dy in range(scale):
                 for dx in range(scale):
-                    if (drawn.samples[view, top + dy, left + dx] & LAST) == key:
-                        if e < s:
-                            fresh = 0
+                    if (drawn.samples[view, top_row + dy, left_column + dx] & LAST) == key:
+                        if other < sample:
+                            is_first = 0
                         covered += 1
-                        px += float(dx)
-                        py += float(dy)
-                    e += 1
-        if fresh == 1:
-            u = float(x) + (px / float(covered) + 0.5) * step - 0.5
-            v = float(y) + (py / float(covered) + 0.5) * step - 0.5
+                        sum_x += float(dx)
+                        sum_y += float(dy)
+                    other += 1
+        if is_first == 1:
+            u = float(x) + (sum_x / float(covered) + 0.5) * sample_size - 0.5
+            v = float(y) + (sum_y / float(covered) + 0.5) * sample_size - 0.5
             ray = wp.vec3((u - focal[2]) / focal[0], (v - focal[3]) / focal[1], 1.0)
             away = wp.normalize(wp.transform_vector(pose, ray))
             colour = wp.vec3(0.0, 0.0, 0.0)
-            mine = int(-1)
+            surface_tag = int(-1)
             z = float(wp.inf)
             if key == wp.uint64(0):
                 colour = sky(light, away, 1)
@@ -493,14 +510,14 @@ def shade_pixel(
                 slot = int(LAST - key)
                 hit = hit_of(geometry, drawn, slot, ray, pose)
                 z = hit.z
-                mine = drawn.tags[hit.draw]
+                surface_tag = drawn.tags[hit.draw]
                 surface = geometry.surfaces[geometry.material[hit.face]]
                 albedo = surface.colour
                 if surface.paint == 1:
                     albedo = drawn.paints[hit.draw]
                 albedo = textured(surface, albedo, hit.uv, hit.distance / (focal[0] * hit.slant))
                 if layers.any == 1:
-                    albedo = albedo * left_by(layers, view, hit.draw, geometry.wearable[hit.face], hit, mine)
+                    albedo = albedo * left_by(layers, view, hit.draw, geometry.wearable[hit.face], hit, surface_tag)
                 row = cell_of(hit.place, eye)
                 open_ = float(1.0)
                 if row >= 0:
@@ -511,35 +528,46 @@ def shade_pixel(
                 glow = surface.emission + surface.night * light.lamps
                 if surface.lamp == 1 and drawn.lit[hit.draw] == 0:
                     glow = 0.0
-                shown = seen_from(light, near, row, surface, albedo, glow, hit, lit, away)
-                colour = shown.colour
+                shaded = seen_from(light, near, row, surface, albedo, glow, hit, lit, away)
+                colour = shaded.colour
                 share = float(covered) / float(count)
                 if layers.any == 1 or (projecting == 1 and row >= 0):
                     piece = Fragment()
                     piece.place = (view * out.radiance.shape[1] + y) * out.radiance.shape[2] + x
                     piece.slot = slot
-                    # area of the surface that the pixel spans
+                    # surface area that the pixel spans
                     span = hit.distance * hit.distance / (focal[0] * focal[1] * hit.slant)
                     span = span / (wp.length(ray) * wp.dot(ray, ray))
-                    gain = shown.gain * share
+                    gain = shaded.gain * share
                     if layers.any == 1:
-                        wear(out, layers, view, hit.draw, geometry.wearable[hit.face], piece, hit, mine, gain, span)
+                        wear(
+                            out,
+                            layers,
+                            view,
+                            hit.draw,
+                            geometry.wearable[hit.face],
+                            piece,
+                            hit,
+                            surface_tag,
+                            gain,
+                            span,
+                        )
                     if projecting == 1 and row >= 0:
                         through = wp.cw_div(gain, wp.max(lit.light, wp.vec3(1.0e-6, 1.0e-6, 1.0e-6)))
                         project(out, near, row, piece, hit, albedo, through, span, open_, light.fog)
-                if out.surface == 1 and (covered > best or (covered == best and z < far)):
+                if out.surface == 1 and (covered > best or (covered == best and z < best_depth)):
                     out.albedo[view, y, x] = albedo
                     out.normal[view, y, x] = hit.normal
                     out.irradiance[view, y, x] = lit.light
-                    out.gain[view, y, x] = shown.gain * share
+                    out.gain[view, y, x] = shaded.gain * share
             total = total + colour * float(covered)
-            if covered > best or (covered == best and z < far):
+            if covered > best or (covered == best and z < best_depth):
                 best = covered
-                most = mine
-                far = z
+                best_tag = surface_tag
+                best_depth = z
     out.radiance[view, y, x] = total / float(count)
-    out.tag[view, y, x] = most
-    out.depth[view, y, x] = far
+    out.tag[view, y, x] = best_tag
+    out.depth[view, y, x] = best_depth
 
 
 @wp.kernel(cuda_max_registers=REGISTERS)
@@ -557,13 +585,14 @@ def shade(
     lanes: int,
     out: Output,
 ):
-    """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
+    """Compute linear light, tag of the surface that covers most of a pixel (-1 sky) and depth (inf sky).
 
-    The radiance is without layers and decals, as if they were black; they are listed as fragments, in any order, and so
-    is what lamps that project a texture add to a surface's own colour (`projecting`: 1 if there are any).
+    The radiance is without layers and decals, as if they were black; they are listed as fragments in any order,
+    and so is the light that texture-projecting lamps add to a surface's own colour (`projecting`: 1 if any).
+    See `Output`.
 
-    Each row has `lanes` threads, which take its pixels in turn: as many as pixels on a GPU, one on a CPU, where every
-    thread copies all the arguments anew.
+    Each row has `lanes` threads, which take its pixels in turn: as many as pixels on a GPU, one on a CPU, where
+    every thread copies all the arguments anew.
     """
     view, y, lane = wp.tid()
     focal = lens[view]

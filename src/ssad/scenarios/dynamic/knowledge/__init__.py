@@ -1,1 +1,1 @@
-"""The scenario classes: one module each, and what they share."""
+"""Scenario classes, one module each, and their shared helpers."""

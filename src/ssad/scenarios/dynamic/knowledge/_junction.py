@@ -1,4 +1,4 @@
-"""What the four junction scenarios share: one car that meets the ego in a junction."""
+"""Shared parts of the four junction scenarios: one car that meets the ego in a junction."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _BODY = "coupe"
 
 
 def box(speed: float, trigger_distance: float) -> tuple[Parameter, ...]:
-    """The parameters of a car that meets the ego in a junction, each 5 either side of SafeBench's value.
+    """Return the parameters of a car that meets the ego in a junction, each 5 around SafeBench's value.
 
     Args:
         speed: SafeBench's speed of the car, m/s.
@@ -89,11 +89,11 @@ def meeting_car(
     Raises:
         RouteError: No lane into the ego's junction crosses its route.
     """
-    value = kind.values(scenario.parameters)
+    values = kind.values(scenario.parameters)
     if scenario.placements:
-        pose = shifted(scenario.placements[0], value["longitudinal"], 0.0)
+        pose = shifted(scenario.placements[0], values["longitudinal"], 0.0)
         return [scripted(name, _BODY, pose, phases)]
-    place = meeting_place(
+    start_place = meeting_place(
         graph,
         scenario,
         route,
@@ -102,5 +102,5 @@ def meeting_car(
         speed=kind.box["speed"].default,
         body=_BODY,
     )
-    place = ahead(graph, place, value["longitudinal"])
-    return [scripted(name, _BODY, pose_at(graph, place), phases, bending_route(graph, place))]
+    start_place = ahead(graph, start_place, values["longitudinal"])
+    return [scripted(name, _BODY, pose_at(graph, start_place), phases, bending_route(graph, start_place))]

@@ -1,4 +1,4 @@
-"""What a scenario class is: a name, a parameter box, and a function that places and scripts its actors."""
+"""Definition of a scenario class: a name, a parameter box, and a function that places and scripts its actors."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that varies a scenario.
+    """Numeric parameter of a scenario class.
 
     Attributes:
         name: Key in `Scenario.parameters`.
-        low: Least value that is searched, in `unit`.
-        high: Greatest value that is searched, in `unit`.
-        default: Value of a scenario that does not give one, in `unit`.
+        low: Minimum of the search range, in `unit`.
+        high: Maximum of the search range, in `unit`.
+        default: Value of a scenario that omits the parameter, in `unit`.
         unit: Unit of the values, "" for a plain number.
-        doc: What the number means.
-        spread: How far a repetition may draw the number from the scenario's own value at spread 1, in `unit`; 0: it
-            is never drawn.
-        allowed: Least and greatest value that a scenario may have, in `unit`; None: `low` and `high`.
+        doc: Meaning of the number.
+        spread: Maximum deviation of a random draw from the scenario's own value at spread 1, in `unit`; 0: never
+            drawn.
+        allowed: Minimum and maximum that a scenario may use, in `unit`; None: `low` and `high`.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Parameter:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Least and greatest value that a scenario may have, in `unit`."""
+        """Minimum and maximum that a scenario may use, in `unit`."""
         return self.allowed or (self.low, self.high)
 
     def __post_init__(self) -> None:
@@ -54,7 +54,7 @@ class Parameter:
             raise ValueError(f"{self.name}: spread {self.spread} outside [0, {self.high - self.low}]")
 
     def problem(self, value: float) -> str | None:
-        """Says what is wrong with a value.
+        """Return the problem of a value, if any.
 
         Args:
             value: The value, in `unit`.
@@ -102,13 +102,13 @@ class ScenarioType:
     Attributes:
         name: Name in `Scenario.type`.
         title: Name in the paper.
-        nhtsa: The pre-crash situation that it comes from.
+        nhtsa: Pre-crash situation of the NHTSA typology.
         build: (scenario, lane graph, the ego's route, random numbers) -> the agents after the ego, in the order that
             `Condition.actor` counts.
-        parameters: Its own parameters; those of the ego's start (`EGO_START`) come by themselves.
-        signals: Signal plan of a scenario that leaves it at the default.
-        traffic: Traffic of a scenario that leaves it at the default.
-        max_distance: How far the ego may drive, m.
+        parameters: Parameters of the class; those of the ego start (`EGO_START`) are added.
+        signals: Default signal plan.
+        traffic: Default traffic.
+        max_distance: Maximum distance of the ego, m.
         whole_town: The signal plan covers every signal of the map, not only the junctions on the route.
     """
 
@@ -128,8 +128,8 @@ class ScenarioType:
 
     @cached_property
     def box(self) -> Mapping[str, Parameter]:
-        """Parameters by name: the class's own, then those of the ego's start."""
-        return {p.name: p for p in (*self.parameters, *EGO_START)}
+        """Parameters by name: those of the class, then those of the ego start."""
+        return {parameter.name: parameter for parameter in (*self.parameters, *EGO_START)}
 
     def values(self, given: Mapping[str, float]) -> dict[str, float]:
         """The value of every parameter.
@@ -143,9 +143,13 @@ class ScenarioType:
         Raises:
             ConfigError: A name is unknown, or a value out of range.
         """
-        box = self.box
+        parameters = self.box
         for name, value in given.items():
-            problem = box[name].problem(value) if name in box else f"no such parameter; known: {', '.join(box)}"
+            problem = (
+                parameters[name].problem(value)
+                if name in parameters
+                else f"no such parameter; known: {', '.join(parameters)}"
+            )
             if problem:
                 raise ConfigError(f"{self.name}: parameter {name}: {problem}")
-        return {name: float(given.get(name, p.default)) for name, p in box.items()}
+        return {name: float(given.get(name, parameter.default)) for name, parameter in parameters.items()}

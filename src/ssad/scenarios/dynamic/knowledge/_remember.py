@@ -1,4 +1,4 @@
-"""Answers that are kept: what depends on the map and the ego's route alone is worked out once, not once a draw."""
+"""Cached results: values that depend only on the map and the ego's route are computed once, not once per draw."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _T = TypeVar("_T")
 
 
 class _Same:
-    """Stands for an object that cannot be hashed: equal to itself alone, and alive as long as the answer is kept."""
+    """Cache key of an unhashable object: equal to itself only, and kept alive by the cache."""
 
     __slots__ = ("value",)
 
@@ -40,19 +40,22 @@ def remembered(most: int = 1024) -> Callable[[Callable[_P, _T]], Callable[_P, _T
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
-        work: Callable[..., _T] = function
+        wrapped: Callable[..., _T] = function
 
+        # LaneGraph and Route hold arrays and are unhashable; lru_cache needs hashable arguments.
         @lru_cache(maxsize=most)
-        def answer(*arguments: Any) -> _T:
-            plain = (a.value if isinstance(a, _Same) else a for a in arguments)
-            return work(*plain)
+        def cached(*arguments: Any) -> _T:
+            unwrapped = (argument.value if isinstance(argument, _Same) else argument for argument in arguments)
+            return wrapped(*unwrapped)
 
         @wraps(function)
-        def ask(*arguments: _P.args, **options: _P.kwargs) -> _T:
+        def wrapper(*arguments: _P.args, **options: _P.kwargs) -> _T:
             if options:
                 raise TypeError(f"{function.__name__}: give its arguments by position")
-            return answer(*(_Same(a) if isinstance(a, LaneGraph | Route) else a for a in arguments))
+            return cached(
+                *(_Same(argument) if isinstance(argument, LaneGraph | Route) else argument for argument in arguments)
+            )
 
-        return ask
+        return wrapper
 
     return decorate

@@ -1,4 +1,4 @@
-"""Custom: a scenario whose author writes actors, phases and paths in the YAML itself."""
+"""Custom: a scenario with actors, phases and paths written in YAML."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ssad.world.roads import route_along
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """The actors as they are written; one without phases stands still."""
+    """Build the actors as written; an actor without phases stands still."""
     agents = []
     for actor in scenario.actors:
-        moves = bool(actor.phases) and model(actor.model).kind != AgentKind.PROP
+        is_moving = bool(actor.phases) and model(actor.model).kind != AgentKind.PROP
         if actor.trajectory:
             agents.append(_recorded(actor))
             continue
@@ -29,9 +29,9 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
             EpisodeAgent(
                 name=actor.name,
                 model=actor.model,
-                controller=Controller.SCRIPT if moves else Controller.NONE,
+                controller=Controller.SCRIPT if is_moving else Controller.NONE,
                 pose=actor.pose,
-                target_speed=max((p.speed for p in actor.phases), default=0.0),
+                target_speed=max((phase.speed for phase in actor.phases), default=0.0),
                 phases=actor.phases,
                 route=polyline_route(np.asarray(actor.path, dtype=np.float64)) if actor.path else None,
             )
@@ -40,7 +40,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
 
 
 def _with_policy(actor: Actor, graph: LaneGraph) -> EpisodeAgent:
-    """An actor that a driver acts for, with the route that its path means. RouteError: there is no such route."""
+    """Build an actor that a driver controls, with the route along its path. RouteError without such a route."""
     route = None
     if actor.path and model(actor.model).kind == AgentKind.WALKER:
         route = polyline_route(np.asarray(actor.path, np.float64))
@@ -61,15 +61,15 @@ def _with_policy(actor: Actor, graph: LaneGraph) -> EpisodeAgent:
 
 
 def _recorded(actor: Actor) -> EpisodeAgent:
-    """An actor with a trajectory, where it is and how fast at the start of the episode, or when it appears."""
+    """Build an actor with a trajectory, at its pose and speed at the start or when it appears."""
     rows = np.array(actor.trajectory)
-    now = float(np.clip(0.0, rows[0, 0], rows[-1, 0]))
-    k = int(np.clip(np.searchsorted(rows[:, 0], now, side="right") - 1, 0, len(rows) - 2))
-    (t, x, y, yaw), (t1, x1, y1, yaw1) = rows[k].tolist(), rows[k + 1].tolist()
-    part = (now - t) / (t1 - t)
-    turned = yaw + part * float(wrap_angle(yaw1 - yaw))
-    pose = Pose(x + part * (x1 - x), y + part * (y1 - y), turned)
-    speed = ((x1 - x) * np.cos(turned) + (y1 - y) * np.sin(turned)) / (t1 - t)
+    start_time = float(np.clip(0.0, rows[0, 0], rows[-1, 0]))
+    row = int(np.clip(np.searchsorted(rows[:, 0], start_time, side="right") - 1, 0, len(rows) - 2))
+    (t, x, y, yaw), (t1, x1, y1, next_yaw) = rows[row].tolist(), rows[row + 1].tolist()
+    fraction = (start_time - t) / (t1 - t)
+    heading = yaw + fraction * float(wrap_angle(next_yaw - yaw))
+    pose = Pose(x + fraction * (x1 - x), y + fraction * (y1 - y), heading)
+    speed = ((x1 - x) * np.cos(heading) + (y1 - y) * np.sin(heading)) / (t1 - t)
     return EpisodeAgent(
         actor.name, actor.model, Controller.TRAJECTORY, pose, speed=float(speed), trajectory=actor.trajectory
     )

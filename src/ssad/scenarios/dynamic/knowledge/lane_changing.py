@@ -18,19 +18,31 @@ if TYPE_CHECKING:
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Leader (actor 0) in the ego's lane, neighbour (actor 1) to its left. RouteError without that lane."""
-    value = SCENARIO.values(scenario.parameters)
-    front, side = ahead_and_left(graph, scenario, route, distance=value["distance"], gap=value["gap"])
-    start = go(value["leader_speed"], value["trigger_distance"])
-    brake = Phase(value["brake_speed"], Condition("travelled", value["brake_after"]))
+    """Place a leader (actor 0) in the ego's lane and a neighbour (actor 1) to its left.
+
+    Raises:
+        RouteError: There is no lane to the left.
+    """
+    values = SCENARIO.values(scenario.parameters)
+    leader_position, neighbour_position = ahead_and_left(
+        graph, scenario, route, distance=values["distance"], gap=values["gap"]
+    )
+    drive_phase = go(values["leader_speed"], values["trigger_distance"])
+    brake_phase = Phase(values["brake_speed"], Condition("travelled", values["brake_after"]))
     return [
-        scripted("leader", "suv", pose_at(graph, front), [start, brake], bending_route(graph, front)),
+        scripted(
+            "leader",
+            "suv",
+            pose_at(graph, leader_position),
+            [drive_phase, brake_phase],
+            bending_route(graph, leader_position),
+        ),
         scripted(
             "neighbour",
             "coupe",
-            pose_at(graph, side),
-            [go(value["neighbour_speed"], value["trigger_distance"])],
-            bending_route(graph, side),
+            pose_at(graph, neighbour_position),
+            [go(values["neighbour_speed"], values["trigger_distance"])],
+            bending_route(graph, neighbour_position),
         ),
     ]
 

@@ -21,57 +21,59 @@ from ssad.world.models import model
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
 
-_BEHIND, _AHEAD = 25.0, 80.0  # m of the ego within which columns are drawn
+_BEHIND, _AHEAD = 25.0, 80.0  # m around the ego covered by columns
 _LEAST_HEADWAY = 0.7  # s
 
 
 def lanes_beside(graph: LaneGraph, lane: int) -> list[int]:
-    """The lane and the driving lanes of its direction beside it, from left to right."""
+    """Return a lane and the driving lanes of its direction beside it, from left to right."""
     sides: list[list[int]] = [[], []]
-    for side, found in zip((graph.left, graph.right), sides, strict=True):
-        other = int(side[lane])
+    for adjacent, side_lanes in zip((graph.left, graph.right), sides, strict=True):
+        other = int(adjacent[lane])
         while other >= 0 and graph.kind[other] == LaneType.DRIVING and graph.same_direction(lane, other):
-            found.append(other)
-            other = int(side[other])
+            side_lanes.append(other)
+            other = int(adjacent[other])
     return [*reversed(sides[0]), lane, *sides[1]]
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Vehicles of each lane's column, the nearest to the ego first."""
+    """Place the vehicles of each lane's column, the nearest to the ego first."""
     from ssad.world.roads import random_route
 
     plan = scenario.traffic or TRAFFIC
-    value = SCENARIO.values(scenario.parameters)
-    own = int(route.lane[0])
-    if own < 0 or graph.junction[own] >= 0:
+    values = SCENARIO.values(scenario.parameters)
+    ego_lane = int(route.lane[0])
+    if ego_lane < 0 or graph.junction[ego_lane] >= 0:
         raise RouteError("the ego of lane traffic starts on a lane, not in a junction or off the road")
-    x, y = (float(v) for v in route.xy[0])
-    found: list[tuple[float, EpisodeAgent]] = []
-    for lane in lanes_beside(graph, own):
-        here = project(graph, lane, x, y).s
-        # the ego leads its own column; beside it a column begins anywhere
-        s = here + 2.5 if lane == own else max(here - _BEHIND - float(rng.uniform(0.0, 20.0)), 0.0)
-        while s < min(here + _AHEAD, float(graph.length[lane]) - 10.0):
-            speed = value["speed"] + value["speed_spread"] * float(rng.uniform(-1.0, 1.0))
-            body = mixed_body(rng)
-            headway = _LEAST_HEADWAY + float(rng.exponential(value["headway"] - _LEAST_HEADWAY))
-            s += headway * value["speed"] + 0.5 * model(body).length
-            if s < float(graph.length[lane]) - 10.0:
-                place = Place(lane, s)
+    x, y = (float(coordinate) for coordinate in route.xy[0])
+    candidates: list[tuple[float, EpisodeAgent]] = []
+    for lane in lanes_beside(graph, ego_lane):
+        ego_position = project(graph, lane, x, y).s
+        # in its own lane the ego leads the column; other columns begin at a random position
+        arc_length = (
+            ego_position + 2.5 if lane == ego_lane else max(ego_position - _BEHIND - float(rng.uniform(0.0, 20.0)), 0.0)
+        )
+        while arc_length < min(ego_position + _AHEAD, float(graph.length[lane]) - 10.0):
+            speed = values["speed"] + values["speed_spread"] * float(rng.uniform(-1.0, 1.0))
+            model_name = mixed_body(rng)
+            headway = _LEAST_HEADWAY + float(rng.exponential(values["headway"] - _LEAST_HEADWAY))
+            arc_length += headway * values["speed"] + 0.5 * model(model_name).length
+            if arc_length < float(graph.length[lane]) - 10.0:
+                place = Place(lane, arc_length)
                 agent = EpisodeAgent(
-                    name=body,
-                    model=body,
+                    name=model_name,
+                    model=model_name,
                     controller=Controller.AUTOPILOT,
                     pose=pose_at(graph, place),
                     speed=speed,
                     target_speed=speed,
-                    route=random_route(graph, lane, s, 400.0, rng),
+                    route=random_route(graph, lane, arc_length, 400.0, rng),
                     wake_distance=plan.wake_distance,
                 )
-                found.append((abs(s - here), agent))
-            s += 0.5 * model(body).length
-    nearest = [agent for _, agent in sorted(found, key=lambda pair: pair[0])[: plan.maximum]]
-    return [replace(agent, name=f"{agent.model} {k}") for k, agent in enumerate(nearest, 1)]
+                candidates.append((abs(arc_length - ego_position), agent))
+            arc_length += 0.5 * model(model_name).length
+    nearest_agents = [agent for _, agent in sorted(candidates, key=lambda pair: pair[0])[: plan.maximum]]
+    return [replace(agent, name=f"{agent.model} {number}") for number, agent in enumerate(nearest_agents, 1)]
 
 
 TRAFFIC = TrafficPlan(minimum=0, maximum=6, wake_distance=0.0)

@@ -2,7 +2,7 @@
 
 As in FREA: places near the route's start and end and near its junction, not on the ego's lanes nor opposite
 to its start; shuffled; a share `intensity` of them, between `minimum` and `maximum`; parked until the ego
-is within 50 m. Other than in FREA: places are every 25 m on driving lanes outside junctions (CARLA's spawn
+is within 50 m. Differences from FREA: places are every 25 m on driving lanes outside junctions (CARLA's spawn
 points are not part of a map file); no two vehicles start within 8 m; the shuffle depends on the scenario's
 seed (FREA: always seed 2000); each vehicle drives a random route of its own near 8 m/s (FREA: CARLA's
 traffic manager); long vehicles drive only where they can turn.
@@ -41,8 +41,8 @@ CLEAR_OF_EGO = 5.0
 CLEAR_AHEAD = 10.0
 APART = 8.0
 _SPACING = 25.0
-_FROM_END = 6.0  # no vehicle starts nearer than this to a lane's end
-_ROUTE = 400.0  # m; more than anyone drives in an episode of 60 s at town speed
+_FROM_END = 6.0  # m; minimum distance of a start from a lane's end
+_ROUTE = 400.0  # m; longer than any episode of 60 s at town speed
 _NOSE = 2.2  # m from the path: a lane's half width and a little
 _MIX: dict[str, float] = {
     "car": 0.30,
@@ -57,21 +57,21 @@ _MIX: dict[str, float] = {
 
 
 def spawn_places(graph: LaneGraph) -> list[Place]:
-    """Places every 25 m on the driving lanes outside junctions, the same for every episode of a town."""
-    places = []
+    """Return places every 25 m on driving lanes outside junctions, the same for every episode of a town."""
+    positions = []
     for lane in np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)):
-        free = float(graph.length[lane]) - 2.0 * _FROM_END
-        if free < 0.0:
+        usable_length = float(graph.length[lane]) - 2.0 * _FROM_END
+        if usable_length < 0.0:
             continue
-        count = int(free / _SPACING) + 1
-        first = _FROM_END + (free - (count - 1) * _SPACING) / 2.0
-        places += [Place(int(lane), first + k * _SPACING) for k in range(count)]
-    return places
+        count = int(usable_length / _SPACING) + 1
+        first_position = _FROM_END + (usable_length - (count - 1) * _SPACING) / 2.0
+        positions += [Place(int(lane), first_position + index * _SPACING) for index in range(count)]
+    return positions
 
 
 @remembered(64)
 def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[Place, Pose], ...]:
-    """The places that FREA's rules leave for a route.
+    """Return the spawn places that FREA's rules allow for a route.
 
     Args:
         graph: Lane graph of the town.
@@ -81,33 +81,33 @@ def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[Place, Pose], ...]
         Places on lanes and their poses, in the order of `spawn_places`.
 
     Raises:
-        RouteError: The route is nowhere on the lane graph.
+        RouteError: No point of the route is on the lane graph.
     """
-    on_graph = route.lane[route.lane >= 0]
-    if not len(on_graph):
+    graph_lanes = route.lane[route.lane >= 0]
+    if not len(graph_lanes):
         raise RouteError("the route is nowhere on the lane graph")
-    own = {(int(graph.road[n]), int(graph.lane_id[n])) for n in np.unique(on_graph)}
+    ego_lanes = {(int(graph.road[lane]), int(graph.lane_id[lane])) for lane in np.unique(graph_lanes)}
     # a route may begin inside a junction; "the ego's road" is then the one after it
-    roads = on_graph[graph.junction[on_graph] < 0]
-    first = int(roads[0] if len(roads) else on_graph[0])
-    inside = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
-    near = [(route.xy[0], NEAR_START), (route.xy[-1], NEAR_END)]
-    if inside.any():
-        near.append((route.xy[inside].mean(axis=0), NEAR_JUNCTION))
-    start = route.xy[: round(CLEAR_AHEAD / route.spacing) + 1]
-    found = []
+    lanes_outside = graph_lanes[graph.junction[graph_lanes] < 0]
+    first_lane = int(lanes_outside[0] if len(lanes_outside) else graph_lanes[0])
+    in_junction = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
+    regions = [(route.xy[0], NEAR_START), (route.xy[-1], NEAR_END)]
+    if in_junction.any():
+        regions.append((route.xy[in_junction].mean(axis=0), NEAR_JUNCTION))
+    start_points = route.xy[: round(CLEAR_AHEAD / route.spacing) + 1]
+    accepted = []
     for place in spawn_places(graph):
         road, lane_id = int(graph.road[place.lane]), int(graph.lane_id[place.lane])
-        opposite = road == int(graph.road[first]) and lane_id * int(graph.lane_id[first]) < 0
-        if opposite or (road, lane_id) in own:
+        opposite = road == int(graph.road[first_lane]) and lane_id * int(graph.lane_id[first_lane]) < 0
+        if opposite or (road, lane_id) in ego_lanes:
             continue
         pose = pose_at(graph, place)
-        if not any(math.hypot(pose.x - xy[0], pose.y - xy[1]) <= radius for xy, radius in near):
+        if not any(math.hypot(pose.x - centre[0], pose.y - centre[1]) <= radius for centre, radius in regions):
             continue
-        if float(np.hypot(start[:, 0] - pose.x, start[:, 1] - pose.y).min()) <= CLEAR_OF_EGO:
+        if float(np.hypot(start_points[:, 0] - pose.x, start_points[:, 1] - pose.y).min()) <= CLEAR_OF_EGO:
             continue
-        found.append((place, pose))
-    return tuple(found)
+        accepted.append((place, pose))
+    return tuple(accepted)
 
 
 def fits(body: str, route: Route) -> bool:
@@ -117,46 +117,46 @@ def fits(body: str, route: Route) -> bool:
     corner reaches length / 2 sin(slip) + width / 2 outwards; at most `_NOSE` m are allowed.
     """
     vehicle = model(body)
-    turn = np.abs(np.diff(np.unwrap(route.yaw.astype(np.float64)))) / route.spacing
-    # over 3 m, as a single kink between two lanes is none
-    smooth = np.convolve(turn, np.ones(3) / 3.0, mode="valid")
-    slip = 0.5 * float(smooth.max()) * vehicle.wheelbase
+    curvature = np.abs(np.diff(np.unwrap(route.yaw.astype(np.float64)))) / route.spacing
+    # average over 3 m: a single kink between two lanes is no bend
+    smoothed = np.convolve(curvature, np.ones(3) / 3.0, mode="valid")
+    slip = 0.5 * float(smoothed.max()) * vehicle.wheelbase
     return 0.5 * vehicle.length * slip + 0.5 * vehicle.width <= _NOSE
 
 
 def mixed_body(rng: np.random.Generator) -> str:
-    """A model as it is common in traffic."""
+    """Draw a vehicle model by its frequency in traffic."""
     return str(rng.choice(list(_MIX), p=list(_MIX.values())))
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Vehicles that drive on their own."""
+    """Place background vehicles that drive autonomously."""
     from ssad.world.roads import random_route
 
     plan = scenario.traffic or TRAFFIC
-    value = SCENARIO.values(scenario.parameters)
-    places = candidates(graph, route)
-    count = min(max(int(len(places) * plan.intensity), plan.minimum), plan.maximum)
+    values = SCENARIO.values(scenario.parameters)
+    spawn_positions = candidates(graph, route)
+    count = min(max(int(len(spawn_positions) * plan.intensity), plan.minimum), plan.maximum)
     agents: list[EpisodeAgent] = []
-    for index in rng.permutation(len(places)):
+    for index in rng.permutation(len(spawn_positions)):
         if len(agents) == count:
             break
-        place, pose = places[int(index)]
-        if any(math.hypot(pose.x - a.pose.x, pose.y - a.pose.y) < APART for a in agents):
+        place, pose = spawn_positions[int(index)]
+        if any(math.hypot(pose.x - agent.pose.x, pose.y - agent.pose.y) < APART for agent in agents):
             continue
-        body = mixed_body(rng)
-        path = random_route(graph, place.lane, place.s, _ROUTE, rng)
-        if not fits(body, path):
-            body = "compact"
-        speed = value["speed"] + value["speed_spread"] * float(rng.uniform(-1.0, 1.0))
+        model_name = mixed_body(rng)
+        vehicle_route = random_route(graph, place.lane, place.s, _ROUTE, rng)
+        if not fits(model_name, vehicle_route):
+            model_name = "compact"
+        speed = values["speed"] + values["speed_spread"] * float(rng.uniform(-1.0, 1.0))
         agents.append(
             EpisodeAgent(
-                name=f"{body} {len(agents) + 1}",
-                model=body,
+                name=f"{model_name} {len(agents) + 1}",
+                model=model_name,
                 controller=Controller.AUTOPILOT,
                 pose=pose,
                 target_speed=min(speed, float(graph.speed_limit[place.lane])),
-                route=path,
+                route=vehicle_route,
                 wake_distance=plan.wake_distance,
             )
         )

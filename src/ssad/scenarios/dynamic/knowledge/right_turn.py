@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Car (actor 0) from the left, on the road that the ego turns into."""
-    value = SCENARIO.values(scenario.parameters)
-    phases = go_when_ego_moves(value["speed"], value["trigger_distance"])
+    """Place a car (actor 0) from the left, on the road that the ego turns into."""
+    values = SCENARIO.values(scenario.parameters)
+    phases = go_when_ego_moves(values["speed"], values["trigger_distance"])
     return meeting_car(SCENARIO, scenario, graph, route, name="car from the left", sides=(FROM_LEFT,), phases=phases)
 
 

@@ -34,14 +34,16 @@ _LANES = (LaneType.DRIVING, LaneType.SHOULDER, LaneType.PARKING, LaneType.BIKING
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Walker (actor 0) beside the outermost lane, facing the road; vending machine between it and the ego."""
-    value = SCENARIO.values(scenario.parameters)
+    """Place a walker (actor 0) beside the outermost lane, facing the road, behind a vending machine."""
+    values = SCENARIO.values(scenario.parameters)
     reference = trigger_place(graph, scenario, route)
-    outer, crossed = to_outermost(graph, reference, kinds=_LANES)
-    in_junction = bool(graph.junction[outer.lane] >= 0)
-    spot = ahead(graph, outer, value["start_distance"] + _PER_LANE * crossed, stop_at_junction=not in_junction)
-    kerb = shifted(pose_at(graph, spot), 0.0, -value["lateral"] * width_at(graph, reference))
-    walker = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + value["yaw"])
+    outermost, crossed = to_outermost(graph, reference, kinds=_LANES)
+    in_junction = bool(graph.junction[outermost.lane] >= 0)
+    kerb_position = ahead(
+        graph, outermost, values["start_distance"] + _PER_LANE * crossed, stop_at_junction=not in_junction
+    )
+    kerb = shifted(pose_at(graph, kerb_position), 0.0, -values["lateral"] * width_at(graph, reference))
+    walker = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + values["yaw"])
     origin = pose_at(graph, reference)
     blocker = Pose(
         origin.x + _BLOCKER * (walker.x - origin.x),
@@ -49,7 +51,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         wrap(walker.yaw + math.pi),
     )
     return [
-        scripted("walker", "walker", walker, [go(value["walker_speed"], value["trigger_distance"])]),
+        scripted("walker", "walker", walker, [go(values["walker_speed"], values["trigger_distance"])]),
         standing("vending machine", "vending_machine", blocker),
     ]
 

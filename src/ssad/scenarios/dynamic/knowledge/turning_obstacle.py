@@ -31,15 +31,15 @@ _PER_LANE = 1.0  # m further on for each lane crossed on the way to the kerb
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Cyclist (actor 0) beside the exit road, facing it."""
-    value = SCENARIO.values(scenario.parameters)
-    _, leave = junction_span(graph, scenario, route)
-    after = ahead(graph, route_place(graph, scenario, route, leave), value["exit_distance"])
-    outer, crossed = to_outermost(graph, after, kinds=(LaneType.DRIVING, LaneType.PARKING))
-    spot = ahead(graph, outer, _PER_LANE * crossed + value["longitudinal"])
-    kerb = shifted(pose_at(graph, spot), 0.0, -value["lateral"] * width_at(graph, spot))
-    cyclist = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + value["yaw"])
-    return [scripted("cyclist", "bicycle", cyclist, [go(value["speed"], value["trigger_distance"])])]
+    """Place a cyclist (actor 0) beside the exit road, facing it."""
+    values = SCENARIO.values(scenario.parameters)
+    _, exit_index = junction_span(graph, scenario, route)
+    exit_position = ahead(graph, route_place(graph, scenario, route, exit_index), values["exit_distance"])
+    outermost, crossed = to_outermost(graph, exit_position, kinds=(LaneType.DRIVING, LaneType.PARKING))
+    kerb_position = ahead(graph, outermost, _PER_LANE * crossed + values["longitudinal"])
+    kerb = shifted(pose_at(graph, kerb_position), 0.0, -values["lateral"] * width_at(graph, kerb_position))
+    cyclist = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + values["yaw"])
+    return [scripted("cyclist", "bicycle", cyclist, [go(values["speed"], values["trigger_distance"])])]
 
 
 SCENARIO = ScenarioType(

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Car (actor 0) on the opposite approach; it goes straight on."""
-    value = SCENARIO.values(scenario.parameters)
-    phases = [go(value["speed"], value["trigger_distance"])]
+    """Place a car (actor 0) on the opposite approach; it goes straight on."""
+    values = SCENARIO.values(scenario.parameters)
+    phases = [go(values["speed"], values["trigger_distance"])]
     return meeting_car(SCENARIO, scenario, graph, route, name="oncoming car", sides=(ONCOMING,), phases=phases)
 
 

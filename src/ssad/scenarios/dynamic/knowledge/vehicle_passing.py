@@ -18,17 +18,19 @@ if TYPE_CHECKING:
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
-    """Parked car (actor 0) in the ego's lane, oncoming car (actor 1) in the lane to the left."""
-    value = SCENARIO.values(scenario.parameters)
-    parked, side = ahead_and_left(graph, scenario, route, distance=value["distance"], gap=value["gap"])
+    """Place a parked car (actor 0) in the ego's lane and an oncoming car (actor 1) in the lane to the left."""
+    values = SCENARIO.values(scenario.parameters)
+    parked_place, oncoming_place = ahead_and_left(
+        graph, scenario, route, distance=values["distance"], gap=values["gap"]
+    )
     return [
-        standing("parked car", "compact", pose_at(graph, parked)),
+        standing("parked car", "compact", pose_at(graph, parked_place)),
         scripted(
             "oncoming car",
             "compact",
-            pose_at(graph, side),
-            [go(value["speed"], value["trigger_distance"])],
-            bending_route(graph, side),
+            pose_at(graph, oncoming_place),
+            [go(values["speed"], values["trigger_distance"])],
+            bending_route(graph, oncoming_place),
         ),
     ]
 

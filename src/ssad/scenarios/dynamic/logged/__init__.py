@@ -1,1 +1,1 @@
-"""Generators that begin with what was recorded."""
+"""Generators that start from recorded drives."""

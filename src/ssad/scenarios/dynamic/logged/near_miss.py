@@ -33,12 +33,12 @@ FACTOR: Final = 0.5, 1.6  # least and greatest, of its recorded speeds
 
 @dataclass(frozen=True)
 class NearMiss:
-    """Two who used one place at different times.
+    """Near miss of the ego and another vehicle.
 
     Attributes:
-        agent: Number of the other.
-        time: s at which the ego was there.
-        late: s by which the other came later (negative: it had been there before).
+        agent: Index of the other vehicle.
+        time: s at which the ego was at the place.
+        late: s by which the other vehicle came later (negative: earlier).
     """
 
     agent: int
@@ -47,34 +47,41 @@ class NearMiss:
 
 
 def near_misses(trace: EpisodeTrace) -> list[NearMiss]:
-    """The nearest miss of each vehicle of a drive that moves, the closest in time first."""
-    box, step = boxes(trace), STRIDE * float(trace.dt)
+    """Return the closest near miss of each moving vehicle, the smallest time difference first."""
+    agent_boxes, step = boxes(trace), STRIDE * float(trace.dt)
     rows = np.arange(0, len(trace.x), STRIDE)
-    most = round(LATEST / step)
-    found = []
+    max_rows = round(LATEST / step)
+    misses = []
     for agent in np.flatnonzero(trace.kind <= AgentKind.BICYCLE).tolist():
         if agent == 0 or np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent])) < MOVES:
             continue
-        centres = box[rows, 0, :2][:, None] - box[rows, agent, :2][None]
-        reach = 0.5 * np.hypot(trace.length[[0, agent]], trace.width[[0, agent]]).sum()
-        there = trace.active[rows, 0][:, None] & trace.active[rows, agent][None]
-        near = there & (np.hypot(centres[..., 0], centres[..., 1]) <= reach)
-        ego, other = np.nonzero(near)
-        # who meets at once cannot come earlier or later
-        first = np.flatnonzero(trace.active[rows, agent])[0]
-        kept = (np.abs(other - ego) <= most) & (other > first + EARLY / step) & (ego * step > EARLY)
-        ego, other = ego[kept], other[kept]
-        if len(ego):
-            touch = obb_distance(box[rows[ego], 0], box[rows[other], agent]) <= 0.0
-            ego, other = ego[touch], other[touch]
-        if len(ego):
-            best = int(np.lexsort((ego, np.abs(other - ego)))[0])
-            found.append(NearMiss(agent, float(ego[best] * step), float((other[best] - ego[best]) * step)))
-    return sorted(found, key=lambda miss: (abs(miss.late), miss.agent))
+        centres = agent_boxes[rows, 0, :2][:, None] - agent_boxes[rows, agent, :2][None]
+        contact_range = 0.5 * np.hypot(trace.length[[0, agent]], trace.width[[0, agent]]).sum()
+        both_present = trace.active[rows, 0][:, None] & trace.active[rows, agent][None]
+        # All pairs of rows (ego time, other time) are compared, not only simultaneous ones.
+        near_pairs = both_present & (np.hypot(centres[..., 0], centres[..., 1]) <= contact_range)
+        ego_row, other_row = np.nonzero(near_pairs)
+        # a vehicle that meets the ego right after its start cannot be shifted in time
+        first_row = np.flatnonzero(trace.active[rows, agent])[0]
+        candidates = (
+            (np.abs(other_row - ego_row) <= max_rows)
+            & (other_row > first_row + EARLY / step)
+            & (ego_row * step > EARLY)
+        )
+        ego_row, other_row = ego_row[candidates], other_row[candidates]
+        if len(ego_row):
+            touching = obb_distance(agent_boxes[rows[ego_row], 0], agent_boxes[rows[other_row], agent]) <= 0.0
+            ego_row, other_row = ego_row[touching], other_row[touching]
+        if len(ego_row):
+            closest = int(np.lexsort((ego_row, np.abs(other_row - ego_row)))[0])
+            misses.append(
+                NearMiss(agent, float(ego_row[closest] * step), float((other_row[closest] - ego_row[closest]) * step))
+            )
+    return sorted(misses, key=lambda miss: (abs(miss.late), miss.agent))
 
 
 class NearMisses:
-    """Near misses of the recorded drive, in which the other comes a little earlier or later."""
+    """Recorded near misses in which the other vehicle comes slightly earlier or later."""
 
     name = "near-miss"
 
@@ -87,25 +94,32 @@ class NearMisses:
 
     @staticmethod
     def check(episode: object) -> None:
-        """Whether an episode has a vehicle; raises ConfigError if not."""
+        """Check that an episode has a vehicle. ConfigError if it has none."""
         King.check(episode)  # type: ignore[arg-type]
 
     def ask(self, count: int) -> list[list[Proposal]]:
-        """Perturbed near misses of each base, the closest ones most often; none where nobody came near."""
-        return [[self._proposal(k) for _ in range(count)] if self._misses[k] else [] for k in range(len(self.bases))]
+        """Return perturbed near misses of each base, the closest ones most often; none without near misses."""
+        return [
+            [self._proposal(base_index) for _ in range(count)] if self._misses[base_index] else []
+            for base_index in range(len(self.bases))
+        ]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Nothing to learn: what was recorded says where to look."""
+        """Ignore the outcomes: the recording alone defines the proposals."""
 
     def _proposal(self, k: int) -> Proposal:
         misses, random, base = self._misses[k], self._random[k], self.bases[k]
-        turn = self._tried[k]
+        proposal_count = self._tried[k]
         self._tried[k] += 1
-        chance = np.exp(-np.abs([miss.late for miss in misses]))
-        which = turn if turn < len(misses) else int(random.choice(len(misses), p=chance / chance.sum()))
-        shift, aside = random.standard_normal(2) if turn >= len(misses) else (0.0, 0.0)
-        name = base.trace.names[misses[which].agent]
-        rows = moved(base.trace, misses[which], shift=SHIFT * shift, aside=ASIDE * aside)
+        weights = np.exp(-np.abs([miss.late for miss in misses]))
+        miss_index = (
+            proposal_count
+            if proposal_count < len(misses)
+            else int(random.choice(len(misses), p=weights / weights.sum()))
+        )
+        shift, offset = random.standard_normal(2) if proposal_count >= len(misses) else (0.0, 0.0)
+        name = base.trace.names[misses[miss_index].agent]
+        rows = moved(base.trace, misses[miss_index], shift=SHIFT * shift, aside=ASIDE * offset)
         return Proposal(with_motion(self._frozen[k], name, rows), adversaries=(name,))
 
 
@@ -118,10 +132,14 @@ def moved(trace: EpisodeTrace, miss: NearMiss, *, shift: float, aside: float) ->
         shift: s by which it then comes later than the ego.
         aside: m to the left of where it drove.
     """
-    way = Way.of(trace, miss.agent)
-    begin = float(way.time[0])
-    factor = float(np.clip((miss.time + miss.late - begin) / max(miss.time + shift - begin, 0.1), *FACTOR))
-    clock = begin + (way.time - begin) * factor
-    over = np.maximum(clock - way.time[-1], 0.0) * max(float(way.speed[-1]), 0.0)
-    ease = np.clip((way.time - begin) / 2.0, 0.0, 1.0)
-    return way.rows(np.interp(clock, way.time, way.distance) + over, aside * ease * ease * (3.0 - 2.0 * ease))
+    recorded_path = Way.of(trace, miss.agent)
+    start_time = float(recorded_path.time[0])
+    factor = float(np.clip((miss.time + miss.late - start_time) / max(miss.time + shift - start_time, 0.1), *FACTOR))
+    warped_time = start_time + (recorded_path.time - start_time) * factor
+    overshoot = np.maximum(warped_time - recorded_path.time[-1], 0.0) * max(float(recorded_path.speed[-1]), 0.0)
+    # Smoothstep over 2 s: the lateral offset must start at 0 with a continuous heading.
+    blend = np.clip((recorded_path.time - start_time) / 2.0, 0.0, 1.0)
+    return recorded_path.rows(
+        np.interp(warped_time, recorded_path.time, recorded_path.distance) + overshoot,
+        aside * blend * blend * (3.0 - 2.0 * blend),
+    )

@@ -1,1 +1,1 @@
-"""Policy-based generators: adversaries that drive by a learned policy."""
+"""Policy-based generators: adversaries driven by a learned policy."""

@@ -26,15 +26,15 @@ SHIPPED = Path(__file__).parent / "weights"
 
 
 class Adversary(PolicyDriver):
-    """Drives whom it is given by a policy that looks at the ego's next way; deterministic, without memory."""
+    """Driver of selected agents by a policy that observes the ego's upcoming route; deterministic, without memory."""
 
     def __init__(self, weights: str | Path | None = None, *, name: str = "adv-ppo") -> None:
-        """A driver of adversaries.
+        """Load the policy.
 
         Args:
-            weights: NAME.safetensors with its card beside it, as `ssad train adversary` writes them; None: the shipped
-                ones.
-            name: What tables call it; of the shipped ones, which.
+            weights: NAME.safetensors with its card beside it, as `ssad train adversary` writes them; None: the
+                shipped ones.
+            name: Name in tables; without `weights` also the name of the shipped weights.
 
         Raises:
             FormatError: The weights are missing or broken, or are not those of a policy.
@@ -43,12 +43,12 @@ class Adversary(PolicyDriver):
 
 
 class AdvPPO:
-    """Adv.PPO: a learned policy drives the vehicle nearest to the ego into its way; one rollout a base."""
+    """Adv.PPO: a learned policy drives the vehicle nearest to the ego into its path; one rollout per base."""
 
     name = "adv-ppo"
 
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
-        """See `ssad.core.generators.GeneratorFactory`; seeds and budget beyond 1 make no difference."""
+        """Check that every base has agents to take over; `seeds` and a `budget` beyond 1 have no effect."""
         for base in bases:
             if not any(_can_be(agent.controller) for agent in base.episode.agents[1:]):
                 raise ConfigError(f"scenario {base.scenario.name}: {self.name} needs other agents than the ego")
@@ -57,22 +57,24 @@ class AdvPPO:
         self._asked = False
 
     def ask(self, count: int) -> Sequence[Sequence[Proposal]]:
-        """The base itself with the policy in it, once."""
-        first, self._asked = not self._asked, True
-        return [[Proposal(base.scenario, drivers=self._drivers)] if first and count else [] for base in self._bases]
+        """Propose each base itself, driven by the policy, once."""
+        first_round, self._asked = not self._asked, True
+        return [
+            [Proposal(base.scenario, drivers=self._drivers)] if first_round and count else [] for base in self._bases
+        ]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Nothing to learn: the policy was trained before."""
+        """Ignore the outcomes: the policy is already trained."""
 
 
 class Frea(AdvPPO):
-    """FREA: as Adv.PPO, but the policy was rewarded only for what the ego could still avoid."""
+    """FREA: Adv.PPO with a policy that was rewarded only for collisions that the ego could still avoid."""
 
     name = "frea"
 
 
 class AdvDDPG(AdvPPO):
-    """As Adv.PPO, trained by deep deterministic policy gradient instead."""
+    """Adv.PPO with a policy trained by deep deterministic policy gradient."""
 
     name = "adv-ddpg"
 

@@ -25,17 +25,17 @@ from ssad.scenarios.dynamic.search.box import BoxSearch
 
 RATE: Final = 0.15  # of Adam, for draws in [-1, 1]
 ENTROPY: Final = 0.01
-FAR: Final = -20.0  # m; gaps beyond are alike
-LEAST: Final = 0.05  # standard deviation that is always left: a collapsed distribution learns nothing more
+FAR: Final = -20.0  # m; larger gaps count as equal
+LEAST: Final = 0.05  # smallest standard deviation: a collapsed distribution stops learning
 
 
 class _Distribution:
-    """One base's distribution of D parameters in [-1, 1].
+    """Autoregressive normal distribution of D parameters of one base in [-1, 1].
 
     Attributes:
-        mean: [D] of each parameter, where those before it are 0.
-        weight: [D, D] how much the mean of one (row) follows those before it (columns).
-        raw: [D] the spread before softplus.
+        mean: [D] mean of each parameter where the earlier parameters are 0.
+        weight: [D, D] weight of earlier parameters (columns) in the mean of each parameter (rows).
+        raw: [D] spread before softplus.
     """
 
     def __init__(self, dimension: int) -> None:
@@ -45,23 +45,28 @@ class _Distribution:
         self.adam = torch.optim.Adam([self.mean, self.weight, self.raw], lr=RATE, betas=(0.5, 0.9))
 
     def spread(self) -> torch.Tensor:
-        """Standard deviations [D]."""
+        """Return the standard deviations [D]."""
         return LEAST + softplus(self.raw)
 
     def draw(self, noise: F64) -> F64:
-        """Draws [N, D] from standard normal numbers [N, D], one parameter after the other."""
-        mean, weight, spread = (v.detach().numpy() for v in (self.mean, self.weight, self.spread()))
-        found = np.zeros_like(noise)
-        for k in range(noise.shape[1]):
-            found[:, k] = mean[k] + found[:, :k] @ weight[k, :k] + spread[k] * noise[:, k]
-        return found
+        """Return draws [N, D] from standard normal numbers [N, D], one parameter after the other."""
+        mean, weight, spread = (tensor.detach().numpy() for tensor in (self.mean, self.weight, self.spread()))
+        draws = np.zeros_like(noise)
+        for dimension in range(noise.shape[1]):
+            draws[:, dimension] = (
+                mean[dimension]
+                + draws[:, :dimension] @ weight[dimension, :dimension]
+                + spread[dimension] * noise[:, dimension]
+            )
+        return draws
 
     def learn(self, draws: F64, advantage: F64) -> None:
-        """One step of REINFORCE from draws [N, D] and how much better [N] than the others they were."""
-        at = torch.from_numpy(draws)
+        """Take one REINFORCE step from draws [N, D] and their advantages [N]."""
+        draw_tensor = torch.from_numpy(draws)
         spread = self.spread()
-        mean = self.mean + at @ torch.tril(self.weight, -1).T
-        likelihood = (-0.5 * ((at - mean) / spread).square() - spread.log()).sum(1)
+        # Only earlier parameters condition later ones, hence the strictly lower triangle.
+        mean = self.mean + draw_tensor @ torch.tril(self.weight, -1).T
+        likelihood = (-0.5 * ((draw_tensor - mean) / spread).square() - spread.log()).sum(1)
         cost = -(torch.from_numpy(advantage) * likelihood).mean() - ENTROPY * spread.log().sum()
         self.adam.zero_grad()
         cost.backward()  # type: ignore[no-untyped-call]
@@ -69,7 +74,7 @@ class _Distribution:
 
 
 class L2C(BoxSearch):
-    """A distribution of the initial state, drawn parameter by parameter, that learns by REINFORCE (L2C)."""
+    """Autoregressive distribution of the initial state that learns by REINFORCE (L2C)."""
 
     name = "l2c"
 
@@ -80,15 +85,15 @@ class L2C(BoxSearch):
         self._draws: list[F64] = [np.zeros((0, box.dimension)) for box in self.boxes]
 
     def points(self, index: int, count: int) -> F64:
-        """Draws from the present distribution; what lies outside the box is cut."""
+        """Draw from the current distribution, clipped to the box."""
         noise = self._random[index].standard_normal((count, self.boxes[index].dimension))
         self._draws[index] = self._of[index].draw(noise)
         return np.asarray(np.clip(0.5 + 0.5 * self._draws[index], 0.0, 1.0))
 
     def learn(self, index: int, points: F64, danger: F64) -> None:
-        """A step from the last draws; nothing where all were alike."""
-        gain = np.maximum(danger, FAR)
-        if len(gain) > 1 and np.ptp(gain) > 1e-9:
-            # ranks: a collision and a miss by a hand's breadth differ as much as their order, whatever the unit
-            order = np.argsort(np.argsort(gain, kind="stable"), kind="stable")
+        """Take a gradient step from the last draws, unless all have the same danger."""
+        floored_danger = np.maximum(danger, FAR)
+        if len(floored_danger) > 1 and np.ptp(floored_danger) > 1e-9:
+            # ranks make the step independent of the unit of danger and of outliers
+            order = np.argsort(np.argsort(floored_danger, kind="stable"), kind="stable")
             self._of[index].learn(self._draws[index], (order - order.mean()) / order.std())

@@ -1,1 +1,1 @@
-"""Searches over a scenario's parameter box: what every other generator must beat."""
+"""Black-box searches over a scenario's parameter box: the baselines of all other generators."""

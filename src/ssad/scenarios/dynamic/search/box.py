@@ -1,4 +1,4 @@
-"""The parameter box of a base as the unit cube, and the outline of searches that need no gradient."""
+"""Parameter boxes of bases as unit cubes, and the base class of gradient-free searches."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ssad.scenarios.dynamic.sampling import TARGET_SPEED
 
 @dataclasses.dataclass(frozen=True)
 class Box:
-    """What may be varied in a scenario: the parameters of its class, all over the ranges that they allow.
+    """Search space of a scenario: the parameters of its class over their full ranges.
 
-    The ego's own start and target speed stay as they are: a generator chooses what others do.
+    The ego's start and target speed are fixed: a generator chooses what other agents do.
 
     Attributes:
         scenario: The nominal scenario.
-        ranges: Parameter -> least and greatest value.
+        ranges: Parameter name -> minimum and maximum.
     """
 
     scenario: Scenario
@@ -33,13 +33,17 @@ class Box:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Box:
-        """The box of a scenario.
+        """Return the box of a scenario.
 
         Raises:
             ConfigError: Its class has no parameters.
         """
-        kind = scenario_type(scenario.type)
-        ranges = {p.name: (p.low, p.high) for p in kind.parameters if p.high > p.low and p.name != TARGET_SPEED}
+        scenario_kind = scenario_type(scenario.type)
+        ranges = {
+            parameter.name: (parameter.low, parameter.high)
+            for parameter in scenario_kind.parameters
+            if parameter.high > parameter.low and parameter.name != TARGET_SPEED
+        }
         if not ranges:
             raise ConfigError(
                 f"scenario {scenario.name}: its type {scenario.type} has no parameters of other agents to search; "
@@ -53,15 +57,18 @@ class Box:
         return len(self.ranges)
 
     def nominal(self) -> F64:
-        """The scenario's own values as a point of the unit cube; the nearest one where they lie beyond."""
-        value = scenario_type(self.scenario.type).values(self.scenario.parameters)
-        shares: F64 = np.array([(value[name] - low) / (high - low) for name, (low, high) in self.ranges.items()])
+        """Return the scenario's own values as a point of the unit cube, clipped to the box."""
+        nominal_values = scenario_type(self.scenario.type).values(self.scenario.parameters)
+        shares: F64 = np.array(
+            [(nominal_values[name] - low) / (high - low) for name, (low, high) in self.ranges.items()]
+        )
         return shares.clip(0.0, 1.0)
 
     def at(self, point: npt.ArrayLike) -> Scenario:
-        """The scenario at a point of the unit cube; what lies outside is cut."""
+        """Return the scenario at a point of the unit cube; coordinates outside are clipped."""
         shares = np.clip(np.asarray(point, np.float64), 0.0, 1.0).tolist()
         values = {
+            # Rounding keeps saved scenarios short; the clip keeps a rounded bound valid.
             name: min(max(round(low + share * (high - low), 6), low), high)
             for share, (name, (low, high)) in zip(shares, self.ranges.items(), strict=True)
         }
@@ -69,7 +76,7 @@ class Box:
 
 
 class BoxSearch(ABC):
-    """A search over the parameter boxes of bases, one by one: they do not know of each other."""
+    """Search over the parameter boxes of several bases, each independent of the others."""
 
     name: ClassVar[str]
 
@@ -81,28 +88,28 @@ class BoxSearch(ABC):
 
     @staticmethod
     def check(episode: Episode) -> None:
-        """Whether there is anything to search in an episode.
+        """Check that an episode has parameters to search.
 
         Raises:
-            ConfigError: There is not.
+            ConfigError: It has none.
         """
         Box.of(episode.scenario)
 
     @abstractmethod
     def points(self, index: int, count: int) -> F64:
-        """The next points [0 to count, D] of the unit cube to try in a base."""
+        """Return the next points [0 to count, D] of the unit cube to try in a base."""
 
     def learn(self, index: int, points: F64, danger: F64) -> None:  # noqa: B027  nothing to learn by default
-        """Take in how dangerous [n] the points [n, D] were, more is worse for the ego."""
+        """Learn from the danger [n] of points [n, D]; larger is worse for the ego."""
 
     def ask(self, count: int) -> list[list[Proposal]]:
-        """The scenarios at the next points."""
-        self._asked = [self.points(k, count) for k in range(len(self.boxes))]
+        """Return the scenarios at the next points of each base."""
+        self._asked = [self.points(base_index, count) for base_index in range(len(self.boxes))]
         return [
             [Proposal(box.at(point)) for point in points] for box, points in zip(self.boxes, self._asked, strict=True)
         ]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Learn from how dangerous they were."""
-        for k, (points, row) in enumerate(zip(self._asked, outcomes, strict=True)):
-            self.learn(k, points, np.array([outcome.danger for outcome in row]))
+        """Pass the danger of the proposed points to `learn`."""
+        for base_index, (points, base_outcomes) in enumerate(zip(self._asked, outcomes, strict=True)):
+            self.learn(base_index, points, np.array([outcome.danger for outcome in base_outcomes]))

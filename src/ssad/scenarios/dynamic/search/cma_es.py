@@ -1,4 +1,4 @@
-"""CMA-ES: a normal distribution over the box that moves to where it is dangerous, by the package cmaes."""
+"""CMA-ES: a normal distribution over the box that moves towards danger, by the package cmaes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIGMA = 0.3  # of the unit cube: the first generation covers most of it
 
 
 class CmaEs(BoxSearch):
-    """Covariance matrix adaptation from the nominal scenario, in generations of 8.
+    """Covariance matrix adaptation evolution strategy from the nominal scenario, in generations of 8.
 
     Source: Hansen and Ostermeier, Completely derandomized self-adaptation in evolution strategies, 2001.
     """
@@ -41,13 +41,13 @@ class CmaEs(BoxSearch):
         self._known: list[list[tuple[F64, float]]] = [[] for _ in self.boxes]
 
     def points(self, index: int, count: int) -> F64:
-        """Draws from the present distribution."""
+        """Draw from the current distribution."""
         return np.array([self._search[index].ask() for _ in range(count)])
 
     def learn(self, index: int, points: F64, danger: F64) -> None:
-        """A new generation whenever 8 outcomes are known; the search minimises minus the danger."""
-        known = self._known[index]
-        known += zip(points, (-danger).tolist(), strict=True)
-        while len(known) >= POPULATION:
-            self._search[index].tell(known[:POPULATION])
-            del known[:POPULATION]
+        """Update the distribution for every 8 outcomes; the search minimises negative danger."""
+        pending = self._known[index]
+        pending += zip(points, (-danger).tolist(), strict=True)
+        while len(pending) >= POPULATION:
+            self._search[index].tell(pending[:POPULATION])
+            del pending[:POPULATION]

@@ -1,4 +1,4 @@
-"""Searches that learn nothing: random points, a grid, and a Halton sequence."""
+"""Searches without learning: random points, a grid, and a Halton sequence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ssad.scenarios.dynamic.search.box import BoxSearch
 
 
 class RandomSearch(BoxSearch):
-    """Points drawn evenly from the box: what any search must beat."""
+    """Uniform random points of the box: the baseline of all searches."""
 
     name = "random"
 
@@ -24,15 +24,15 @@ class RandomSearch(BoxSearch):
         self._random = [generator("random search", seed) for seed in seeds]
 
     def points(self, index: int, count: int) -> F64:
-        """The next draws."""
+        """Return the next random points."""
         return self._random[index].random((count, self.boxes[index].dimension))
 
 
 class GridSearch(BoxSearch):
-    """The middles of equal cells: as many along each parameter as the budget allows, in an order drawn at random.
+    """Centres of equal grid cells, as many along each parameter as the budget allows, in random order.
 
-    Parameters that come first get one more where the budget allows it. The order makes a search that is cut short a
-    sample of the grid and not a corner of it.
+    The first parameters get one cell more where the budget allows it. The random order makes an interrupted search a
+    sample of the whole grid instead of one corner.
     """
 
     name = "grid"
@@ -42,20 +42,20 @@ class GridSearch(BoxSearch):
         self._cells = []
         for box, seed in zip(self.boxes, seeds, strict=True):
             counts = _counts(budget, box.dimension)
-            axes = np.meshgrid(*((np.arange(n) + 0.5) / n for n in counts), indexing="ij")
+            axes = np.meshgrid(*((np.arange(cell_count) + 0.5) / cell_count for cell_count in counts), indexing="ij")
             cells = np.stack([axis.ravel() for axis in axes], 1)
             self._cells.append(cells[generator("grid search", seed).permutation(len(cells))])
         self._next = [0] * len(self.boxes)
 
     def points(self, index: int, count: int) -> F64:
-        """The next cells; none when all have been tried."""
+        """Return the next cells; none when all have been tried."""
         start = self._next[index]
         self._next[index] += count
         return np.asarray(self._cells[index][start : start + count])
 
 
 class HaltonSearch(BoxSearch):
-    """A scrambled Halton sequence, which fills the box more evenly than random points (Halton 1960, Owen 2017)."""
+    """Scrambled Halton sequence, which covers the box more evenly than random points (Halton 1960, Owen 2017)."""
 
     name = "halton"
 
@@ -69,14 +69,15 @@ class HaltonSearch(BoxSearch):
         ]
 
     def points(self, index: int, count: int) -> F64:
-        """The next points of the sequence."""
+        """Return the next points of the sequence."""
         return np.asarray(self._sequences[index].random(count))
 
 
 def _counts(budget: int, dimension: int) -> list[int]:
-    """Cells along each of the axes, at most `budget` in all."""
-    each = max(1, math.floor(budget ** (1.0 / dimension) + 1e-9))
-    counts = [each] * dimension
+    """Return the number of cells along each axis, at most `budget` in all."""
+    # The epsilon makes exact powers (such as 8 = 2^3) robust against rounding.
+    per_axis = max(1, math.floor(budget ** (1.0 / dimension) + 1e-9))
+    counts = [per_axis] * dimension
     for axis in range(dimension):
         counts[axis] += 1
         if math.prod(counts) > budget:

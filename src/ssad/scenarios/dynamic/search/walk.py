@@ -25,11 +25,11 @@ FIRST_STEP, LAST_STEP = 0.25, 0.03  # forward and backward, in the unit cube
 
 @dataclass
 class _Place:
-    """Where a search of a base is.
+    """State of the search of one base.
 
     Attributes:
-        point: [D] in the unit cube.
-        danger: There.
+        point: [D] current point of the unit cube.
+        danger: Danger at that point.
         step: Length of the next step.
         axis: Next parameter and direction to try, counted through both.
         idle: Rounds without progress.
@@ -43,79 +43,80 @@ class _Place:
 
 
 class _LocalSearch(BoxSearch):
-    """A point that moves to the most dangerous of those tried around it, and begins elsewhere when it found one."""
+    """Local search: move to the most dangerous neighbour, and restart elsewhere after a collision."""
 
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
         super().__init__(bases, seeds=seeds, budget=budget)
         self._random = [generator(self.name, seed) for seed in seeds]
-        self._place = [self._begin(k, box.nominal()) for k, box in enumerate(self.boxes)]
+        self._place = [self._begin(base_index, box.nominal()) for base_index, box in enumerate(self.boxes)]
 
     @abstractmethod
     def neighbours(self, index: int, count: int) -> F64:
-        """What to try next [1 to count, D] around the point of a base."""
+        """Return the points [1 to count, D] to try next around the current point of a base."""
 
     @abstractmethod
     def stuck(self, index: int) -> bool:
-        """Whether the point of a base, which has just found nothing worse, should begin elsewhere."""
+        """Return True if the search of a base, which has just made no progress, should restart."""
 
     def points(self, index: int, count: int) -> F64:
-        """The point itself first, then what lies around it."""
-        place = self._place[index]
-        if place.danger == -np.inf:
-            return np.asarray(np.vstack([place.point, self.neighbours(index, count - 1)]))
+        """Return the starting point first, then neighbours of the current point."""
+        state = self._place[index]
+        if state.danger == -np.inf:
+            return np.asarray(np.vstack([state.point, self.neighbours(index, count - 1)]))
         return self.neighbours(index, count)
 
     def learn(self, index: int, points: F64, danger: F64) -> None:
-        """Move to the worst for the ego; after a collision, or where there is no progress, begin anywhere."""
-        place = self._place[index]
-        best = int(np.argmax(danger))
-        if danger[best] > place.danger:
-            place.point, place.danger, place.idle = points[best], float(danger[best]), 0
+        """Move to the most dangerous point; restart after a collision or without progress."""
+        state = self._place[index]
+        worst_index = int(np.argmax(danger))
+        if danger[worst_index] > state.danger:
+            state.point, state.danger, state.idle = points[worst_index], float(danger[worst_index]), 0
         else:
-            place.idle += 1
-        if place.danger >= 0.0 or (place.idle and self.stuck(index)):
+            state.idle += 1
+        if state.danger >= 0.0 or (state.idle and self.stuck(index)):
             self._place[index] = self._begin(index, np.asarray(self._random[index].random(points.shape[1])))
 
     def _begin(self, index: int, point: F64) -> _Place:
-        """A search from a point; which parameter comes first, and how far, is drawn."""
+        """Start a search at a point; the first parameter and the step length are random."""
         random = self._random[index]
         return _Place(point, step=FIRST_STEP * random.uniform(0.8, 1.2), axis=2 * int(random.integers(len(point))))
 
 
 class RandomWalk(_LocalSearch):
-    """A random walk from the nominal scenario: the most dangerous of some neighbours is the next place."""
+    """Random walk from the nominal scenario: the most dangerous of several neighbours is the next point."""
 
     name = "random-walk"
 
     def neighbours(self, index: int, count: int) -> F64:
-        """Points a normal step away."""
+        """Return points a normally distributed step away."""
         point = self._place[index].point
         return np.asarray(np.clip(point + NEAR * self._random[index].standard_normal((count, len(point))), 0.0, 1.0))
 
     def stuck(self, index: int) -> bool:
-        """After three rounds."""
+        """Return True after three rounds without progress."""
         return self._place[index].idle >= PATIENCE
 
 
 class ForwardBackward(_LocalSearch):
-    """One parameter at a time, forward and backward from the nominal scenario; half the step where nothing is worse."""
+    """Coordinate search from the nominal scenario, forward and backward; halves the step without progress."""
 
     name = "forward-backward"
 
     def neighbours(self, index: int, count: int) -> F64:
-        """The next parameters in turn, each forward and backward."""
-        place = self._place[index]
-        turns = 2 * len(place.point)
-        found = np.repeat(place.point[None], min(count, turns), 0)
-        for row in found:
-            axis, back = divmod(place.axis, 2)
-            row[axis] = np.clip(row[axis] + (-place.step if back else place.step), 0.0, 1.0)
-            place.axis = (place.axis + 1) % turns
-        return np.asarray(found)
+        """Return the next parameters in turn, each forward and backward."""
+        state = self._place[index]
+        direction_count = 2 * len(state.point)
+        candidates = np.repeat(state.point[None], min(count, direction_count), 0)
+        for candidate in candidates:
+            axis, backward = divmod(state.axis, 2)
+            candidate[axis] = np.clip(candidate[axis] + (-state.step if backward else state.step), 0.0, 1.0)
+            state.axis = (state.axis + 1) % direction_count
+        return np.asarray(candidates)
 
     def stuck(self, index: int) -> bool:
-        """Once steps have become short; until then they are halved after each round through all parameters."""
-        place = self._place[index]
-        if place.idle * 8 >= 2 * len(place.point):
-            place.step, place.idle = 0.5 * place.step, 0
-        return place.step < LAST_STEP
+        """Return True once steps are short; until then halve them after each round through all parameters."""
+        state = self._place[index]
+        # A round tries up to 8 points, and a full turn has two per parameter.
+        if state.idle * 8 >= 2 * len(state.point):
+            state.step, state.idle = 0.5 * state.step, 0
+        return state.step < LAST_STEP

@@ -1,1 +1,1 @@
-"""Generators that change how others move from step to step: in their kinematic states, or as whole trajectories."""
+"""Generators that change the motion of other agents: step by step in their kinematic states, or as trajectories."""

@@ -24,20 +24,20 @@ REACH: Final[Mapping[str, float]] = {
     "VehiclePassing": 2.0,
 }
 ELSEWHERE: Final = 3.0  # m
-SMOOTH: Final = 1.0  # s over which offsets are means: a wheel does not turn at once
+SMOOTH: Final = 1.0  # s of the moving average of offsets: steering takes time
 
 
 class AdvTraj(MotionSearch):
-    """Offsets of one vehicle beside its own path, its speed kept, by CMA-ES (AdvTraj)."""
+    """Lateral offsets of one vehicle from its own path, at unchanged speed, by CMA-ES (AdvTraj)."""
 
     name = "adv-traj"
 
     def motion(self, base: Base, way: Way, agent: int, point: F64) -> F64:
-        """On its path at the start; offsets at evenly spaced places of it, linear between them."""
+        """Interpolate offsets linearly between evenly spaced points of the path, starting from 0."""
         reach = REACH.get(base.scenario.type, ELSEWHERE)
-        places = np.linspace(0.0, max(float(way.distance[-1]), 1.0), KNOTS + 1)
-        told = np.concatenate([[0.0], reach * (2.0 * point - 1.0)])
-        aside = np.interp(way.distance, places, told)
+        knot_distances = np.linspace(0.0, max(float(way.distance[-1]), 1.0), KNOTS + 1)
+        knot_offsets = np.concatenate([[0.0], reach * (2.0 * point - 1.0)])
+        offsets = np.interp(way.distance, knot_distances, knot_offsets)
         window = max(1, round(SMOOTH / way.step))
-        padded = np.concatenate([np.zeros(window - 1), aside])
+        padded = np.concatenate([np.zeros(window - 1), offsets])
         return way.rows(way.distance, np.convolve(padded, np.ones(window) / window, mode="valid"))

@@ -1,11 +1,11 @@
-"""KING: one adversary's controls are optimised by gradients through the differentiable twin of the world.
+"""KING: gradient-based optimisation of one adversary's controls through the differentiable twin of the world.
 
-It starts from what everybody did in a base that the ego survived. The loop is not part of the gradient: a chain of
-controls is optimised against the ego as it drove in the chain's last rollout, then the world shows how the ego answers,
-and so on. Many chains of many bases are optimised at once.
+The search starts from the recorded motion of a base that the ego survived. The ego's reaction is not part of the
+gradient: a chain of controls is optimised against the ego of the chain's last rollout, then a new rollout records how
+the ego responds, and so on. Many chains of many bases are optimised at once.
 
 Source: Hanselmann et al., KING: Generating safety-critical driving scenarios for robust imitation via kinematics
-gradients, ECCV 2022 (arXiv 2204.13683); its gradients too leave out how the ego answers.
+gradients, ECCV 2022 (arXiv 2204.13683); its gradients also exclude the ego's reaction.
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ NEAREST: Final = 4  # vehicles of a base that may become the adversary
 ITERATIONS: Final = 30  # of the optimiser before each rollout
 RATE: Final = 0.05  # of Adam
 BETAS: Final = 0.8, 0.99  # KING's
-SOFT: Final = 1.0  # m; the least gap is taken softly
+SOFT: Final = 1.0  # m; scale of the soft minimum of the gap over time
 PURSUIT: Final = 0.2  # weight of the mean gap, KING's own objective: the adversary stays with an ego that waits
 CLEAR: Final = 1.25  # m that KING keeps between agents
-OTHERS: Final = 3.0  # weight of coming nearer than that; KING's
+OTHERS: Final = 3.0  # weight of violating this clearance; KING's
 ROAD: Final = 20.0  # weight of corners off the road; KING's
 AFTER: Final = 0.2  # weight of what happens after the ego is nearest, when the episode is over
 FAR: Final = 6.0  # m
 EFFORT: Final = 0.02  # weight of changing what was recorded
 PATIENCE: Final = 5  # rollouts of a chain before it starts anew with another adversary
-HOPELESS: Final = 10.0  # m; who has not come nearer after two is left alone while there are others
+HOPELESS: Final = 10.0  # m; after two rollouts beyond this gap an adversary is given up while others remain
 JITTER: Final = 0.25  # spread of the controls that a chain starts with when its adversary has been tried before
 
 
 @dataclass
 class _Chain:
-    """One adversary's controls as they develop.
+    """Controls of one adversary during the optimisation.
 
     Attributes:
-        base: Number of the base.
-        agent: The adversary.
-        change: [K, 2] effort and steering added to what was recorded.
+        base: Index of the base.
+        agent: Index of the adversary.
+        change: [K, 2] change of effort and steering at the knots, added to the recorded controls.
         ego: The ego's box and presence [T + 1, 6] in the last rollout.
-        weight: Of the road and the others.
+        weight: Weight of the costs of the road and other agents.
         tried: Rollouts so far.
     """
 
@@ -85,8 +85,8 @@ class King:
         self._road = raster_of(
             [base.graph for base in bases],
             [
-                np.concatenate([m[..., :2].reshape(-1, 2), b.trace.route])
-                for m, b in zip(self._motion, bases, strict=True)
+                np.concatenate([motion[..., :2].reshape(-1, 2), motion_base.trace.route])
+                for motion, motion_base in zip(self._motion, bases, strict=True)
             ],
         )
         self._started = [0] * len(self.bases)
@@ -95,7 +95,7 @@ class King:
 
     @staticmethod
     def check(episode: Episode) -> None:
-        """Whether an episode has a vehicle that could become the adversary.
+        """Check that an episode has a vehicle that could become the adversary.
 
         Raises:
             ConfigError: It has none.
@@ -104,15 +104,15 @@ class King:
             raise _nobody(episode.scenario)
 
     def ask(self, count: int) -> list[list[Proposal]]:
-        """Each chain, further optimised."""
-        for k, chains in enumerate(self._chains):
+        """Optimise each chain further and propose its scenario."""
+        for base_index, chains in enumerate(self._chains):
             while len(chains) < count:
-                chains.append(self._new_chain(k))
+                chains.append(self._new_chain(base_index))
             del chains[count:]
-        flat = [chain for chains in self._chains for chain in chains]
-        poses = self._optimise(flat)
+        active_chains = [chain for chains in self._chains for chain in chains]
+        poses = self._optimise(active_chains)
         proposals: list[list[Proposal]] = [[] for _ in self.bases]
-        for chain, pose in zip(flat, poses, strict=True):
+        for chain, pose in zip(active_chains, poses, strict=True):
             name = self.bases[chain.base].trace.names[chain.agent]
             rows = np.concatenate([STEP * np.arange(STEPS + 1)[:, None], pose], 1)
             scenario = with_motion(self._frozen[chain.base], name, rows)
@@ -120,136 +120,150 @@ class King:
         return proposals
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Chains learn how the ego answered; those that are done, or stuck, start anew."""
-        for k, row in enumerate(outcomes):
-            for at, outcome in enumerate(row):
-                chain = self._chains[k][at]
+        """Update chains with the ego's response; restart those that are finished or stuck."""
+        for base_index, base_outcomes in enumerate(outcomes):
+            for chain_index, outcome in enumerate(base_outcomes):
+                chain = self._chains[base_index][chain_index]
                 chain.tried += 1
-                away = outcome.gap is None or outcome.gap > HOPELESS
-                if away and chain.tried >= 2:
-                    self._away[k].add(chain.agent)
-                if outcome.trace is None or outcome.valid or chain.tried >= (2 if away else PATIENCE):
-                    self._chains[k][at] = self._new_chain(k)
+                is_hopeless = outcome.gap is None or outcome.gap > HOPELESS
+                if is_hopeless and chain.tried >= 2:
+                    self._away[base_index].add(chain.agent)
+                if outcome.trace is None or outcome.valid or chain.tried >= (2 if is_hopeless else PATIENCE):
+                    self._chains[base_index][chain_index] = self._new_chain(base_index)
                     continue
                 chain.ego = sampled(outcome.trace)[0]
                 if outcome.off_road or outcome.hit_others:
                     chain.weight *= 2.0
 
     def _new_chain(self, base: int) -> _Chain:
-        """The next adversary in turn; from the second turn on with other controls to begin with."""
-        agents = [a for a in self._agents[base] if a not in self._away[base]] or self._agents[base]
-        turn, which = divmod(self._started[base], len(agents))
-        agent = agents[which]
-        draws = generator("king", self._seeds[base], self._started[base])
+        """Start a chain with the next adversary in turn; from the second turn on with random controls."""
+        agents = [candidate for candidate in self._agents[base] if candidate not in self._away[base]] or self._agents[
+            base
+        ]
+        turn, agent_position = divmod(self._started[base], len(agents))
+        agent = agents[agent_position]
+        random = generator("king", self._seeds[base], self._started[base])
         self._started[base] += 1
-        change = JITTER * min(turn, 1) * draws.standard_normal((STEPS // KNOT + 1, 2))
+        change = JITTER * min(turn, 1) * random.standard_normal((STEPS // KNOT + 1, 2))
         if np.abs(self.bases[base].trace.speed[:, agent]).max() < 0.5:
-            change[:, 0] += 0.1  # who stands without throttle has no gradient
+            change[:, 0] += 0.1  # a standing vehicle without throttle has no gradient
         return _Chain(base, agent, change, self._motion[base][0])
 
     def _as_recorded(self) -> list[dict[int, tuple[MotionState, Tensor]]]:
-        """Start and controls [T, 4] with which the twin repeats what each of the adversaries of each base did."""
-        who = [(k, agent) for k, agents in enumerate(self._agents) for agent in agents]
-        bodies = bodies_of([self.bases[k].trace.models[agent] for k, agent in who], dtype=torch.float64)
-        motion = torch.from_numpy(np.stack([self._motion[k][agent] for k, agent in who]))
-        speed = torch.tensor([float(self.bases[k].trace.speed[0, agent]) for k, agent in who], dtype=torch.float64)
+        """Return start state and controls [T, 4] with which the twin repeats each candidate of each base."""
+        candidates = [(base_index, agent) for base_index, agents in enumerate(self._agents) for agent in agents]
+        bodies = bodies_of(
+            [self.bases[base_index].trace.models[agent] for base_index, agent in candidates], dtype=torch.float64
+        )
+        motion = torch.from_numpy(np.stack([self._motion[base_index][agent] for base_index, agent in candidates]))
+        speed = torch.tensor(
+            [float(self.bases[base_index].trace.speed[0, agent]) for base_index, agent in candidates],
+            dtype=torch.float64,
+        )
         start = MotionState(motion[:, 0, :3], speed, torch.zeros_like(speed))
         controls = tracked(start, motion[..., :3].transpose(0, 1), bodies)
-        found: list[dict[int, tuple[MotionState, Tensor]]] = [{} for _ in self.bases]
-        for i, (k, agent) in enumerate(who):
-            found[k][agent] = MotionState(*(part[i] for part in start)), controls[:, i]
-        return found
+        recorded: list[dict[int, tuple[MotionState, Tensor]]] = [{} for _ in self.bases]
+        for row, (base_index, agent) in enumerate(candidates):
+            recorded[base_index][agent] = MotionState(*(part[row] for part in start)), controls[:, row]
+        return recorded
 
     def _optimise(self, chains: Sequence[_Chain]) -> F64:
-        """Improves the chains' controls, and returns the poses [N, T + 1, 3] that they lead to."""
-        recorded = [self._recorded[c.base][c.agent] for c in chains]
-        start = MotionState(*(torch.stack(parts) for parts in zip(*(r[0] for r in recorded), strict=True)))
-        told = torch.stack([r[1] for r in recorded], 1)
-        bodies = bodies_of([self.bases[c.base].trace.models[c.agent] for c in chains], dtype=torch.float64)
-        ego = torch.from_numpy(np.stack([c.ego for c in chains]))
+        """Improve the controls of the chains, and return their poses [N, T + 1, 3]."""
+        recorded = [self._recorded[member.base][member.agent] for member in chains]
+        start = MotionState(
+            *(torch.stack(parts) for parts in zip(*(replayed[0] for replayed in recorded), strict=True))
+        )
+        recorded_controls = torch.stack([replayed[1] for replayed in recorded], 1)
+        bodies = bodies_of(
+            [self.bases[member.base].trace.models[member.agent] for member in chains], dtype=torch.float64
+        )
+        ego = torch.from_numpy(np.stack([member.ego for member in chains]))
         others = torch.from_numpy(self._others(chains))
-        weight = torch.tensor([c.weight for c in chains], dtype=torch.float64)
-        place = torch.tensor([c.base for c in chains])
-        change = torch.from_numpy(np.stack([c.change for c in chains])).requires_grad_()
+        weight = torch.tensor([member.weight for member in chains], dtype=torch.float64)
+        base_index = torch.tensor([member.base for member in chains])
+        change = torch.from_numpy(np.stack([member.change for member in chains])).requires_grad_()
 
-        def moved() -> MotionState:
-            states = unroll(start, _controls(told, change), bodies, dt=STEP, substeps=1)
-            sound = change.isfinite().all(-1).all(-1) & states.pose.isfinite().all(-1).all(0)
-            if not bool(sound.all()):
-                bad = self.bases[chains[int((~sound).nonzero()[0])].base].scenario.name
-                raise ConfigError(f"generator king: the optimisation diverged in {bad} (a motion that is not finite)")
+        def unroll_changed() -> MotionState:
+            states = unroll(start, _controls(recorded_controls, change), bodies, dt=STEP, substeps=1)
+            is_finite = change.isfinite().all(-1).all(-1) & states.pose.isfinite().all(-1).all(0)
+            if not bool(is_finite.all()):
+                diverged_scenario = self.bases[chains[int((~is_finite).nonzero()[0])].base].scenario.name
+                raise ConfigError(
+                    f"generator king: the optimisation diverged in {diverged_scenario} (a motion that is not finite)"
+                )
             return states
 
-        first, second = torch.zeros_like(change), torch.zeros_like(change)
+        first_moment, second_moment = torch.zeros_like(change), torch.zeros_like(change)
         for step in range(1, ITERATIONS + 1):
-            cost = self._cost(moved(), bodies, ego=ego, others=others, weight=weight, place=place)
+            cost = self._cost(unroll_changed(), bodies, ego=ego, others=others, weight=weight, place=base_index)
             cost = cost + EFFORT * change.square().mean((1, 2))
-            (slope,) = torch.autograd.grad(cost.sum(), change)
+            (gradient,) = torch.autograd.grad(cost.sum(), change)
             # Adam; that of torch.optim imports torch's compiler first, which takes 4 s
             with torch.no_grad():
-                first.lerp_(slope, 1.0 - BETAS[0])
-                second.lerp_(slope.square(), 1.0 - BETAS[1])
-                size = (second / (1.0 - BETAS[1] ** step)).sqrt() + 1e-8
-                change -= RATE / (1.0 - BETAS[0] ** step) * first / size
+                first_moment.lerp_(gradient, 1.0 - BETAS[0])
+                second_moment.lerp_(gradient.square(), 1.0 - BETAS[1])
+                denominator = (second_moment / (1.0 - BETAS[1] ** step)).sqrt() + 1e-8
+                change -= RATE / (1.0 - BETAS[0] ** step) * first_moment / denominator
         with torch.no_grad():
-            states = moved()
+            states = unroll_changed()
         for chain, values in zip(chains, change.detach().numpy(), strict=True):
             chain.change = values.copy()
         return states.pose.transpose(0, 1).numpy()
 
     def _others(self, chains: Sequence[_Chain]) -> F64:
-        """Boxes and presence [N, O, T + 1, 6] of all but the ego and the adversary, as they were recorded."""
-        most = max(len(self._motion[c.base]) for c in chains)
-        found = np.zeros((len(chains), most, STEPS + 1, 6))
-        for row, chain in zip(found, chains, strict=True):
+        """Return recorded boxes and presence [N, O, T + 1, 6] of all agents but the ego and the adversary."""
+        agent_count = max(len(self._motion[member.base]) for member in chains)
+        boxes = np.zeros((len(chains), agent_count, STEPS + 1, 6))
+        for row, chain in zip(boxes, chains, strict=True):
             motion = self._motion[chain.base]
             row[: len(motion)] = motion
             row[[0, chain.agent], :, 5] = 0.0
-        return found
+        return boxes
 
     def _cost(
         self, states: MotionState, bodies: Bodies, *, ego: Tensor, others: Tensor, weight: Tensor, place: Tensor
     ) -> Tensor:
-        """Costs [N]: near the ego is good, near others or off the road is bad."""
+        """Return costs [N]: low near the ego, high near other agents or off the road."""
         pose = states.pose.transpose(0, 1)
         size = torch.stack([bodies.length, bodies.width], -1)[:, None].expand(-1, STEPS + 1, -1)
         box = torch.cat([pose, size], -1)
-        there = ego[..., 5] > 0.5
-        gap = torch.where(there, _gap(box, ego[..., :5]), 1.0e3)
-        near = -SOFT * torch.logsumexp(-gap / SOFT, -1)
-        present = there.sum(-1).clamp_min(1)
-        pursuit = torch.where(there, gap.clamp(0.0, 50.0), 0.0).sum(-1) / present
-        near = near + PURSUIT * pursuit
+        ego_present = ego[..., 5] > 0.5
+        gap = torch.where(ego_present, _gap(box, ego[..., :5]), 1.0e3)
+        ego_cost = -SOFT * torch.logsumexp(-gap / SOFT, -1)
+        present = ego_present.sum(-1).clamp_min(1)
+        pursuit = torch.where(ego_present, gap.clamp(0.0, 50.0), 0.0).sum(-1) / present
+        ego_cost = ego_cost + PURSUIT * pursuit
         # the episode ends where the two meet
         time = torch.arange(STEPS + 1)
-        counts = torch.where(time <= gap.detach().argmin(1)[:, None] + 2, 1.0, AFTER)
-        apart = (pose.detach()[:, None, :, :2] - others[..., :2]).square().sum(-1)
-        pick = torch.where(others[..., 5] > 0.5, apart, 1.0e9).argmin(1)
-        nearest = torch.take_along_dim(others, pick[:, None, :, None], 1)[:, 0]
-        close = torch.where(nearest[..., 5] > 0.5, (CLEAR - _gap(box, nearest[..., :5])).clamp_min(0.0), 0.0)
-        off = self._road(_corners(box), place).clamp(0.0, 5.0).sum(-1)
-        beside = self._road(pose[..., :2], place).add(0.5).clamp(0.0, 5.0)
-        road = ((off + 4.0 * beside) * counts).mean(1)
-        return near + weight * (OTHERS * (close * counts).amax(1) + ROAD * road)
+        time_weight = torch.where(time <= gap.detach().argmin(1)[:, None] + 2, 1.0, AFTER)
+        # Only the nearest agent of each step gets an exact gap; the choice itself needs no gradient.
+        squared_distance = (pose.detach()[:, None, :, :2] - others[..., :2]).square().sum(-1)
+        nearest_index = torch.where(others[..., 5] > 0.5, squared_distance, 1.0e9).argmin(1)
+        nearest = torch.take_along_dim(others, nearest_index[:, None, :, None], 1)[:, 0]
+        intrusion = torch.where(nearest[..., 5] > 0.5, (CLEAR - _gap(box, nearest[..., :5])).clamp_min(0.0), 0.0)
+        corner_cost = self._road(_corners(box), place).clamp(0.0, 5.0).sum(-1)
+        centre_cost = self._road(pose[..., :2], place).add(0.5).clamp(0.0, 5.0)
+        road_cost = ((corner_cost + 4.0 * centre_cost) * time_weight).mean(1)
+        return ego_cost + weight * (OTHERS * (intrusion * time_weight).amax(1) + ROAD * road_cost)
 
 
 def adversaries(base: Base) -> list[int]:
-    """The vehicles of a base that could become adversaries: present from the start, nearest to the ego's route first.
+    """Return the vehicles present from the start, nearest to the ego's route first.
 
     Raises:
         ConfigError: There are none.
     """
     trace = base.trace
-    found = []
+    candidates = []
     for agent in range(1, len(trace.names)):
         if trace.active[0, agent] and AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE:
-            there = trace.active[:, agent]
-            path = np.stack([trace.x[there, agent], trace.y[there, agent]], 1)[::5]
-            apart = np.hypot(*np.moveaxis(path[:, None] - trace.route[None], -1, 0))
-            found.append((float(apart.min()), agent))
-    if not found:
+            present = trace.active[:, agent]
+            path = np.stack([trace.x[present, agent], trace.y[present, agent]], 1)[::5]
+            route_distance = np.hypot(*np.moveaxis(path[:, None] - trace.route[None], -1, 0))
+            candidates.append((float(route_distance.min()), agent))
+    if not candidates:
         raise _nobody(base.scenario)
-    return [agent for _, agent in sorted(found)[:NEAREST]]
+    return [agent for _, agent in sorted(candidates)[:NEAREST]]
 
 
 def _nobody(scenario: Scenario) -> ConfigError:
@@ -260,20 +274,24 @@ def _nobody(scenario: Scenario) -> ConfigError:
 
 
 def tracked(start: MotionState, poses: Tensor, bodies: Bodies) -> Tensor:
-    """Controls [T, N, 4] with which the twin follows recorded poses [T + 1, N, 3], as near as the bodies allow."""
+    """Return controls [T, N, 4] with which the twin follows poses [T + 1, N, 3] as closely as the bodies allow."""
     state, controls = start, []
-    for now, then in pairwise(poses):
+    for pose, next_pose in pairwise(poses):
         x, y, yaw = state.pose.unbind(-1)
-        cos, sin = torch.cos(now[:, 2]), torch.sin(now[:, 2])
-        ahead = (then[:, 0] - x) * cos + (then[:, 1] - y) * sin
-        left = (x - now[:, 0]) * -sin + (y - now[:, 1]) * cos
-        speed = 2.0 * ahead / STEP - state.speed  # the mean over the step covers the distance
-        wanted = 0.5 * (speed + torch.hypot(then[:, 0] - now[:, 0], then[:, 1] - now[:, 1]) / STEP)
-        effort = (wanted - state.speed) / STEP
+        cos, sin = torch.cos(pose[:, 2]), torch.sin(pose[:, 2])
+        distance_ahead = (next_pose[:, 0] - x) * cos + (next_pose[:, 1] - y) * sin
+        lateral_error = (x - pose[:, 0]) * -sin + (y - pose[:, 1]) * cos
+        speed = 2.0 * distance_ahead / STEP - state.speed  # the mean over the step covers the distance
+        mean_speed = 0.5 * (speed + torch.hypot(next_pose[:, 0] - pose[:, 0], next_pose[:, 1] - pose[:, 1]) / STEP)
+        effort = (mean_speed - state.speed) / STEP
         effort = torch.where(effort > 0.0, effort / bodies.max_accel, effort / bodies.max_brake).clamp(-1.0, 1.0)
-        fast = state.speed.clamp_min(1.0)
-        turn = torch.remainder(then[:, 2] - yaw + torch.pi, 2 * torch.pi) - torch.pi - torch.atan(0.7 * left / fast)
-        slip = torch.asin((turn / STEP * bodies.wheelbase / (2.0 * fast)).clamp(-0.9, 0.9))
+        safe_speed = state.speed.clamp_min(1.0)
+        turn = (
+            torch.remainder(next_pose[:, 2] - yaw + torch.pi, 2 * torch.pi)
+            - torch.pi
+            - torch.atan(0.7 * lateral_error / safe_speed)
+        )
+        slip = torch.asin((turn / STEP * bodies.wheelbase / (2.0 * safe_speed)).clamp(-0.9, 0.9))
         wheel = torch.atan(2.0 * torch.tan(slip))
         steer = torch.where(state.speed > 0.3, (wheel / bodies.max_steer).clamp(-1.0, 1.0), 0.0)
         control = torch.stack([effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0), steer, torch.zeros_like(steer)], -1)
@@ -284,8 +302,9 @@ def tracked(start: MotionState, poses: Tensor, bodies: Bodies) -> Tensor:
 
 def _controls(told: Tensor, change: Tensor) -> Tensor:
     """Controls [T, N, 4]: those told, and what is added to effort and steering, linear between knots [N, K, 2]."""
-    times, knots = torch.arange(STEPS)[:, None] / KNOT, torch.arange(change.shape[1])
-    share = (1.0 - (times - knots).abs()).clamp_min(0.0).to(change.dtype)
+    step_times, knots = torch.arange(STEPS)[:, None] / KNOT, torch.arange(change.shape[1])
+    # Hat functions: each step blends the two adjacent knots.
+    share = (1.0 - (step_times - knots).abs()).clamp_min(0.0).to(change.dtype)
     added = torch.einsum("tk,nkc->tnc", share, change)
     effort = told[..., 0] - told[..., 1] + added[..., 0]
     steer = told[..., 2] + added[..., 1]
@@ -295,13 +314,14 @@ def _controls(told: Tensor, change: Tensor) -> Tensor:
 def _gap(first: Tensor, second: Tensor) -> Tensor:
     """How far boxes [..., 5] are apart: exact up to `FAR`; beyond it, where most pairs are, from their centres."""
     reach = 0.5 * (torch.hypot(first[..., 3], first[..., 4]) + torch.hypot(second[..., 3], second[..., 4]))
-    rough = torch.hypot(first[..., 0] - second[..., 0], first[..., 1] - second[..., 1]) - 0.7 * reach
-    near = (rough < FAR).nonzero(as_tuple=True)
-    return rough.index_put(near, box_gap(first[near], second[near]))
+    # The exact distance of boxes is expensive, and most pairs are far apart.
+    approximate = torch.hypot(first[..., 0] - second[..., 0], first[..., 1] - second[..., 1]) - 0.7 * reach
+    near_pairs = (approximate < FAR).nonzero(as_tuple=True)
+    return approximate.index_put(near_pairs, box_gap(first[near_pairs], second[near_pairs]))
 
 
 def _corners(box: Tensor) -> Tensor:
-    """Corners [..., 4, 2] of boxes [..., 5]."""
+    """Return the corners [..., 4, 2] of boxes [..., 5]."""
     cos, sin = torch.cos(box[..., 2:3]), torch.sin(box[..., 2:3])
     along = 0.5 * box[..., 3:4] * box.new_tensor([1.0, -1.0, -1.0, 1.0])
     across = 0.5 * box[..., 4:5] * box.new_tensor([1.0, 1.0, -1.0, -1.0])
@@ -309,15 +329,16 @@ def _corners(box: Tensor) -> Tensor:
 
 
 def sampled(trace: EpisodeTrace) -> F64:
-    """Boxes and presence [A, T + 1, 6] of a trace at the steps of the optimisation; after its end nobody is there."""
-    at = STEP * np.arange(STEPS + 1) / trace.dt
-    last = len(trace.active) - 1
-    low = np.minimum(np.floor(at + 1e-9).astype(int), last)
-    high = np.minimum(low + 1, last)
-    share = np.clip(at - low, 0.0, 1.0)[:, None]
+    """Resample a trace to boxes and presence [A, T + 1, 6] at the optimisation steps; absent after its end."""
+    row_position = STEP * np.arange(STEPS + 1) / trace.dt
+    last_row = len(trace.active) - 1
+    row_before = np.minimum(np.floor(row_position + 1e-9).astype(int), last_row)
+    row_after = np.minimum(row_before + 1, last_row)
+    share = np.clip(row_position - row_before, 0.0, 1.0)[:, None]
+    # Linear interpolation must not cross the jump at pi.
     yaw = np.unwrap(trace.yaw.astype(np.float64), axis=0)
     values = [trace.x.astype(np.float64), trace.y.astype(np.float64), yaw]
-    columns = [v[low] + share * (v[high] - v[low]) for v in values]
-    size = [np.broadcast_to(v.astype(np.float64), columns[0].shape) for v in (trace.length, trace.width)]
-    there = trace.active[low] & (at <= last + 1e-9)[:, None]
-    return np.stack([*columns, *size, there.astype(np.float64)], -1).transpose(1, 0, 2)
+    columns = [column[row_before] + share * (column[row_after] - column[row_before]) for column in values]
+    size = [np.broadcast_to(column.astype(np.float64), columns[0].shape) for column in (trace.length, trace.width)]
+    present = trace.active[row_before] & (row_position <= last_row + 1e-9)[:, None]
+    return np.stack([*columns, *size, present.astype(np.float64)], -1).transpose(1, 0, 2)

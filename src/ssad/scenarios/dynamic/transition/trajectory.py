@@ -37,19 +37,19 @@ CANDIDATES: Final = 32  # M
 ANSWERS: Final = 5  # N rollouts of the ego
 STRIDE: Final = 2  # steps: overlaps are looked for every 0.5 s
 DECAY: Final = 0.99
-SPREAD: Final = 0.5  # m/s: how near a recorded motion's first speed must be to the opponent's
+SPREAD: Final = 0.5  # m/s: kernel width on the difference of initial speeds
 STARTS: Final = 4  # steps between the moments from which the opponent may drive otherwise: 1 s
 EPISODES: Final = 16  # of natural traffic that the prior is learned from
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A trajectory that an opponent may take: the recorded one up to step `start`, then another.
+    """Trajectory that an opponent may take: the recorded one up to step `start`, then another.
 
     Attributes:
-        agent: The opponent.
+        agent: Index of the opponent.
         start: Step.
-        pose: [LENGTH + 1, 3] x, y, yaw from there.
+        pose: [HORIZON_STEPS + 1, 3] x, y, yaw from that step on.
         prior: P1.
     """
 
@@ -60,7 +60,7 @@ class _Candidate:
 
 
 class Cat:
-    """The likely trajectory that meets the ego's last rollouts (CAT), its prior learned from natural traffic."""
+    """Plausible trajectory that hits the ego's last rollouts (CAT), with a prior learned from natural traffic."""
 
     name = "cat"
     check = staticmethod(King.check)
@@ -69,91 +69,101 @@ class Cat:
         self.bases = list(bases)
         self._frozen = [frozen(base.episode, base.trace) for base in bases]
         self._motion = [sampled(base.trace) for base in bases]
-        self._left = [self._candidates(k, seed) for k, seed in enumerate(seeds)]
+        self._left = [self._candidates(base_index, seed) for base_index, seed in enumerate(seeds)]
         self._egos: list[deque[F64]] = [deque([motion[0]], maxlen=ANSWERS) for motion in self._motion]
 
     def ask(self, count: int) -> list[list[Proposal]]:
-        """The candidates of the largest products that have not been tried."""
-        return [self._best(k, count) for k in range(len(self.bases))]
+        """Propose the untried candidates with the largest products."""
+        return [self._best(base_index, count) for base_index in range(len(self.bases))]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
-        """Keep how the ego drove."""
-        for egos, row in zip(self._egos, outcomes, strict=True):
-            egos.extend(sampled(o.trace)[0] for o in row if o.trace is not None)
+        """Store the ego's trajectories."""
+        for egos, base_outcomes in zip(self._egos, outcomes, strict=True):
+            egos.extend(sampled(outcome.trace)[0] for outcome in base_outcomes if outcome.trace is not None)
 
     def _best(self, base: int, count: int) -> list[Proposal]:
-        left = self._left[base]
-        scores = [self._score(base, candidate) for candidate in left]
-        order = sorted(range(len(left)), key=lambda j: scores[j], reverse=True)[:count]
-        self._left[base] = [c for j, c in enumerate(left) if j not in set(order)]
-        return [self._proposal(base, left[j]) for j in order]
+        untried = self._left[base]
+        scores = [self._score(base, candidate) for candidate in untried]
+        best_indices = sorted(range(len(untried)), key=lambda index: scores[index], reverse=True)[:count]
+        self._left[base] = [remaining for index, remaining in enumerate(untried) if index not in set(best_indices)]
+        return [self._proposal(base, untried[index]) for index in best_indices]
 
     def _score(self, base: int, candidate: _Candidate) -> tuple[float, float]:
-        """The product of the three terms, summed over the ego's rollouts; where it is 0, minus the least distance."""
+        """Return the product of the three terms, summed over the ego's rollouts, and minus the minimum distance."""
         size = self._motion[base][candidate.agent, 0, 3:5]
-        at = np.arange(candidate.start, min(candidate.start + LENGTH, self._motion[base].shape[1] - 1) + 1, STRIDE)
-        pose = candidate.pose[at - candidate.start]
-        body = np.concatenate([pose, np.broadcast_to(size, (len(at), 2))], 1)
-        total, least = 0.0, np.inf
+        steps = np.arange(candidate.start, min(candidate.start + LENGTH, self._motion[base].shape[1] - 1) + 1, STRIDE)
+        pose = candidate.pose[steps - candidate.start]
+        body = np.concatenate([pose, np.broadcast_to(size, (len(steps), 2))], 1)
+        score, min_distance = 0.0, np.inf
         for ego in self._egos[base]:
-            there = ego[at, 5] > 0.5
-            apart = np.where(there, np.hypot(*(ego[at, :2] - pose[:, :2]).T), np.inf)
-            least = min(least, float(apart.min(initial=np.inf)))
-            near = np.flatnonzero(apart < 8.0)
-            touch = near[obb_distance(body[near], ego[at][near, :5]) <= 0.0] if len(near) else near
-            if len(touch):
-                total += candidate.prior * DECAY ** float(touch[0])
-        return total, -least
+            ego_present = ego[steps, 5] > 0.5
+            distance = np.where(ego_present, np.hypot(*(ego[steps, :2] - pose[:, :2]).T), np.inf)
+            min_distance = min(min_distance, float(distance.min(initial=np.inf)))
+            near_rows = np.flatnonzero(distance < 8.0)
+            contact_rows = (
+                near_rows[obb_distance(body[near_rows], ego[steps][near_rows, :5]) <= 0.0]
+                if len(near_rows)
+                else near_rows
+            )
+            if len(contact_rows):
+                score += candidate.prior * DECAY ** float(contact_rows[0])
+        return score, -min_distance
 
     def _proposal(self, base: int, candidate: _Candidate) -> Proposal:
-        before = self._motion[base][candidate.agent, : candidate.start, :3]
-        pose = np.concatenate([before, candidate.pose])
+        recorded = self._motion[base][candidate.agent, : candidate.start, :3]
+        pose = np.concatenate([recorded, candidate.pose])
         rows = np.concatenate([STEP * np.arange(len(pose))[:, None], pose], 1)
         name = self.bases[base].trace.names[candidate.agent]
         return Proposal(with_motion(self._frozen[base], name, rows), adversaries=(name,))
 
     def _candidates(self, base: int, seed: int) -> list[_Candidate]:
-        """All trajectories of all opponents and moments that traffic might drive, each with its prior."""
+        """Return all plausible trajectories of all opponents and start steps, each with its prior."""
         motions, speeds = traffic()
         motion = self._motion[base]
-        last = int(np.flatnonzero(motion[0, :, 5] > 0.5)[-1])
+        last_step = int(np.flatnonzero(motion[0, :, 5] > 0.5)[-1])
         random = generator("cat", seed)
-        found: list[_Candidate] = []
+        candidates: list[_Candidate] = []
         for agent in adversaries(self.bases[base]):
-            for start in range(0, max(last - LENGTH // 4, 1), STARTS):
-                now = motion[agent, start]
-                if now[5] < 0.5:
+            for start in range(0, max(last_step - LENGTH // 4, 1), STARTS):
+                current = motion[agent, start]
+                if current[5] < 0.5:
                     continue
-                speed = float(np.hypot(*(motion[agent, start + 1, :2] - now[:2]))) / STEP
-                weight = np.exp(-0.5 * ((speeds - speed) / SPREAD) ** 2)
+                speed = float(np.hypot(*(motion[agent, start + 1, :2] - current[:2]))) / STEP
+                weights = np.exp(-0.5 * ((speeds - speed) / SPREAD) ** 2)
                 # equal weights fall to chance and not to the order of the recordings
-                pick = np.argsort(-weight - 1e-9 * random.random(len(weight)))[:CANDIDATES]
-                pose = np.concatenate([to_world(now[:3], motions[pick, :, :2]), motions[pick, :, 2:] + now[2]], -1)
-                chance = weight[pick] * self._plausible(base, agent, start, pose)
-                if chance.sum() > 0.0:
-                    chance = chance / chance.sum()
-                found += [_Candidate(agent, start, p, float(c)) for p, c in zip(pose, chance, strict=True) if c > 0.0]
-        return found
+                selected = np.argsort(-weights - 1e-9 * random.random(len(weights)))[:CANDIDATES]
+                pose = np.concatenate(
+                    [to_world(current[:3], motions[selected, :, :2]), motions[selected, :, 2:] + current[2]], -1
+                )
+                priors = weights[selected] * self._plausible(base, agent, start, pose)
+                if priors.sum() > 0.0:
+                    priors = priors / priors.sum()
+                candidates += [
+                    _Candidate(agent, start, trajectory, float(prior))
+                    for trajectory, prior in zip(pose, priors, strict=True)
+                    if prior > 0.0
+                ]
+        return candidates
 
     def _plausible(self, base: int, agent: int, start: int, pose: F64) -> F64:
-        """1 where trajectories [M, LENGTH + 1, 3] stay on the road and clear of all but the ego, else 0."""
+        """Return 1 for trajectories [M, T + 1, 3] on the road and clear of all agents but the ego, else 0."""
         motion = self._motion[base]
-        at = np.minimum(np.arange(start, start + LENGTH + 1), motion.shape[1] - 1)[::STRIDE]
+        steps = np.minimum(np.arange(start, start + LENGTH + 1), motion.shape[1] - 1)[::STRIDE]
         path = pose[:, ::STRIDE]
         road = raster_of([self.bases[base].graph], [path[..., :2].reshape(-1, 2)])
         edge = road(torch.from_numpy(np.ascontiguousarray(path[..., :2])), torch.zeros(len(path), dtype=torch.long))
-        good: Bool = np.asarray((edge.numpy() < 0.0).all(1))
+        plausible: Bool = np.asarray((edge.numpy() < 0.0).all(1))
         size = motion[agent, 0, 3:5]
         for other in range(1, len(motion)):
             if other == agent:
                 continue
-            box, there = motion[other, at, :5], motion[other, at, 5] > 0.5
-            near = there & (np.hypot(*np.moveaxis(path[..., :2] - box[:, :2], -1, 0)) < 9.0)
-            row, column = np.nonzero(near)
+            other_boxes, other_present = motion[other, steps, :5], motion[other, steps, 5] > 0.5
+            near_mask = other_present & (np.hypot(*np.moveaxis(path[..., :2] - other_boxes[:, :2], -1, 0)) < 9.0)
+            row, column = np.nonzero(near_mask)
             if len(row):
                 body = np.concatenate([path[row, column], np.broadcast_to(size, (len(row), 2))], 1)
-                good[row[obb_distance(body, box[column]) <= 0.0]] = False
-        return np.asarray(good, np.float64)
+                plausible[row[obb_distance(body, other_boxes[column]) <= 0.0]] = False
+        return np.asarray(plausible, np.float64)
 
 
 @lru_cache(maxsize=1)
@@ -168,12 +178,12 @@ def traffic() -> tuple[F64, F64]:
     from ssad.world.world import World
 
     scenarios = load_scenarios("natural")
-    chosen = scenarios[:: max(1, len(scenarios) // EPISODES)][:EPISODES]
-    graphs = {name: load_town(name) for name in {s.town for s in chosen}}
-    # a seed of its own: what is searched is not what is learned from
-    episodes = [build_episode(s, graphs[s.town], seed=1_000_003) for s in chosen]
-    found = [windows(trace) for trace in rollout(World(episodes, graphs, ego=Controller.AUTOPILOT), {})]
-    return np.concatenate([m for m, _ in found]), np.concatenate([s for _, s in found])
+    selected = scenarios[:: max(1, len(scenarios) // EPISODES)][:EPISODES]
+    graphs = {name: load_town(name) for name in {scenario.town for scenario in selected}}
+    # a separate seed: the prior must not come from the searched episodes
+    episodes = [build_episode(scenario, graphs[scenario.town], seed=1_000_003) for scenario in selected]
+    recorded = [windows(trace) for trace in rollout(World(episodes, graphs, ego=Controller.AUTOPILOT), {})]
+    return np.concatenate([motions for motions, _ in recorded]), np.concatenate([scenario for _, scenario in recorded])
 
 
 def windows(trace: EpisodeTrace) -> tuple[F64, F64]:
@@ -182,10 +192,10 @@ def windows(trace: EpisodeTrace) -> tuple[F64, F64]:
     motions, speeds = [np.zeros((0, LENGTH + 1, 3))], [0.0][:0]
     for agent in np.flatnonzero(trace.kind <= AgentKind.BICYCLE).tolist():
         for start in range(0, motion.shape[1] - LENGTH - 1, STARTS):
-            part = motion[agent, start : start + LENGTH + 1]
-            if (part[:, 5] > 0.5).all() and np.hypot(*np.ptp(part[:, :2], axis=0)) > 1.0:
-                local = to_local(part[0, :3], part[:, :2])
-                turned = np.asarray(wrap_angle(part[:, 2:3] - part[0, 2]))
-                motions.append(np.concatenate([local, turned], 1)[None].astype(np.float64))
-                speeds.append(float(np.hypot(*(part[1, :2] - part[0, :2]))) / STEP)
+            window = motion[agent, start : start + LENGTH + 1]
+            if (window[:, 5] > 0.5).all() and np.hypot(*np.ptp(window[:, :2], axis=0)) > 1.0:
+                local = to_local(window[0, :3], window[:, :2])
+                relative_yaw = np.asarray(wrap_angle(window[:, 2:3] - window[0, 2]))
+                motions.append(np.concatenate([local, relative_yaw], 1)[None].astype(np.float64))
+                speeds.append(float(np.hypot(*(window[1, :2] - window[0, :2]))) / STEP)
     return np.concatenate(motions), np.array(speeds)

@@ -1,7 +1,7 @@
-"""Digital adversarial attacks on detectors (paper III.A.1), each under an exact budget on 8-bit pictures.
+"""Digital adversarial attacks on detectors (paper III.A.1), each under an exact budget on 8-bit images.
 
-`run_attack(make_attack("pgd"), detector, images, truth, Budget(px(5)))`; which loss is ascended is an attack's own
-choice unless it is told another.
+`run_attack(make_attack("pgd"), detector, images, truth, Budget(px(5)))`. Each attack has a default loss
+(`default_loss`), which `objective` overrides.
 """
 
 from __future__ import annotations
@@ -36,55 +36,62 @@ LOSS: dict[str, str] = {"cw": "margin", "cw-min": "margin"}
 
 
 def attack_names() -> dict[str, str]:
-    """All names -> where they come from."""
+    """Return the names of all attacks and the modules that define them."""
     return names("attack", ATTACKS)
 
 
 def make_attack(name: str, **options: Any) -> Any:
-    """An attack by name.
+    """Create an attack by name.
 
     Args:
-        name: Of `ATTACKS`, one that a package offers (`ssad.attacks`), or "module:object".
-        **options: What its constructor takes.
+        name: Key of `ATTACKS`, entry point of the group `ssad.attacks`, or "module:object".
+        **options: Arguments of the attack's constructor.
 
     Raises:
         UnknownNameError: There is no such attack.
-        ConfigError: An option that it does not have, or a value that it refuses.
+        ConfigError: An option is unknown, missing, or has an invalid value.
     """
-    build = resolve("attack", ATTACKS, name)
-    needed = ("name", "access", "perturb")
-    if not callable(build):
-        return make("attack", name, build, {}, needed)
-    known = inspect.signature(build).parameters
-    open_ended = any(one.kind is one.VAR_KEYWORD for one in known.values())
+    factory = resolve("attack", ATTACKS, name)
+    required_attributes = ("name", "access", "perturb")
+    if not callable(factory):
+        return make("attack", name, factory, {}, required_attributes)
+    # Options are checked before the call, so that the error can list the valid ones.
+    options_by_name = inspect.signature(factory).parameters
+    accepts_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in options_by_name.values())
     for option in options:
-        if option not in known and not open_ended:
-            own = ", ".join(one for one in known if one not in ("name", "access")) or "none"
+        if option not in options_by_name and not accepts_any:
+            allowed = (
+                ", ".join(parameter for parameter in options_by_name if parameter not in ("name", "access")) or "none"
+            )
             raise ConfigError(
-                f"attack {name}: there is no option '{option}'; {f'it has {own}' if own else 'it has none'}"
+                f"attack {name}: there is no option '{option}'; {f'it has {allowed}' if allowed else 'it has none'}"
             )
     missing = [option for option in needs(name) if option not in options]
     if missing:
         raise ConfigError(f"attack {name}: it needs {' and '.join(missing)}: make it in Python (docs/attacks.md)")
-    return make("attack", name, build, options, needed)
+    return make("attack", name, factory, options, required_attributes)
 
 
 def needs(name: str) -> tuple[str, ...]:
-    """Options without which an attack cannot be made; a suite cannot run an attack that has any.
+    """Return the required options of an attack; a suite can only run attacks without any.
 
     Args:
         name: As for `make_attack`.
     """
-    build = resolve("attack", ATTACKS, name)
-    if not callable(build):
+    factory = resolve("attack", ATTACKS, name)
+    if not callable(factory):
         return ()
-    positional = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    parameters = inspect.signature(build).parameters.items()
-    return tuple(option for option, one in parameters if one.default is one.empty and one.kind in positional)
+    named_kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    parameters = inspect.signature(factory).parameters.items()
+    return tuple(
+        option
+        for option, parameter in parameters
+        if parameter.default is parameter.empty and parameter.kind in named_kinds
+    )
 
 
 def default_loss(name: str) -> str:
-    """The loss that an attack ascends if it is told none."""
+    """Return the loss that an attack ascends unless another one is given."""
     return LOSS.get(name, "full")
 
 

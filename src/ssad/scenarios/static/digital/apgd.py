@@ -1,4 +1,4 @@
-"""Auto-PGD: projected ascent that halves its own step when progress stalls, and goes on from the best image."""
+"""Auto-PGD: projected ascent that halves its step when progress stalls, and continues from the best image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ssad.scenarios.static.digital.budget import Budget
 from ssad.scenarios.static.digital.pgd import Start, starts
 from ssad.scenarios.static.digital.victim import Victim
 
-INERTIA = 0.75  # share of the new step; the rest repeats the last one
+INERTIA = 0.75  # weight of the new step; the rest repeats the last one
 PROGRESS = 0.75  # least share of steps that must raise the loss between two checkpoints
 
 
@@ -24,10 +24,10 @@ class APGD:
 
     Attributes:
         steps: Gradient steps of each start, including the first gradient.
-        start: Where the first start begins.
+        start: Position of the first start.
         restarts: Further random starts.
-        name: What tables call it.
-        access: It asks for gradients.
+        name: Name shown in tables.
+        access: Queries gradients.
 
     Raises:
         ConfigError: Fewer than two steps, or a negative number of restarts.
@@ -47,50 +47,51 @@ class APGD:
             raise ConfigError("apgd: steps must be 2 or more, restarts 0 or more")
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`."""
+        """Run the ascent from every start and keep the best images."""
         best = victim.clean, victim.clean.new_full((len(victim),), -torch.inf, dtype=torch.float32)
         for images in starts(victim, budget, self.start, self.restarts):
             best = keep_best(best, *self._run(victim, budget, images))
         return best[0]
 
     def _run(self, victim: Victim, budget: Budget, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Best images and losses of one start."""
-        marks = checkpoints(self.steps)
+        """Return the best images and losses of one start."""
+        checkpoint_steps = checkpoints(self.steps)
         loss, gradient = victim.gradient(images)
         loss = loss.float()
         best_images, best_loss, best_gradient = images, loss, gradient
-        step = torch.full_like(loss, 2.0 * budget.radius)
-        rises = torch.zeros_like(loss)
-        last_mark = 0
-        step_before, best_before = step.clone(), loss.clone()
-        before = images
-        for k in range(1, self.steps + 1):
-            ahead = budget.project(images + _each(step) * budget.steepest(gradient), victim.clean)
-            share = INERTIA if k > 1 else 1.0
-            moved = images + share * (ahead - images) + (1 - share) * (images - before)
-            before, images = images, budget.project(moved, victim.clean)
-            if k == self.steps:
+        step_length = torch.full_like(loss, 2.0 * budget.radius)
+        rise_count = torch.zeros_like(loss)
+        last_checkpoint = 0
+        previous_step, previous_best = step_length.clone(), loss.clone()
+        previous_images = images
+        for iteration in range(1, self.steps + 1):
+            gradient_step = budget.project(images + _each(step_length) * budget.steepest(gradient), victim.clean)
+            step_share = INERTIA if iteration > 1 else 1.0
+            proposed = images + step_share * (gradient_step - images) + (1 - step_share) * (images - previous_images)
+            previous_images, images = images, budget.project(proposed, victim.clean)
+            if iteration == self.steps:
                 return keep_best((best_images, best_loss), images, victim.loss(images).float())
-            fresh, gradient = victim.gradient(images)
-            fresh = fresh.float()
-            rises += fresh > loss
-            loss = fresh
-            better = fresh > best_loss
-            best_images = torch.where(_each(better), images, best_images)
-            best_gradient = torch.where(_each(better), gradient, best_gradient)
-            best_loss = torch.where(better, fresh, best_loss)
-            if k in marks:
-                stalled = rises < PROGRESS * (k - last_mark)
-                stuck = (step_before == step) & (best_before == best_loss)
-                back = stalled | stuck
-                step_before, best_before = step.clone(), best_loss.clone()
-                step = torch.where(back, step / 2, step)
-                images = torch.where(_each(back), best_images, images)
-                before = torch.where(_each(back), best_images, before)
-                gradient = torch.where(_each(back), best_gradient, gradient)
-                loss = torch.where(back, best_loss, loss)
-                rises = torch.zeros_like(rises)
-                last_mark = k
+            new_loss, gradient = victim.gradient(images)
+            new_loss = new_loss.float()
+            rise_count += new_loss > loss
+            loss = new_loss
+            improved = new_loss > best_loss
+            best_images = torch.where(_each(improved), images, best_images)
+            best_gradient = torch.where(_each(improved), gradient, best_gradient)
+            best_loss = torch.where(improved, new_loss, best_loss)
+            if iteration in checkpoint_steps:
+                # Conditions 1 and 2 of the source.
+                stalled = rise_count < PROGRESS * (iteration - last_checkpoint)
+                unchanged = (previous_step == step_length) & (previous_best == best_loss)
+                restart = stalled | unchanged
+                previous_step, previous_best = step_length.clone(), best_loss.clone()
+                step_length = torch.where(restart, step_length / 2, step_length)
+                images = torch.where(_each(restart), best_images, images)
+                previous_images = torch.where(_each(restart), best_images, previous_images)
+                gradient = torch.where(_each(restart), best_gradient, gradient)
+                loss = torch.where(restart, best_loss, loss)
+                rise_count = torch.zeros_like(rise_count)
+                last_checkpoint = iteration
         return best_images, best_loss
 
 
@@ -100,12 +101,12 @@ def checkpoints(steps: int) -> frozenset[int]:
     Args:
         steps: All steps.
     """
-    marks = [0.0, 0.22]
-    while marks[-1] < 1.0:
-        marks.append(marks[-1] + max(marks[-1] - marks[-2] - 0.03, 0.06))
-    return frozenset(math.ceil(mark * steps - 1e-9) for mark in marks[1:] if mark < 1.0)
+    fractions = [0.0, 0.22]
+    while fractions[-1] < 1.0:
+        fractions.append(fractions[-1] + max(fractions[-1] - fractions[-2] - 0.03, 0.06))
+    return frozenset(math.ceil(fraction * steps - 1e-9) for fraction in fractions[1:] if fraction < 1.0)
 
 
 def _each(values: Tensor) -> Tensor:
-    """[B] as [B, 1, 1, 1]."""
+    """Reshape values [B] to [B, 1, 1, 1]."""
     return values[:, None, None, None]

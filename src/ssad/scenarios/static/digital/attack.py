@@ -1,4 +1,4 @@
-"""The seam of digital attacks, and the one way to run them: what comes out is an 8-bit picture within its budget."""
+"""Protocol of digital attacks, and `run_attack`, which returns 8-bit images within the budget."""
 
 from __future__ import annotations
 
@@ -21,45 +21,45 @@ Access = Literal["white-box", "black-box", "none"]
 
 
 class Attack(Protocol):
-    """A method; what it needs to know is given to its constructor.
+    """Attack method; its settings are given to its constructor.
 
     Attributes:
-        name: What tables call it.
-        access: "white-box": it asks for gradients. "black-box": for losses only. "none": it asks nothing.
+        name: Name shown in tables.
+        access: "white-box": queries gradients. "black-box": queries losses only. "none": queries nothing.
     """
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
 
     @property
     def access(self) -> Access:
-        """What it asks for: "white-box": gradients; "black-box": only losses; "none": nothing."""
+        """Access to the detector: "white-box": gradients; "black-box": losses only; "none": nothing."""
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """Look for images that raise the victim's loss.
+        """Search for images that raise the victim's loss.
 
         Args:
             victim: Detector, images and loss.
-            budget: How far images may be moved.
+            budget: Maximum change of the images.
 
         Returns:
-            [B, 3, H, W] the best images found, within the budget. Each depends on its own image and key alone.
+            [B, 3, H, W], the best images within the budget. Each depends on its own image and key alone.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Attacked:
-    """What an attack made of a batch.
+    """Result of an attack on a batch.
 
     Attributes:
-        images: [B, 3, H, W] float32, multiples of 1/255: what a detector reads from the stored 8-bit picture.
-        before, after: [B] the loss of the clean images, and of `images`.
-        idle: [B] images in which there was nothing to attack; they are the clean ones.
-        cost: of each image.
-        gradient_error: the largest relative error of the gradient against finite differences that was found before the
-            attack; None if it was not looked at.
-        about: attack, access, loss, budget, as plain data for a record.
+        images: [B, 3, H, W] float32, multiples of 1/255, as a detector reads them from stored 8-bit images.
+        before, after: [B] loss of the clean images, and of `images`.
+        idle: [B] mask of the images without anything to attack; they are returned clean.
+        cost: Cost per image.
+        gradient_error: Largest relative error of the gradient against finite differences before the attack; None if
+            it was not checked.
+        about: Attack, access, loss and budget as plain data for a record.
     """
 
     images: Tensor
@@ -89,17 +89,17 @@ def run_attack(
     """Attack a batch of images.
 
     Args:
-        attack: The method.
-        detector: What is attacked; its modes, flags and buffers are the same afterwards.
+        attack: Attack method.
+        detector: Detector under attack; its modes, flags and buffers are restored afterwards.
         images: [B, 3, H, W] float in [0, 1], multiples of 1/255.
-        truth: What is in each image.
-        budget: How far each may be moved.
-        objective: The loss to ascend, or its name.
+        truth: Ground truth of each image.
+        budget: Maximum change of each image.
+        objective: Loss to ascend, or its name.
         intrinsic: [B, 3, 3], for 3D.
-        aim: Which objects are attacked.
-        keys: What the random draws of each image come from.
-        through: A defence that the attack knows.
-        precision: Of the gradients; see `Victim`.
+        aim: Objects under attack.
+        keys: Random keys of the images.
+        through: Defence that the attack knows.
+        precision: Precision of the gradients; see `Victim`.
         check: Compare the gradient with finite differences first (white-box attacks only).
 
     Returns:
@@ -108,46 +108,48 @@ def run_attack(
     Raises:
         ConfigError: See `Victim`; the gradient is missing, not finite or wrong; the attack broke the budget.
     """
-    ascended = make_objective(objective) if isinstance(objective, str) else objective
+    loss_function = make_objective(objective) if isinstance(objective, str) else objective
     with steady(detector):
         victim = Victim(
             detector,
             images,
             truth,
-            ascended,
+            loss_function,
             intrinsic=intrinsic,
             aim=aim,
             keys=keys,
             through=through,
             precision=precision,
         )
-        error = check_gradient(victim) if check and attack.access == "white-box" else None
-        before = victim.loss(victim.clean)
+        gradient_error = check_gradient(victim) if check and attack.access == "white-box" else None
+        loss_before = victim.loss(victim.clean)
+        # The cost counts the attack alone, not the checks before it.
         victim.cost = Cost()
-        found = attack.perturb(victim, budget) if budget.radius > 0 else victim.clean
-        if found.shape != victim.clean.shape or not bool(found.isfinite().all()):
+        perturbed = attack.perturb(victim, budget) if budget.radius > 0 else victim.clean
+        if perturbed.shape != victim.clean.shape or not bool(perturbed.isfinite().all()):
             raise ConfigError(f"attack {attack.name}: what it found has another shape, or is not finite")
         cost = Cost(victim.cost.gradients, victim.cost.queries)
-        found = torch.where(victim.idle[:, None, None, None], victim.clean, found.detach())
-        kept = quantise(found, victim.codes, budget).to(victim.clean) / LEVELS
-        after = victim.loss(kept)
-    about = {
+        perturbed = torch.where(victim.idle[:, None, None, None], victim.clean, perturbed.detach())
+        stored = quantise(perturbed, victim.codes, budget).to(victim.clean) / LEVELS
+        # The loss is measured on the rounded images, which are what a detector reads.
+        loss_after = victim.loss(stored)
+    metadata = {
         "attack": attack.name,
         "access": attack.access,
-        "loss": ascended.name,
+        "loss": loss_function.name,
         "norm": budget.norm,
         "radius_px": round(budget.radius * LEVELS, 6),
         "gradients": cost.gradients,
         "queries": cost.queries,
     }
-    return Attacked(kept, before, after, victim.idle, cost, error, about)
+    return Attacked(stored, loss_before, loss_after, victim.idle, cost, gradient_error, metadata)
 
 
 def keep_best(best: tuple[Tensor, Tensor], images: Tensor, loss: Tensor) -> tuple[Tensor, Tensor]:
-    """The images with the higher loss of two sets, and these losses.
+    """Return the images with the higher loss of two sets, and these losses.
 
     Args:
-        best: Images [B, 3, H, W] and losses [B] so far.
+        best: Best images [B, 3, H, W] and losses [B] so far.
         images: [B, 3, H, W].
         loss: [B].
     """

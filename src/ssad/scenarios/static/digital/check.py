@@ -1,8 +1,8 @@
-"""Is an attack as strong as it claims? Tried out on a few images, beside noise, a single step and a reference attack.
+"""Strength checks of an attack on a few images, against noise, a single step and a reference attack.
 
-A weak attack makes a detector look robust. The usual faults: steps too small to cross the ball, a loss of boxes that
-survived suppression, a gradient that is cut off or of the wrong sign, a loss in which the images of a batch share, a
-budget that is broken and mended by rounding.
+A weak attack makes a detector look robust. Usual faults: steps too small to cross the ball, a loss on boxes that
+survived suppression, a gradient that is cut off or has the wrong sign, a loss that couples the images of a batch,
+and a budget that is exceeded and then repaired by rounding.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ def find_weaknesses(
     objective: str | Objective = "full",
     intrinsic: Tensor | None = None,
 ) -> list[str]:
-    """Faults of an attack, a sentence each; none for a sound one.
+    """Return the faults of an attack, one sentence each; the list is empty for a sound attack.
 
     Args:
-        attack: What is tried; one that asks for gradients more than once is also held to PGD on the loss `margin` with
-            as many steps.
-        detector: What it is tried on; it should find most of the objects.
+        attack: Attack to check. One that takes more than one gradient is also compared with PGD on the loss
+            `margin` with as many steps.
+        detector: Detector under attack; it should detect most of the objects.
         images: [B, 3, H, W], two or more.
-        truth: What is in each image.
-        budget: At which it is tried.
-        objective: The loss that it ascends, or its name.
+        truth: Ground truth of each image.
+        budget: Budget of the check.
+        objective: Loss to ascend, or its name.
         intrinsic: [B, 3, 3], for 3D.
 
     Raises:
@@ -54,30 +54,31 @@ def find_weaknesses(
     """
     if len(images) < 2:
         raise ConfigError("an attack is tried on two images or more")
-    ascended = make_objective(objective) if isinstance(objective, str) else objective
+    loss_function = make_objective(objective) if isinstance(objective, str) else objective
     faults: list[str] = []
     try:
-        own = run_attack(attack, detector, images, truth, budget, objective=ascended, intrinsic=intrinsic)
+        result = run_attack(attack, detector, images, truth, budget, objective=loss_function, intrinsic=intrinsic)
     except ConfigError as error:
         return [str(error)]
     with steady(detector):
-        faults += _budget_faults(attack, Victim(detector, images, truth, ascended, intrinsic=intrinsic), budget)
-    faults += _batch_faults(attack, detector, images, truth, budget, ascended, intrinsic)
-    rise = own.after - own.before
-    others: list[Attack] = [RandomNoise()] + ([FGSM()] if own.cost.gradients > 1 else [])
-    for other in others:
-        beside = run_attack(
-            other, detector, images, truth, budget, objective=ascended, intrinsic=intrinsic, check=False
+        faults += _budget_faults(attack, Victim(detector, images, truth, loss_function, intrinsic=intrinsic), budget)
+    faults += _batch_faults(attack, detector, images, truth, budget, loss_function, intrinsic)
+    loss_increase = result.after - result.before
+    baselines: list[Attack] = [RandomNoise()] + ([FGSM()] if result.cost.gradients > 1 else [])
+    for baseline in baselines:
+        baseline_result = run_attack(
+            baseline, detector, images, truth, budget, objective=loss_function, intrinsic=intrinsic, check=False
         )
-        theirs = beside.after - beside.before
-        if float(rise.mean()) < float(theirs.mean()) - SLACK * abs(float(theirs.mean())):
+        baseline_increase = baseline_result.after - baseline_result.before
+        if float(loss_increase.mean()) < float(baseline_increase.mean()) - SLACK * abs(float(baseline_increase.mean())):
             faults.append(
-                f"it raises the loss by {float(rise.mean()):.3g}, {other.name} of the same budget by "
-                f"{float(theirs.mean()):.3g}"
+                f"it raises the loss by {float(loss_increase.mean()):.3g}, {baseline.name} of the same budget by "
+                f"{float(baseline_increase.mean()):.3g}"
             )
-    if own.cost.gradients > 1:
+    if result.cost.gradients > 1:
+        # A strong loss with the same number of gradients bounds what a sound attack should reach.
         reference = run_attack(
-            PGD(own.cost.gradients),
+            PGD(result.cost.gradients),
             detector,
             images,
             truth,
@@ -86,24 +87,27 @@ def find_weaknesses(
             intrinsic=intrinsic,
             check=False,
         )
-        left, least = (quality_left(detector, one.images, truth, intrinsic) for one in (own, reference))
-        if left > least + BESIDE:
+        attack_quality, reference_quality = (
+            quality_left(detector, attack_result.images, truth, intrinsic) for attack_result in (result, reference)
+        )
+        if attack_quality > reference_quality + BESIDE:
             faults.append(
-                f"it leaves an average precision of {left:.0%}, PGD on the loss margin with as many steps leaves "
-                f"{least:.0%}"
+                f"it leaves an average precision of {attack_quality:.0%}, PGD on the loss margin "
+                "with as many steps leaves "
+                f"{reference_quality:.0%}"
             )
     return faults
 
 
 def _budget_faults(attack: Attack, victim: Victim, budget: Budget) -> list[str]:
-    """Whether what the attack finds, before anything is rounded, keeps to the budget and the range."""
-    found = attack.perturb(victim, budget)
-    change = found - victim.clean
+    """Return violations of the budget and of the range [0, 1] before any rounding."""
+    perturbed = attack.perturb(victim, budget)
+    change = perturbed - victim.clean
     size = float(change.abs().max() if budget.norm == "linf" else lengths(change).max())
     faults = []
     if size > budget.radius * (1 + 1e-4) + 1e-6:
         faults.append(f"it moves images by {size * LEVELS:.4g} px, the budget is {budget.radius * LEVELS:.4g}")
-    if bool(((found < 0) | (found > 1)).any()):
+    if bool(((perturbed < 0) | (perturbed > 1)).any()):
         faults.append("it leaves the range of images, [0, 1]")
     return faults
 
@@ -117,35 +121,36 @@ def _batch_faults(  # noqa: PLR0917
     objective: Objective,
     intrinsic: Tensor | None,
 ) -> list[str]:
-    """Whether an image fares the same alone as beside others."""
+    """Return faults of an attack that treats an image differently alone and within a batch."""
     faults, losses = [], {}
     for count in (1, len(images)):
-        lens = None if intrinsic is None else intrinsic[:count]
+        batch_intrinsic = None if intrinsic is None else intrinsic[:count]
         with steady(detector):
-            victim = Victim(detector, images[:count], truth[:count], objective, intrinsic=lens)
-            clean = float(victim.loss(victim.clean)[0])
-            losses[count] = clean, float(victim.loss(attack.perturb(victim, budget))[0])
-    (clean, alone), (clean_beside, beside) = losses.values()
-    size = max(abs(clean), abs(alone - clean), 1e-6)
-    if abs(clean - clean_beside) > 1e-3 * size:
+            victim = Victim(detector, images[:count], truth[:count], objective, intrinsic=batch_intrinsic)
+            clean_alone = float(victim.loss(victim.clean)[0])
+            losses[count] = clean_alone, float(victim.loss(attack.perturb(victim, budget))[0])
+    (clean_alone, attacked_alone), (clean_in_batch, attacked_in_batch) = losses.values()
+    size = max(abs(clean_alone), abs(attacked_alone - clean_alone), 1e-6)
+    if abs(clean_alone - clean_in_batch) > 1e-3 * size:
         faults.append("the loss of an image depends on the other images of its batch")
-    elif abs(alone - beside) > 0.05 * size:
+    elif abs(attacked_alone - attacked_in_batch) > 0.05 * size:
         faults.append("what becomes of an image depends on the other images of its batch")
     return faults
 
 
 def quality_left(detector: Detector, images: Tensor, truth: Sequence[Truth], intrinsic: Tensor | None) -> float:
-    """Mean over images of what a detector still gets right of each (see `image_quality`), 0 to 1."""
-    found = detector.predict(images, intrinsic)
-    pairs = zip(found, truth, strict=True)
-    values = [image_quality(*pair, task=detector.task, classes=len(detector.classes)).value for pair in pairs]
+    """Return the mean `image_quality` of a detector over images, 0 to 1."""
+    detections = detector.predict(images, intrinsic)
+    matches = zip(detections, truth, strict=True)
+    values = [image_quality(*match, task=detector.task, classes=len(detector.classes)).value for match in matches]
     return sum(values) / len(values)
 
 
 def within(images: Tensor, clean: Tensor, budget: Budget) -> bool:
-    """Whether stored images keep to a budget around clean ones, in whole code values."""
+    """Check that stored images keep to a budget around clean ones, in whole code values."""
     change = codes_of(images).double() - codes_of(clean).double()
     limit = budget.radius * LEVELS
     if budget.norm == "linf":
+        # The tolerance covers radii such as 5 / 255 that floats do not hold exactly.
         return float(change.abs().max()) <= limit + 1e-9
     return bool(((change**2).flatten(1).sum(1) <= limit**2 * (1 + 1e-9)).all())

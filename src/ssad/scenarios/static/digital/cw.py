@@ -1,4 +1,4 @@
-"""Carlini and Wagner's attack: margin ascent inside the ball, and the smallest change that empties the picture."""
+"""Carlini and Wagner's attack: margin ascent inside the ball, and the smallest change that empties the image."""
 
 from __future__ import annotations
 
@@ -18,14 +18,11 @@ EDGE = 1e-6  # how far from 0 and 1 values are kept before they are mapped to th
 
 
 def cw(*, steps: int = 10, restarts: int = 0) -> PGD:
-    """Margin ascent inside the ball (with the loss `margin`), from the clean image.
+    """Return margin ascent inside the ball (with the loss `margin`), starting at the clean image.
 
     Args:
         steps: Gradient steps.
         restarts: Further random starts.
-
-    Returns:
-        The attack.
 
     Source: Madry et al. (ICLR 2018) ascend Carlini and Wagner's margin in the same way.
     """
@@ -34,15 +31,15 @@ def cw(*, steps: int = 10, restarts: int = 0) -> PGD:
 
 @dataclass(frozen=True, slots=True)
 class MinimalCW:
-    """The smallest Euclidean change after which the loss `margin` is 0: no location scores above the threshold.
+    """Smallest Euclidean change after which the loss `margin` is 0: no location scores above the threshold.
+
+    A change that exceeds the budget is shortened to it.
 
     Attributes:
-        rounds: of the binary search of the weight of the loss.
-        steps: of Adam in each round.
-        rate: of Adam.
-        weight: of the loss in the first round.
-
-    What does not fit into the budget is shortened to it.
+        rounds: Rounds of the binary search over the weight of the loss.
+        steps: Steps of Adam in each round.
+        rate: Learning rate of Adam.
+        weight: Weight of the loss in the first round.
 
     Raises:
         ConfigError: No rounds or steps.
@@ -62,41 +59,43 @@ class MinimalCW:
             raise ConfigError("cw-min: rounds and steps must be 1 or more, rate and weight above 0")
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`. Images that no change empties are the best that was met."""
+        """Search for the smallest emptying change; an image without one keeps the images of its best loss."""
         count = len(victim)
         weight = victim.clean.new_full((count,), self.weight)
-        low, high = torch.zeros_like(weight), torch.full_like(weight, torch.inf)
+        lower_weight, upper_weight = torch.zeros_like(weight), torch.full_like(weight, torch.inf)
         shortest = torch.full_like(weight, torch.inf)
-        found = victim.clean
-        least = torch.full_like(weight, -torch.inf)
+        best_images = victim.clean
+        best_loss = torch.full_like(weight, -torch.inf)
         for _ in range(self.rounds):
-            won = torch.zeros(count, dtype=torch.bool, device=weight.device)
+            solved = torch.zeros(count, dtype=torch.bool, device=weight.device)
             for images, loss in self._descend(victim, weight):
-                size = lengths(images - victim.clean).flatten()
-                done = loss >= 0
-                won |= done
-                better = (done & (size < shortest)) | (shortest.isinf() & ~done & (loss > least))
-                found = torch.where(better[:, None, None, None], images, found)
-                shortest = torch.where(done & better, size, shortest)
-                least = torch.maximum(least, loss)
-            high = torch.where(won, torch.minimum(high, weight), high)
-            low = torch.where(won, low, torch.maximum(low, weight))
-            weight = torch.where(high.isinf(), weight * 10, (low + high) / 2)
-        return budget.project(found, victim.clean)
+                change_length = lengths(images - victim.clean).flatten()
+                empties = loss >= 0
+                solved |= empties
+                better = (empties & (change_length < shortest)) | (shortest.isinf() & ~empties & (loss > best_loss))
+                best_images = torch.where(better[:, None, None, None], images, best_images)
+                shortest = torch.where(empties & better, change_length, shortest)
+                best_loss = torch.maximum(best_loss, loss)
+            upper_weight = torch.where(solved, torch.minimum(upper_weight, weight), upper_weight)
+            lower_weight = torch.where(solved, lower_weight, torch.maximum(lower_weight, weight))
+            # Grow the weight tenfold until a round succeeds, then bisect.
+            weight = torch.where(upper_weight.isinf(), weight * 10, (lower_weight + upper_weight) / 2)
+        return budget.project(best_images, victim.clean)
 
     def _descend(self, victim: Victim, weight: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Images and losses that are met with one weight each."""
+        """Yield the images and losses of an Adam descent with one weight for each image."""
         clean = victim.clean.clamp(EDGE, 1 - EDGE)
-        line = torch.logit(clean).requires_grad_()
-        optimizer = torch.optim.Adam([line], lr=self.rate)
+        # The logistic map keeps images in [0, 1] without a projection.
+        logits = torch.logit(clean).requires_grad_()
+        optimizer = torch.optim.Adam([logits], lr=self.rate)
         for _ in range(self.steps):
-            images = line.sigmoid()
+            images = logits.sigmoid()
             loss, gradient = victim.gradient(images)
             yield images.detach(), loss
             with torch.enable_grad():
-                shown = line.sigmoid()
-                size = ((shown - victim.clean) ** 2).flatten(1).sum(1)
-                ascended = (shown * gradient).flatten(1).sum(1)  # has the gradient of the loss
-                (size - weight * ascended).sum().backward()  # type: ignore[no-untyped-call]
+                decoded = logits.sigmoid()
+                squared_length = ((decoded - victim.clean) ** 2).flatten(1).sum(1)
+                linear_loss = (decoded * gradient).flatten(1).sum(1)  # has the gradient of the loss
+                (squared_length - weight * linear_loss).sum().backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             optimizer.zero_grad()

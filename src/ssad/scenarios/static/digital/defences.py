@@ -1,12 +1,12 @@
-"""Defences that a picture passes before the detector, with gradients for attacks that know them.
+"""Defences that transform an image before the detector, with gradients for attacks that know them.
 
     Defended(detector, Jpeg(75))    # a detector like any other
     run_attack(PGD(), detector, images, truth, budget, through=Jpeg(75))
     run_attack(Expected(PGD(), resize), detector, images, truth, budget, through=resize)    # see expectation.py
 
-Rounding is done for real and has slope one (straight-through): the true slope of a staircase is 0 almost everywhere
-(Athalye et al., Obfuscated Gradients Give a False Sense of Security, ICML 2018). None of them moves anything in the
-picture: boxes and intrinsics stay what they are.
+Rounding is exact and has slope one (straight-through), since the true slope of a staircase is 0 almost everywhere
+(Athalye et al., Obfuscated Gradients Give a False Sense of Security, ICML 2018). No defence moves content within
+the image: boxes and intrinsics stay valid.
 """
 
 from __future__ import annotations
@@ -31,33 +31,36 @@ SMALLEST = 8  # pixels of a side below which pictures are not shrunk
 
 
 class Defence(Protocol):
-    """What every picture passes before it reaches the detector.
+    """Transformation of every image before it reaches the detector.
 
     Attributes:
-        name: What tables call it.
-        smooth: Whether its gradient agrees with finite differences. It does not where the defence rounds or draws at
+        name: Name shown in tables.
+        smooth: True if its gradient agrees with finite differences. It does not where the defence rounds or draws at
             random; the check before an attack then covers the detector alone.
     """
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
 
     @property
     def smooth(self) -> bool:
-        """Whether its gradient agrees with finite differences."""
+        """True if its gradient agrees with finite differences."""
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Images [B, 3, H, W] in [0, 1] to images of the same shape, each from its own image alone; differentiable."""
+        """Transform images [B, 3, H, W] in [0, 1] into images of the same shape, differentiably.
+
+        Each output depends on its own image alone.
+        """
 
 
 @dataclass(frozen=True, slots=True)
 class Jpeg:
-    """The picture is written as JPEG and read again, as libjpeg does both.
+    """JPEG compression and decompression of an image as libjpeg computes them.
 
     Attributes:
         quality: 1 to 100.
-        subsampling: of the colours, "420" or "444".
+        subsampling: Chroma subsampling, "420" or "444".
 
     Raises:
         ConfigError: There is no such quality or subsampling.
@@ -77,17 +80,17 @@ class Jpeg:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
         return f"jpeg-{self.quality}"
 
     def __call__(self, images: Tensor) -> Tensor:
-        """See `Defence`."""
+        """Compress and decompress images."""
         return jpeg(images, self.quality, self.subsampling)
 
 
 @dataclass(frozen=True, slots=True)
 class BitDepth:
-    """Fewer levels for each value.
+    """Quantisation of each value to fewer levels.
 
     Attributes:
         bits: 1 to 8.
@@ -107,26 +110,27 @@ class BitDepth:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
         return f"bits-{self.bits}"
 
     def __call__(self, images: Tensor) -> Tensor:
-        """See `Defence`."""
+        """Round images to the levels of `bits`."""
         steps = 2**self.bits - 1
         rounded = (images * steps).round() / steps
-        found: Tensor = rounded.detach() + (images - images.detach())
-        return found
+        # Straight-through: the value is rounded, the gradient is that of the identity.
+        quantised: Tensor = rounded.detach() + (images - images.detach())
+        return quantised
 
 
 @dataclass(frozen=True, slots=True)
 class Blur:
-    """A Gaussian blur; what lies beyond the border repeats the last row and column.
+    """Gaussian blur; the border repeats the last row and column.
 
     Attributes:
-        sigma: in pixels; the kernel ends after three of them.
+        sigma: Standard deviation in pixels; the kernel ends after three of them.
 
     Raises:
-        ConfigError: It is not above 0.
+        ConfigError: Sigma is not above 0.
 
     Source: Xu et al., Feature Squeezing (NDSS 2018), section II.B.
     """
@@ -140,38 +144,38 @@ class Blur:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
         return f"blur-{self.sigma:g}"
 
     def __call__(self, images: Tensor) -> Tensor:
-        """See `Defence`."""
+        """Blur images along rows, then along columns."""
         reach = math.ceil(3 * self.sigma)
-        away = torch.arange(-reach, reach + 1, dtype=torch.float64)
-        line = torch.exp(-0.5 * (away / self.sigma) ** 2)
-        line = (line / line.sum()).to(images)
-        wide: Tensor = (
-            functional.pad(images, (reach, reach, reach, reach), mode="replicate").unfold(2, len(line), 1) @ line
+        offsets = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        kernel = torch.exp(-0.5 * (offsets / self.sigma) ** 2)
+        kernel = (kernel / kernel.sum()).to(images)
+        blurred_rows: Tensor = (
+            functional.pad(images, (reach, reach, reach, reach), mode="replicate").unfold(2, len(kernel), 1) @ kernel
         )
-        return _in_range(wide.unfold(3, len(line), 1) @ line)
+        return _in_range(blurred_rows.unfold(3, len(kernel), 1) @ kernel)
 
 
 @dataclass(frozen=True, slots=True)
 class RandomResize:
-    """Each picture is shrunk to a random size and enlarged to its own again, so that nothing moves in it.
+    """Reduction of each image to a random size and enlargement back, so that its content does not move.
 
-    Called as a defence, the size comes from `seed` and the picture's own 8-bit codes: the same picture is always
-    treated alike, and each other one anew, which an attack cannot foresee. For an attack that knows all but the draw,
-    see `expectation.Expected`.
+    Called as a defence, the size comes from `seed` and the image's own 8-bit codes: an image is always treated in the
+    same way, and an attack cannot predict the size for another. For an attack that knows everything but the draw, see
+    `expectation.Expected`.
 
     Attributes:
-        smallest: share of the size that is the least drawn; shares are uniform up to 1.
-        seed: of the draws.
+        smallest: Lower bound of the relative size; sizes are uniform up to 1.
+        seed: Seed of the draws.
 
     Raises:
         ConfigError: A share outside (0, 1).
 
     Source: Xie et al., Mitigating Adversarial Effects Through Randomization (ICLR 2018); they pad at random, which
-    moves boxes, where this enlarges again.
+    moves boxes, while this enlarges again.
     """
 
     smallest: float = 0.6
@@ -184,14 +188,14 @@ class RandomResize:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
         return f"resize-{self.smallest:g}"
 
     def __call__(self, images: Tensor) -> Tensor:
-        """See `Defence`."""
+        """Resize each image by the share that its own codes determine."""
         codes = (images.detach() * LEVELS).round().clamp(0, LEVELS).to(torch.uint8).cpu()
-        shares = [self._share(tuple(one.shape), one.numpy().tobytes()) for one in codes]
-        return torch.cat([self._through(one[None], share) for one, share in zip(images, shares, strict=True)])
+        shares = [self._share(tuple(image.shape), image.numpy().tobytes()) for image in codes]
+        return torch.cat([self._through(image[None], share) for image, share in zip(images, shares, strict=True)])
 
     def drawn(self, number: int) -> Callable[[Tensor], Tensor]:
         """What it does to every picture in one draw, whatever is in it.
@@ -200,21 +204,22 @@ class RandomResize:
             number: Of the draw.
         """
         share = self._share("draw", number)
-        return lambda images: torch.cat([self._through(one[None], share) for one in images])
+        return lambda images: torch.cat([self._through(image[None], share) for image in images])
 
     def _share(self, *key: object) -> float:
         return float(generator("random resize", self.seed, *key).uniform(self.smallest, 1.0))
 
     @staticmethod
     def _through(image: Tensor, share: float) -> Tensor:
-        whole = (int(image.shape[2]), int(image.shape[3]))
-        small = tuple(max(round(share * side), min(side, SMALLEST)) for side in whole)
-        less = functional.interpolate(image, size=small, mode="bilinear", antialias=True)
-        return _in_range(functional.interpolate(less, size=whole, mode="bilinear"))
+        full_size = (int(image.shape[2]), int(image.shape[3]))
+        reduced_size = tuple(max(round(share * side), min(side, SMALLEST)) for side in full_size)
+        reduced = functional.interpolate(image, size=reduced_size, mode="bilinear", antialias=True)
+        return _in_range(functional.interpolate(reduced, size=full_size, mode="bilinear"))
 
 
 def _in_range(images: Tensor) -> Tensor:
-    """Means of values in [0, 1] without their last digit's excess, and with the gradient even where they are white."""
+    """Clip rounding excess of means of values in [0, 1]; the gradient passes everywhere."""
+    # A plain clamp would have no gradient at values that rounding put just outside [0, 1].
     return images.clamp(0.0, 1.0).detach() + (images - images.detach())
 
 
@@ -222,31 +227,31 @@ DEFENCES: dict[str, Callable[..., Any]] = {"jpeg": Jpeg, "bits": BitDepth, "blur
 
 
 def make_defence(name: str, **options: Any) -> Defence:
-    """A defence by name.
+    """Create a defence by name.
 
     Args:
-        name: Of `DEFENCES`.
-        **options: What its constructor takes.
+        name: Key of `DEFENCES`.
+        **options: Arguments of its constructor.
 
     Raises:
         UnknownNameError: There is no such defence.
-        ConfigError: An option that it does not have, or a value that it refuses.
+        ConfigError: An option is unknown or has an invalid value.
     """
     if name not in DEFENCES:
         raise unknown_name("defence", name, DEFENCES)
     try:
-        made: Defence = DEFENCES[name](**options)
+        defence: Defence = DEFENCES[name](**options)
     except TypeError as error:
         raise ConfigError(f"defence {name}: {error}") from None
-    return made
+    return defence
 
 
 class Defended:
-    """A detector behind a defence, which is a detector itself: whatever it is shown passes the defence first.
+    """Detector behind a defence, itself a detector: every image passes the defence first.
 
     Args:
-        detector: What is behind.
-        defence: What stands before it; it moves nothing in the picture, so intrinsics and boxes stay what they are.
+        detector: Detector that receives the defended images.
+        defence: Transformation before it; it moves no content, so intrinsics and boxes stay valid.
     """
 
     def __init__(self, detector: Detector, defence: Defence) -> None:
@@ -254,35 +259,35 @@ class Defended:
         self.name = f"{detector.name}+{defence.name}"
         self.task, self.classes = detector.task, detector.classes
         # held here as well, so that `steady` finds them
-        inside = [] if isinstance(detector, nn.Module) else list(getattr(detector, "__dict__", {}).values())
-        self._parts = [one for one in inside if isinstance(one, nn.Module)]
-        for number, part in enumerate(self._parts):
-            setattr(self, f"_part_{number}", part)
+        attributes = [] if isinstance(detector, nn.Module) else list(getattr(detector, "__dict__", {}).values())
+        self._parts = [attribute for attribute in attributes if isinstance(attribute, nn.Module)]
+        for index, part in enumerate(self._parts):
+            setattr(self, f"_part_{index}", part)
 
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
-        """See `Detector`."""
+        """Detect objects in the defended images."""
         with torch.no_grad():
-            shown = self._shown(images)
-        return self.detector.predict(shown, intrinsic, threshold=threshold)
+            defended = self._shown(images)
+        return self.detector.predict(defended, intrinsic, threshold=threshold)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """See `Detector`."""
+        """Return the dense outputs for the defended images."""
         return self.detector.dense(self._shown(images), intrinsic)
 
     def _shown(self, images: Tensor) -> Tensor:
-        """What the detector sees; a defence might hide from it that these are no images."""
+        """Validate images and pass them through the defence, which might hide a wrong shape or type."""
         if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
             raise ConfigError(f"images are [B, 3, H, W] of floats, not {list(images.shape)} {images.dtype}")
         return self.defence(images)
 
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """See `Detector`."""
+        """Assign targets with the wrapped detector."""
         return self.detector.assign(dense, truth)
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """See `Detector`."""
+        """Return the training losses of the wrapped detector."""
         return self.detector.losses(dense, assignment, reduction=reduction)

@@ -1,4 +1,4 @@
-"""Several attacks on the same pictures, of which each picture keeps the worst for the detector."""
+"""Ensembles of attacks on the same images: each image keeps the result that is worst for the detector."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ Judge = Callable[[Detections, Truth], Quality]
 
 @dataclass(frozen=True, slots=True)
 class Ensemble:
-    """Attacks, each with the loss that it ascends: losses cannot be compared, so what is detected decides.
+    """Attacks, each with the loss that it ascends.
+
+    Losses are not comparable, so the detections decide between the members.
 
     Attributes:
-        members: An attack and its loss (or the name of one), for each.
+        members: Attack and loss (or its name) of each member.
 
     Raises:
         ConfigError: There is no member.
@@ -41,9 +43,9 @@ class Ensemble:
 
     @property
     def access(self) -> Access:
-        """What the member asks for that asks for most."""
-        asked = {attack.access for attack, _ in self.members}
-        return "white-box" if "white-box" in asked else "black-box" if "black-box" in asked else "none"
+        """Highest access level of the members."""
+        access_levels = {attack.access for attack, _ in self.members}
+        return "white-box" if "white-box" in access_levels else "black-box" if "black-box" in access_levels else "none"
 
 
 def run_ensemble(
@@ -61,31 +63,31 @@ def run_ensemble(
     threshold: float | None = None,
     judge: Judge | None = None,
 ) -> Attacked:
-    """Attack a batch with every member and keep for each image the one that leaves least, after the 8-bit round trip.
+    """Attack a batch with every member and keep the worst result of each image after the 8-bit round trip.
 
-    What is left of an image is judged by what is detected in it (`image_quality`). Of members that leave the same, the
-    one whose false detections have the higher scores wins; of those that are equal in this too, the first.
+    The detections in an image determine its quality (`image_quality`). Of members with equal quality, the one whose
+    false detections have the higher scores wins; of those that tie again, the first.
 
     Args:
-        ensemble: The attacks and their losses.
-        detector: What is attacked.
+        ensemble: Attacks and their losses.
+        detector: Detector under attack.
         images: [B, 3, H, W] float in [0, 1], multiples of 1/255.
-        truth: What is in each image.
-        budget: How far each may be moved.
+        truth: Ground truth of each image.
+        budget: Maximum change of each image.
         intrinsic: [B, 3, 3], for 3D.
-        aim: Which objects are attacked; all others count as crowd where images are judged.
-        keys: What the random draws of each image come from.
-        through: A defence that every picture passes, which the attacks know.
+        aim: Objects under attack; all others count as crowd when images are judged.
+        keys: Random keys of the images.
+        through: Defence that every image passes and that the attacks know.
         check: Compare gradients with finite differences first.
-        threshold: Least score of a detection; None: the detector's own.
-        judge: What scores the detections of an image; default: `image_quality`.
+        threshold: Minimum score of a detection; None: the detector's own.
+        judge: Function that scores the detections of an image; default: `image_quality`.
 
     Returns:
-        The worst images. `before` and `after` are 1 less the quality of the clean and the attacked image; `idle`:
-        where no member had anything to attack; costs are the sums of all members', and one query
-        more for each, to judge it. `about` has the names of the
-        members and their losses ("members"), for each image the number of the one that won ("won") and the quality
-        that each member leaves ("quality" [B][M], the clean one's in "clean_quality").
+        The worst images. `before` and `after` are 1 minus the quality of the clean and of the attacked image; `idle`
+        marks images in which no member had an object to attack. Costs are the sums over all members, plus one query
+        each to judge its result. The metadata has the names of the members and their losses ("members"), the index of
+        the winner of each image ("won") and the quality that each member leaves ("quality" [B][M]; the clean one's in
+        "clean_quality").
 
     Raises:
         ConfigError: See `run_attack`.
@@ -93,13 +95,15 @@ def run_ensemble(
 
     def judged(pictures: Tensor) -> list[Quality]:
         with steady(detector), torch.no_grad():
-            shown = pictures if through is None else through(pictures)
-            found = detector.predict(shown, intrinsic, threshold=threshold)
-        pairs = zip(found, (of_aim(one, aim, detector.classes) for one in truth), strict=True)
+            defended = pictures if through is None else through(pictures)
+            detections = detector.predict(defended, intrinsic, threshold=threshold)
+        judged_pairs = zip(
+            detections, (of_aim(image_truth, aim, detector.classes) for image_truth in truth), strict=True
+        )
         if judge is not None:
-            return [judge(*pair) for pair in pairs]
-        many = len(detector.classes)
-        return [image_quality(*pair, task=detector.task, classes=many) for pair in pairs]
+            return [judge(*judged_pair) for judged_pair in judged_pairs]
+        class_count = len(detector.classes)
+        return [image_quality(*judged_pair, task=detector.task, classes=class_count) for judged_pair in judged_pairs]
 
     runs = [
         run_attack(
@@ -117,12 +121,16 @@ def run_ensemble(
         )
         for attack, objective in ensemble.members
     ]
-    left = [judged(run.images) for run in runs]
-    clean = judged(images)
-    won = [min(range(len(runs)), key=lambda m: left[m][k].order) for k in range(len(images))]
+    qualities_by_member = [judged(run.images) for run in runs]
+    clean_qualities = judged(images)
+    winners = [
+        min(range(len(runs)), key=lambda member_index: qualities_by_member[member_index][image_index].order)
+        for image_index in range(len(images))
+    ]
+    # Judging the result of a member takes one more query.
     cost = Cost(sum(run.cost.gradients for run in runs), sum(run.cost.queries + 1 for run in runs))
     errors = [run.gradient_error for run in runs if run.gradient_error is not None]
-    about: dict[str, Any] = {
+    metadata: dict[str, Any] = {
         "attack": ensemble.name,
         "access": ensemble.access,
         "loss": "quality",
@@ -131,16 +139,24 @@ def run_ensemble(
         "gradients": cost.gradients,
         "queries": cost.queries,
         "members": [f"{run.about['attack']}/{run.about['loss']}" for run in runs],
-        "won": won,
-        "quality": [[member[k].value for member in left] for k in range(len(images))],
-        "clean_quality": [one.value for one in clean],
+        "won": winners,
+        "quality": [
+            [member_qualities[image_index].value for member_qualities in qualities_by_member]
+            for image_index in range(len(images))
+        ],
+        "clean_quality": [clean_quality.value for clean_quality in clean_qualities],
     }
     return Attacked(
-        torch.stack([runs[m].images[k] for k, m in enumerate(won)]),
-        images.new_tensor([1 - one.value for one in clean]),
-        images.new_tensor([1 - left[m][k].value for k, m in enumerate(won)]),
+        torch.stack([runs[member_index].images[image_index] for image_index, member_index in enumerate(winners)]),
+        images.new_tensor([1 - clean_quality.value for clean_quality in clean_qualities]),
+        images.new_tensor(
+            [
+                1 - qualities_by_member[member_index][image_index].value
+                for image_index, member_index in enumerate(winners)
+            ]
+        ),
         torch.stack([run.idle for run in runs]).all(0),
         cost,
         max(errors, default=None),
-        about,
+        metadata,
     )

@@ -17,9 +17,10 @@ from ssad.scenarios.static.digital.victim import Through, Victim
 
 
 class _OverDraws(Victim):
-    """A victim whose loss is the mean over draws of a random defence."""
+    """Victim whose loss is the mean over draws of a random defence."""
 
     def __init__(self, victim: Victim, defence: RandomResize, draws: Sequence[Through]) -> None:
+        # Share the state of the victim: building a new one would repeat its target assignment.
         self.__dict__.update(vars(victim))
         bare = victim.detector
         if isinstance(bare, Defended) and bare.defence == defence:
@@ -33,24 +34,24 @@ class _OverDraws(Victim):
             self.parts.append(part)
 
     def loss(self, images: Tensor) -> Tensor:
-        return torch.stack([part.loss(images) for part in self.parts]).mean(0)
+        return torch.stack([draw_victim.loss(images) for draw_victim in self.parts]).mean(0)
 
     def gradient(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        losses, gradients = zip(*(part.gradient(images) for part in self.parts), strict=True)
+        losses, gradients = zip(*(draw_victim.gradient(images) for draw_victim in self.parts), strict=True)
         return torch.stack(losses).mean(0), torch.stack(gradients).mean(0)
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """An attack that knows a random defence but not its draw: it ascends the mean loss over draws of its own.
+    """Attack that knows a random defence but not its draw: it ascends the mean loss over draws of its own.
 
-    The defence may stand before the detector (`Defended`, or `through`) or not: the attack puts its draws in its place.
-    They are the same at all steps, so that losses can be compared; each question costs as many as there are draws.
+    The defence may stand before the detector (`Defended` or `through`) or not: the attack substitutes its own draws.
+    They are the same at all steps, so that losses are comparable; each query costs as many as there are draws.
 
     Attributes:
-        inner: the attack.
-        defence: the random defence.
-        draws: how many.
+        inner: Attack.
+        defence: Random defence.
+        draws: Number of draws.
 
     Raises:
         ConfigError: No draws; later: the victim's `through` is another defence.
@@ -68,17 +69,17 @@ class Expected:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
         return f"{self.inner.name}-over-{self.defence.name}"
 
     @property
     def access(self) -> Access:
-        """That of the inner attack."""
+        """Access of the inner attack."""
         return self.inner.access
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`."""
+        """Run the inner attack on the mean loss over the draws."""
         if victim.through is not None and victim.through != self.defence:
             raise ConfigError(f"{self.name}: the pictures pass another defence on their way to the detector")
-        draws = [self.defence.drawn(number) for number in range(self.draws)]
+        draws = [self.defence.drawn(draw_index) for draw_index in range(self.draws)]
         return self.inner.perturb(_OverDraws(victim, self.defence, draws), budget)

@@ -1,4 +1,4 @@
-"""The fast gradient sign method: one step, as long as the budget."""
+"""Fast gradient sign method: one step of the length of the budget."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ssad.scenarios.static.digital.victim import Victim
 
 @dataclass(frozen=True, slots=True)
 class FGSM:
-    """One step of the size of the budget along the steepest direction.
+    """Single step of the length of the budget along the steepest direction.
 
     Source: Goodfellow et al., Explaining and Harnessing Adversarial Examples (ICLR 2015).
     """
@@ -22,6 +22,6 @@ class FGSM:
     access: Access = "white-box"
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`."""
+        """Take one step from the clean images."""
         _, gradient = victim.gradient(victim.clean)
         return budget.ascend(victim.clean, gradient, victim.clean, budget.radius)

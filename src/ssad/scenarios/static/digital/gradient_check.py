@@ -1,4 +1,4 @@
-"""Before a white-box attack: is the gradient that it will follow the gradient of its loss?"""
+"""Check before a white-box attack: the gradient that it follows must be the gradient of its loss."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ COARSE = 0.05  # the same for a detector that computes in float32 only
 def check_gradient(victim: Victim) -> float:
     """Compare the slope along the gradient of each image's loss with central finite differences.
 
-    A detector that is a module, or one behind a defence, is copied and asked in float64, so that a step may be small
-    enough not to cross the kinks of its activations; any other is asked as it is, with a larger step. A defence that
-    rounds or draws is left out.
+    A detector that is a module, or one behind a defence, is copied to float64, so that a step may be small enough not
+    to cross the kinks of its activations; any other is queried as it is, with a larger step. A defence that rounds or
+    draws is left out.
 
     Args:
-        victim: What will be attacked; its costs do not count.
+        victim: Victim of the attack; the check does not count towards its costs.
 
     Returns:
         The largest relative error over the images; losses whose target is detached, as in the source of YOLOv5, are
         known to differ by up to a fifth.
 
     Raises:
-        ConfigError: There is no gradient, or it is further from the truth than half its length: of the wrong sign, cut
-            off from a part of the detector, or masked.
+        ConfigError: There is no gradient, or its error exceeds half its length: it has the wrong sign, is cut off
+            from a part of the detector, or masked.
     """
     error = _error(victim)
     if error > WRONG:
@@ -47,38 +47,40 @@ def check_gradient(victim: Victim) -> float:
 
 def _error(victim: Victim) -> float:
     victim = _without_stairs(victim)
-    exact = _doubled(victim.detector)
-    asked = victim if exact is None else _in_double(victim, exact)
-    step = COARSE if exact is None else STEP
-    _, gradient = asked.gradient(asked.clean)
-    size = gradient.flatten(1).norm(dim=1)
-    some = (size > 0) & ~victim.idle
-    if not bool(some.any()):
+    double_detector = _doubled(victim.detector)
+    checked_victim = victim if double_detector is None else _in_double(victim, double_detector)
+    step = COARSE if double_detector is None else STEP
+    _, gradient = checked_victim.gradient(checked_victim.clean)
+    slope = gradient.flatten(1).norm(dim=1)
+    is_checked = (slope > 0) & ~victim.idle
+    if not bool(is_checked.any()):
         raise ConfigError(
             f"the gradient of loss '{victim.objective.name}' of {victim.detector.name} is 0 everywhere: it is cut off, "
             "or the loss is flat at the clean images"
         )
-    direction = gradient / size.clamp_min(1e-30)[:, None, None, None]
-    rise = asked.loss(asked.clean + step * direction) - asked.loss(asked.clean - step * direction)
-    wrong = (rise / (2 * step) - size).abs() / size.clamp_min(1e-30)
-    return float(wrong[some].max())
+    direction = gradient / slope.clamp_min(1e-30)[:, None, None, None]
+    loss_difference = checked_victim.loss(checked_victim.clean + step * direction) - checked_victim.loss(
+        checked_victim.clean - step * direction
+    )
+    relative_error = (loss_difference / (2 * step) - slope).abs() / slope.clamp_min(1e-30)
+    return float(relative_error[is_checked].max())
 
 
 def _without_stairs(victim: Victim) -> Victim:
-    """Without a defence that is not smooth: finite differences say nothing about the slope across its stairs."""
-    found = copy.copy(victim)
-    found.cost, found.precision = copy.copy(victim.cost), "float32"
+    """Remove a defence that is not smooth: finite differences do not measure its slope."""
+    smooth_victim = copy.copy(victim)
+    smooth_victim.cost, smooth_victim.precision = copy.copy(victim.cost), "float32"
     if not getattr(victim.through, "smooth", True):
-        found.through = None
+        smooth_victim.through = None
     if not getattr(getattr(victim.detector, "defence", None), "smooth", True):
-        bare: Any = victim.detector
-        found.detector = bare.detector
-        found.situation = replace(victim.situation, detector=bare.detector)
-    return found
+        defended: Any = victim.detector
+        smooth_victim.detector = defended.detector
+        smooth_victim.situation = replace(victim.situation, detector=defended.detector)
+    return smooth_victim
 
 
 def _doubled(detector: Any) -> Any:
-    """A copy of a detector in float64, behind its defence if it has one; None if it is no module."""
+    """Copy a detector to float64, behind its defence if it has one; None if it is no module."""
     if isinstance(detector, Defended):
         inner = _doubled(detector.detector)
         return None if inner is None else Defended(inner, detector.defence)
@@ -86,21 +88,21 @@ def _doubled(detector: Any) -> Any:
 
 
 def _in_double(victim: Victim, detector: Any) -> Victim:
-    """The same questions to a copy of the detector in float64."""
-    found = copy.copy(victim)
-    found.detector = detector
-    found.clean = victim.clean.double()
-    found.intrinsic = None if victim.intrinsic is None else victim.intrinsic.double()
-    found.cost = copy.copy(victim.cost)
-    frozen = victim.situation.assignment
+    """Return the victim with a float64 copy of the detector and float64 inputs."""
+    double_victim = copy.copy(victim)
+    double_victim.detector = detector
+    double_victim.clean = victim.clean.double()
+    double_victim.intrinsic = None if victim.intrinsic is None else victim.intrinsic.double()
+    double_victim.cost = copy.copy(victim.cost)
+    original = victim.situation.assignment
     assignment = Assignment(
-        frozen.label,
-        frozen.owner,
-        tuple(_double(one) for one in frozen.truth),
-        {name: _wide(value) for name, value in frozen.extra.items()},
+        original.label,
+        original.owner,
+        tuple(_double(image_truth) for image_truth in original.truth),
+        {name: _wide(value) for name, value in original.extra.items()},
     )
-    found.situation = type(victim.situation)(detector, assignment, victim.situation.aim)
-    return found
+    double_victim.situation = type(victim.situation)(detector, assignment, victim.situation.aim)
+    return double_victim
 
 
 def _wide(value: Tensor) -> Tensor:
@@ -113,5 +115,5 @@ def _double(truth: Truth) -> Truth:
         solid = Solids(
             _wide(solid.centre), _wide(solid.size_lhw), _wide(solid.yaw), _wide(solid.velocity), solid.attribute
         )
-    lens = None if truth.intrinsic is None else _wide(truth.intrinsic)
-    return Truth(truth.label, _wide(truth.box), solid, lens, truth.crowd)
+    intrinsic = None if truth.intrinsic is None else _wide(truth.intrinsic)
+    return Truth(truth.label, _wide(truth.box), solid, intrinsic, truth.crowd)

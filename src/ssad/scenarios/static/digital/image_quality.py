@@ -1,4 +1,4 @@
-"""How much of one picture a detector still gets right: what an ensemble of attacks compares, from boxes alone."""
+"""Quality of the detections in a single image, computed from boxes alone; ensembles of attacks compare it."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ MOST = 100  # best detections of a class that are looked at in 2D, as COCO does
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """What is left of one picture.
+    """Detection quality of one image.
 
     Attributes:
-        value: in [0, 1], the mean over the classes that are there of their average precision; in a picture without
-            objects 1 if nothing is found, else 0.
-        noise: the sum of the scores of false detections less that of the right ones: of pictures of equal value, the
-            one with more of it hurts the precision of a whole set more.
+        value: Mean average precision over the classes present, in [0, 1]; in an image without objects 1 if nothing is
+            detected, else 0.
+        noise: Sum of the scores of false detections minus that of the correct ones. Among images of equal value, the
+            one with more noise lowers the precision of a whole set more.
     """
 
     value: float
@@ -40,7 +40,7 @@ class Quality:
 
     @property
     def order(self) -> tuple[float, float]:
-        """Least first is worst first."""
+        """Sort key: the smallest is the worst for the detector."""
         return self.value, -self.noise
 
 
@@ -67,51 +67,58 @@ def image_quality(
     """
     rank = found.score.argsort(descending=True, stable=True)
     score, label = _array(found.score[rank]), _whole(found.label[rank])
-    real = _whole(truth.label)
-    crowd = np.zeros(len(real), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
-    many = max([classes or 0, *(label + 1), *(real + 1)])
+    truth_label = _whole(truth.label)
+    crowd = np.zeros(len(truth_label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
+    class_count = max([classes or 0, *(label + 1), *(truth_label + 1)])
     if task == "2d":
-        matched = match_2d(
-            Boxes2D(np.zeros(len(real), np.int32), real.astype(np.int32), _array(truth.box), ignore=crowd),
+        matches = match_2d(
+            Boxes2D(
+                np.zeros(len(truth_label), np.int32), truth_label.astype(np.int32), _array(truth.box), ignore=crowd
+            ),
             Boxes2D(np.zeros(len(label), np.int32), label.astype(np.int32), _array(found.box[rank]), score),
-            labels=many,
+            labels=class_count,
             threshold=IOU,
             max_detections=MOST,
         )
-        # it orders equal scores by class; sums over all of a kind do not mind
+        # `match_2d` orders equal scores by class, which sums do not depend on
         score = np.sort(_best(score, label))[::-1]
     else:
-        matched = _match_3d(
-            _plane(found.solid)[rank.cpu().numpy()], label, _plane(truth.solid), real, crowd=crowd, classes=many
+        matches = _match_3d(
+            _plane(found.solid)[rank.cpu().numpy()],
+            label,
+            _plane(truth.solid),
+            truth_label,
+            crowd=crowd,
+            classes=class_count,
         )
-    precision = matched.average_precision()
-    hit, wrong = matched.hit, ~matched.hit & ~matched.ignored
+    precision = matches.average_precision()
+    correct, wrong = matches.hit, ~matches.hit & ~matches.ignored
     # rounded, so that pictures of equal quality are equal to the last digit
-    value = round(float(np.nanmean(precision)), 9) if matched.truth.any() else float(not wrong.any())
-    return Quality(value, float(score[wrong].sum() - score[hit].sum()))
+    value = round(float(np.nanmean(precision)), 9) if matches.truth.any() else float(not wrong.any())
+    return Quality(value, float(score[wrong].sum() - score[correct].sum()))
 
 
 def of_aim(truth: Truth, aim: Aim, classes: Sequence[str]) -> Truth:
-    """The truth with every object as crowd that is not under attack.
+    """Return the truth with every object that is not under attack marked as crowd.
 
     Args:
-        truth: What is in an image.
-        aim: Which objects are attacked.
+        truth: Ground truth of an image.
+        aim: Objects under attack.
         classes: Names of the labels.
     """
     if aim.everything:
         return truth
     names = list(aim.becomes) if aim.becomes else aim.classes
     crowd = torch.zeros(len(truth.label), dtype=torch.bool) if truth.crowd is None else truth.crowd.clone().cpu()
-    for k, label in enumerate(truth.label.tolist()):
-        wanted = names is None or classes[label] in names
-        crowd[k] |= not (wanted and (aim.objects is None or k in aim.objects))
+    for index, label in enumerate(truth.label.tolist()):
+        is_class_attacked = names is None or classes[label] in names
+        crowd[index] |= not (is_class_attacked and (aim.objects is None or index in aim.objects))
     return replace(truth, crowd=crowd.to(truth.label.device))
 
 
 def _best(score: F64, label: I64) -> F64:
     """Scores of the best detections of each class, as many as are looked at."""
-    return np.concatenate([score[:0], *(score[label == one][:MOST] for one in np.unique(label))])
+    return np.concatenate([score[:0], *(score[label == class_label][:MOST] for class_label in np.unique(label))])
 
 
 def _match_3d(
@@ -119,14 +126,21 @@ def _match_3d(
 ) -> Matched2D:
     """Matches of detections at places [N, 2], best first, with objects at places [Q, 2]."""
     distance = np.sqrt(((found[:, None] - centre[None]) ** 2).sum(-1))
-    near = (distance < METRES) & (label[:, None] == real[None])
-    pred, box = np.nonzero(near & ~crowd[None])
-    order = np.lexsort((box, distance[pred, box], pred))
-    ((took, _),) = assign(pred[order], box[order], distance[pred, box][order], boxes=len(real), thresholds=(np.inf,))
-    hit = np.zeros(len(found), np.bool_)
-    hit[took] = True
-    ignored = (near & crowd[None]).any(1)
-    return Matched2D(label.astype(np.int32), hit, ignored & ~hit, np.bincount(real[~crowd], minlength=classes))
+    is_close = (distance < METRES) & (label[:, None] == real[None])
+    detection_index, object_index = np.nonzero(is_close & ~crowd[None])
+    # Detections come best first, so the primary key is the detection, then the distance.
+    order = np.lexsort((object_index, distance[detection_index, object_index], detection_index))
+    ((matched, _),) = assign(
+        detection_index[order],
+        object_index[order],
+        distance[detection_index, object_index][order],
+        boxes=len(real),
+        thresholds=(np.inf,),
+    )
+    correct = np.zeros(len(found), np.bool_)
+    correct[matched] = True
+    ignored = (is_close & crowd[None]).any(1)
+    return Matched2D(label.astype(np.int32), correct, ignored & ~correct, np.bincount(real[~crowd], minlength=classes))
 
 
 def _plane(solid: Solids | None) -> F64:
@@ -136,10 +150,10 @@ def _plane(solid: Solids | None) -> F64:
 
 
 def _array(values: Tensor) -> F64:
-    found: F64 = values.detach().double().cpu().numpy()
-    return found
+    array: F64 = values.detach().double().cpu().numpy()
+    return array
 
 
 def _whole(values: Tensor) -> I64:
-    found: I64 = values.detach().long().cpu().numpy()
-    return found
+    array: I64 = values.detach().long().cpu().numpy()
+    return array

@@ -1,6 +1,6 @@
-"""Digital attacks on the pictures that a driver gets, at every step of the loop (`ssad.core.driving.Perturbation`).
+"""Digital attacks on the camera images of a driver in the loop (`ssad.core.driving.Perturbation`).
 
-Nobody tells the attacker what is there: he takes what the detector finds in the clean picture for the truth.
+The attacker has no ground truth: it uses the detections in the clean image instead.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ SURE = 0.3  # least score of what is taken for an object
 
 @dataclass(slots=True)
 class Spent:
-    """What an attack took so far.
+    """Cumulative cost of an attack.
 
     Attributes:
-        images: Pictures that were attacked.
-        gradients: Forward and backward passes, over all pictures.
-        queries: Forward passes alone, likewise.
-        gradient_error: Of the gradient against finite differences, on the first pictures with an object in them; None:
-            not looked at yet.
+        images: Attacked images.
+        gradients: Forward and backward passes over all images.
+        queries: Forward passes without a gradient over all images.
+        gradient_error: Error of the gradient against finite differences, on the first images with an object; None:
+            not checked yet.
     """
 
     images: int = 0
@@ -47,23 +47,23 @@ class Spent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveAttack:
-    """A `Perturbation`: every picture is attacked by itself, and its 8-bit round trip is handed on.
+    """Perturbation that attacks every image by itself and returns it after an 8-bit round trip.
 
-    `Universal` and `RandomNoise` ask no detector anything, so they cost next to nothing. Every other attack costs what
-    its constructor says, such as `make_attack("pgd", steps=2)`, for each picture, and three queries besides: for what
-    is there, and for the loss before and after.
+    `Universal` and `RandomNoise` do not query a detector, so they cost next to nothing. Every other attack costs what
+    its constructor says, such as `make_attack("pgd", steps=2)`, for each image, and three more queries: one for the
+    pseudo ground truth and two for the loss before and after.
 
     Attributes:
-        attack: The method.
-        budget: How far a picture may be moved.
-        objective: The loss to ascend, or its name.
-        aim: Which objects are attacked; numbers of objects count what the detector finds, best first.
-        detector: What is attacked; None: the victim, if it is a detector, or else its attribute `detector`. To attack
-            another one than the driver's is a transfer attack.
-        intrinsic: Camera matrix [3, 3] of the pictures, for 3D. A driver with several cameras needs an attack for each:
-            `rollout` takes a mapping from names of sensors.
-        batch: Pictures at once; it changes no result.
-        spent: What was asked so far.
+        attack: Attack method.
+        budget: Maximum change of an image.
+        objective: Loss to ascend, or its name.
+        aim: Objects under attack; object indices count the detections, best first.
+        detector: Detector under attack; None: the victim, if it is a detector, else its attribute `detector`. Another
+            detector than the driver's makes it a transfer attack.
+        intrinsic: Camera matrix [3, 3] of the images, for 3D. A driver with several cameras needs one attack for
+            each: `rollout` takes a mapping from sensor names.
+        batch: Images per batch; it does not affect the result.
+        spent: Cumulative cost.
 
     Raises:
         UnknownNameError: There is no such loss.
@@ -83,77 +83,78 @@ class LiveAttack:
             make_objective(self.objective)
 
     def apply(self, frames: Frames, victim: Any, truth: Any, generators: Generators) -> Frames:
-        """Attack pictures; black ones, of episodes that have ended, are left alone.
+        """Attack images; black images of episodes that have ended are left unchanged.
 
         Args:
             frames: uint8 [N, 3, H, W], RGB.
-            victim: Whose pictures these are.
-            truth: Not looked at, unless it is a list of N `Truth` with labels of the detector.
-            generators: One for each picture.
+            victim: Driver or detector that receives the images.
+            truth: Ignored, unless it is a list of N `Truth` with labels of the detector.
+            generators: One for each image.
 
         Returns:
             uint8 [N, 3, H, W].
 
         Raises:
-            ConfigError: Frames of another kind; there is no detector; see `run_attack`.
+            ConfigError: The frames have another shape or type, or there is no detector; see `run_attack`.
         """
         if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[1] != 3 or len(frames) != len(generators):
             raise ConfigError(
                 f"attack {self.attack.name}: it takes pictures uint8 [N, 3, H, W] and as many generators, not "
                 f"{frames.dtype} {list(frames.shape)} and {len(generators)}"
             )
-        keys = [(int(one.integers(1 << 62)),) for one in generators]
-        found = frames.copy()
-        lit = np.flatnonzero(frames.any(axis=(1, 2, 3)))
-        for k in range(0, len(lit), max(self.batch, 1)):
-            rows = lit[k : k + max(self.batch, 1)]
-            told = [truth[row] for row in rows] if _is_truth(truth, len(frames)) else None
-            found[rows] = self._some(frames[rows], victim, told, [keys[row] for row in rows])
-        self.spent.images += len(lit)
-        return found
+        # Keys are drawn before batching, so that the batch size does not affect the result.
+        keys = [(int(random_generator.integers(1 << 62)),) for random_generator in generators]
+        attacked = frames.copy()
+        active_rows = np.flatnonzero(frames.any(axis=(1, 2, 3)))
+        for start in range(0, len(active_rows), max(self.batch, 1)):
+            rows = active_rows[start : start + max(self.batch, 1)]
+            rows_truth = [truth[row_index] for row_index in rows] if _is_truth(truth, len(frames)) else None
+            attacked[rows] = self._some(frames[rows], victim, rows_truth, [keys[row_index] for row_index in rows])
+        self.spent.images += len(active_rows)
+        return attacked
 
     def _some(
         self, frames: Frames, victim: Any, truth: Sequence[Truth] | None, keys: Sequence[tuple[object, ...]]
     ) -> Frames:
-        """Some pictures at once."""
+        """Attack one batch of images."""
         if isinstance(self.attack, Universal | RandomNoise):
             images = torch.from_numpy(frames).float() / LEVELS
-            asked = Pictures(images, keys)
-            return quantise(self.attack.perturb(asked, self.budget), codes_of(images), self.budget).numpy()
+            clean_images = Pictures(images, keys)
+            return quantise(self.attack.perturb(clean_images, self.budget), codes_of(images), self.budget).numpy()
         detector = attacked_detector(victim) if self.detector is None else self.detector
         device = _device_of(detector)
         images = torch.from_numpy(frames).to(device).float() / LEVELS
-        lens = None
+        intrinsics = None
         if detector.task == "3d":
             if self.intrinsic is None:
                 raise ConfigError(f"attack {self.attack.name}: {detector.name} finds 3D boxes; give the intrinsic")
-            lens = torch.as_tensor(np.asarray(self.intrinsic), dtype=torch.float32, device=device)
-            lens = lens.expand(len(images), 3, 3).contiguous()
+            intrinsics = torch.as_tensor(np.asarray(self.intrinsic), dtype=torch.float32, device=device)
+            intrinsics = intrinsics.expand(len(images), 3, 3).contiguous()
         if truth is None:
-            truth = own_truth(detector, images, lens)
+            truth = own_truth(detector, images, intrinsics)
             self.spent.queries += len(images)
-        # once, and where there is something to attack: elsewhere a sound loss may be flat
-        unknown = self.spent.gradient_error is None and any(len(one.label) for one in truth)
+        # check once, on images with an object: without one a correct loss may be flat
+        check_needed = self.spent.gradient_error is None and any(len(image_truth.label) for image_truth in truth)
         try:
-            done = run_attack(
+            result = run_attack(
                 self.attack,
                 detector,
                 images,
                 truth,
                 self.budget,
                 objective=self.objective,
-                intrinsic=lens,
+                intrinsic=intrinsics,
                 aim=self.aim,
                 keys=keys,
-                check=unknown,
+                check=check_needed,
             )
         except NothingToAttackError:
             return frames
-        if done.gradient_error is not None:
-            self.spent.gradient_error = done.gradient_error
-        self.spent.gradients += len(images) * done.cost.gradients
-        self.spent.queries += len(images) * (done.cost.queries + 2)
-        return (done.images * LEVELS).round().to(torch.uint8).cpu().numpy()
+        if result.gradient_error is not None:
+            self.spent.gradient_error = result.gradient_error
+        self.spent.gradients += len(images) * result.cost.gradients
+        self.spent.queries += len(images) * (result.cost.queries + 2)
+        return (result.images * LEVELS).round().to(torch.uint8).cpu().numpy()
 
 
 def own_truth(
@@ -168,9 +169,12 @@ def own_truth(
         least: Least score of what is taken for an object.
     """
     with steady(detector), torch.no_grad():
-        found = detector.predict(images, intrinsic, threshold=least)
-    lenses: list[Tensor | None] = [None] * len(found) if intrinsic is None else list(intrinsic.cpu())
-    return [_as_truth(one, lens) for one, lens in zip(found, lenses, strict=True)]
+        detections = detector.predict(images, intrinsic, threshold=least)
+    intrinsics: list[Tensor | None] = [None] * len(detections) if intrinsic is None else list(intrinsic.cpu())
+    return [
+        _as_truth(image_detections, image_intrinsic)
+        for image_detections, image_intrinsic in zip(detections, intrinsics, strict=True)
+    ]
 
 
 def _as_truth(found: Detections, intrinsic: Tensor | None) -> Truth:
@@ -188,16 +192,16 @@ def _as_truth(found: Detections, intrinsic: Tensor | None) -> Truth:
 
 
 def attacked_detector(victim: Any) -> Detector:
-    """The victim itself if it is a detector, or else the detector that it has.
+    """Return the victim itself if it is a detector, else its attribute `detector`.
 
     Raises:
         ConfigError: There is none.
     """
-    found: Any = victim if callable(getattr(victim, "dense", None)) else getattr(victim, "detector", None)
-    if not callable(getattr(found, "dense", None)):
+    candidate: Any = victim if callable(getattr(victim, "dense", None)) else getattr(victim, "detector", None)
+    if not callable(getattr(candidate, "dense", None)):
         name = getattr(victim, "name", type(victim).__name__)
         raise ConfigError(f"{name} has no detector to attack: it must have an attribute detector, or be given one")
-    detector: Detector = found
+    detector: Detector = candidate
     return detector
 
 
@@ -209,4 +213,8 @@ def _device_of(detector: Any) -> torch.device:
 
 
 def _is_truth(truth: Any, count: int) -> bool:
-    return isinstance(truth, Sequence) and len(truth) == count and all(isinstance(one, Truth) for one in truth)
+    return (
+        isinstance(truth, Sequence)
+        and len(truth) == count
+        and all(isinstance(image_truth, Truth) for image_truth in truth)
+    )

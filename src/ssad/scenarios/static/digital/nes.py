@@ -1,4 +1,4 @@
-"""Gradients estimated from losses alone, by pairs of probes on either side, followed as PGD follows true ones."""
+"""Gradient estimates from losses alone, by antithetic pairs of probes, followed in the same way as by PGD."""
 
 from __future__ import annotations
 
@@ -19,24 +19,26 @@ from ssad.scenarios.static.digital.victim import Victim, draw
 class NES:
     """Natural evolution strategies: the mean over random directions of the loss's slope along each, times it.
 
-    Attributes:
-        steps: of the ascent.
-        samples: pairs of probes for each step's estimate; each pair costs two queries.
-        sigma: how far probes lie from the image, for each value, in [0, 1].
-        step: length of the first step as a share of the radius; None: the rule of `PGD`; steps shrink as there.
-        decay: of the sum of the estimates of earlier steps: it is what averages their noise.
-        directions: "gaussian" (NES), or "signs": every value by `sigma` up or down (SPSA).
-        tile: side of the squares over which a direction is constant. A picture has a million values, and a few dozen
-            probes say next to nothing about so many; neighbours have similar slopes, so squares lose little.
+    The ascent starts at the clean image; the best image of all steps is kept. It takes (2 samples + 1) queries for
+    each step, and one more.
 
-    The ascent starts at the clean image; the best image met is kept. Queries: (2 samples + 1) for each step, and one.
+    Attributes:
+        steps: Ascent steps.
+        samples: Pairs of probes for the estimate of each step; each pair costs two queries.
+        sigma: Distance of the probes from the image, for each value, in [0, 1].
+        step: Length of the first step as a share of the radius; None: the rule of `PGD`; steps shrink in the same
+            way.
+        decay: Decay of the sum of earlier estimates, which averages their noise.
+        directions: "gaussian" (NES), or "signs": every value by `sigma` up or down (SPSA).
+        tile: Side of the squares over which a direction is constant. An image has a million values, about which a few
+            dozen probes say next to nothing; neighbours have similar slopes, so squares lose little.
 
     Raises:
         ConfigError: No step or sample, a sigma or step of 0 or less, a decay below 0.
 
     Source: Ilyas et al., Black-box Adversarial Attacks with Limited Queries and Information (ICML 2018), with its
-    antithetic draws and momentum. Tiles: Ilyas et al., Prior Convictions (ICLR 2019), section 3.1. SPSA: Uesato et al.,
-    Adversarial Risk and the Dangers of Evaluating Against Weak Attacks (ICML 2018).
+    antithetic draws and momentum. Tiles: Ilyas et al., Prior Convictions (ICLR 2019), section 3.1. SPSA: Uesato et
+    al., Adversarial Risk and the Dangers of Evaluating Against Weak Attacks (ICML 2018).
     """
 
     steps: int = 20
@@ -60,14 +62,14 @@ class NES:
             raise ConfigError(f"{self.name}: directions '{self.directions}'; choose gaussian or signs")
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`."""
-        rule = PGD(self.steps, step=self.step)
+        """Ascend along estimated gradients."""
+        schedule = PGD(self.steps, step=self.step)
         images = victim.clean
         best = images, victim.loss(images).float()
         estimate = torch.zeros_like(images)
-        for k in range(self.steps):
-            estimate = self.decay * estimate + self.estimate(victim, images, k)
-            images = budget.ascend(images, estimate, victim.clean, budget.radius * rule.share(k))
+        for step_index in range(self.steps):
+            estimate = self.decay * estimate + self.estimate(victim, images, step_index)
+            images = budget.ascend(images, estimate, victim.clean, budget.radius * schedule.share(step_index))
             best = keep_best(best, images, victim.loss(images).float())
         return best[0]
 
@@ -80,35 +82,32 @@ class NES:
             use: Which estimate it is: others draw other directions.
         """
         total = torch.zeros_like(images)
-        for j in range(self.samples):
-            direction = self._direction(victim, use, j)
+        for sample_index in range(self.samples):
+            direction = self._direction(victim, use, sample_index)
             if self.directions == "signs":
                 direction = torch.where(direction < 0, -1.0, 1.0).to(images)
-            rise = victim.loss((images + self.sigma * direction).clamp(0.0, 1.0))
-            rise = rise - victim.loss((images - self.sigma * direction).clamp(0.0, 1.0))
-            total += rise.to(images)[:, None, None, None] * direction
+            loss_difference = victim.loss((images + self.sigma * direction).clamp(0.0, 1.0))
+            loss_difference = loss_difference - victim.loss((images - self.sigma * direction).clamp(0.0, 1.0))
+            total += loss_difference.to(images)[:, None, None, None] * direction
         return total / (2 * self.sigma * self.samples)
 
     def _direction(self, victim: Victim, *use: object) -> Tensor:
         """A normal direction [B, 3, H, W], constant over tiles."""
-        few = draw(victim.clean[:, :, :: self.tile, :: self.tile], victim.keys, "gaussian", self.name, *use)
+        coarse = draw(victim.clean[:, :, :: self.tile, :: self.tile], victim.keys, "gaussian", self.name, *use)
         height, width = victim.clean.shape[2:]
-        return few.repeat_interleave(self.tile, 2).repeat_interleave(self.tile, 3)[:, :, :height, :width]
+        return coarse.repeat_interleave(self.tile, 2).repeat_interleave(self.tile, 3)[:, :, :height, :width]
 
 
 def spsa(
     *, steps: int = 20, samples: int = 25, delta: float = px(1), step: float | None = None, decay: float = 0.9
 ) -> NES:
-    """Simultaneous perturbation stochastic approximation: `NES` with directions of signs.
+    """Return simultaneous perturbation stochastic approximation: `NES` with directions of signs.
 
     Args:
-        steps: Of the ascent.
-        samples: Pairs of probes for each step's estimate.
-        delta: How far each value of a probe lies from the image's.
+        steps: Ascent steps.
+        samples: Pairs of probes for the estimate of each step.
+        delta: Distance of the probes from the image, for each value.
         step: Length of the first step as a share of the radius.
-        decay: Of the sum of earlier estimates.
-
-    Returns:
-        The attack.
+        decay: Decay of the sum of earlier estimates.
     """
     return NES(steps, samples, sigma=delta, step=step, decay=decay, directions="signs", name="spsa")

@@ -1,4 +1,4 @@
-"""Random noise of the size of the budget: the control that stands beside every attack."""
+"""Random noise of the size of the budget: the control for every attack."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ssad.scenarios.static.digital.victim import Pictures, Victim
 
 @dataclass(frozen=True, slots=True)
 class RandomNoise:
-    """Random noise as large as any attack within the budget, without asking the detector anything.
+    """Random noise as large as the budget allows, without queries.
 
     Under L-infinity each value moves up or down by the radius; under L2 the image moves by the radius in a random
     direction.
@@ -24,7 +24,7 @@ class RandomNoise:
     access: Access = "none"
 
     def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
-        """See `Attack`."""
+        """Add random noise of the size of the budget."""
         draws = victim.draw("gaussian", "noise")
         change = draws.sign() if budget.norm == "linf" else budget.steepest(draws)
         return budget.project(victim.clean + budget.radius * torch.where(change == 0, 1.0, change), victim.clean)

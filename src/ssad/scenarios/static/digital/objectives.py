@@ -1,8 +1,8 @@
-"""What an attack ascends: losses on the dense outputs, one value an image, with the target assignment frozen.
+"""Losses that attacks ascend: functions of the dense outputs, one value per image, with a frozen assignment.
 
-None of them looks at boxes that survived suppression: a suppressed box has no gradient, and with no box left the attack
-would stop. Which loss is ascended decides what an attack does: the training losses fill a picture with false boxes,
-`vanish` and `margin` empty it.
+None of them uses boxes that survived suppression: a suppressed box has no gradient, and with no box left the attack
+would stop. The loss decides the effect of an attack: the training losses fill an image with false boxes, `vanish` and
+`margin` empty it.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ TERMS: Mapping[str, frozenset[str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """Which objects an attack is about, and what they should be taken for.
+    """Objects under attack, and the classes that they should be mistaken for.
 
     Attributes:
-        classes: Names of the classes that are attacked; None: all.
-        objects: Indices of the objects that are attacked, in the truth of each image; None: all.
-        becomes: Name of a class -> name of the class that it should be taken for; objects of other classes are left
-            alone. Used by `mislabel`; empty: whichever wrong class is nearest.
+        classes: Names of the attacked classes; None: all.
+        objects: Indices of the attacked objects in the truth of each image; None: all.
+        becomes: Map from a class to the class that it should be mistaken for; objects of other classes are not
+            attacked. Used by `mislabel`; empty: the nearest wrong class.
     """
 
     classes: tuple[str, ...] | None = None
@@ -61,23 +61,23 @@ class Aim:
     becomes: Mapping[str, str] = field(default_factory=dict)
 
     def places(self, detector: Detector, assignment: Assignment) -> Tensor:
-        """Locations [B, P] that are assigned to an object under attack.
+        """Return a mask [B, P] of the locations that are assigned to an object under attack.
 
         Raises:
-            ConfigError: A class that the detector does not know.
+            ConfigError: The detector does not know one of the classes.
         """
-        chosen = assignment.label >= 0
+        is_attacked = assignment.label >= 0
         names = list(self.becomes) if self.becomes else self.classes
         if names is not None:
-            wanted = [_index(detector, name) for name in names]
-            chosen &= torch.isin(assignment.label, torch.tensor(wanted, device=chosen.device))
+            class_indices = [_index(detector, name) for name in names]
+            is_attacked &= torch.isin(assignment.label, torch.tensor(class_indices, device=is_attacked.device))
         if self.objects is not None:
-            chosen &= torch.isin(assignment.owner, torch.tensor(self.objects, device=chosen.device))
-        return chosen
+            is_attacked &= torch.isin(assignment.owner, torch.tensor(self.objects, device=is_attacked.device))
+        return is_attacked
 
     @property
     def everything(self) -> bool:
-        """Whether all objects are under attack, whatever they become."""
+        """True if all objects are under attack and no target class is given."""
         return self.classes is None and self.objects is None and not self.becomes
 
 
@@ -86,7 +86,7 @@ EVERYTHING = Aim()
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What an objective is told besides the dense outputs: the detector, its frozen assignment, the aim."""
+    """Inputs of an objective besides the dense outputs: the detector, its frozen assignment and the aim."""
 
     detector: Detector
     assignment: Assignment
@@ -94,31 +94,31 @@ class Situation:
 
 
 class Objective(Protocol):
-    """A loss to ascend.
+    """Loss to ascend.
 
     Attributes:
-        name: What records call it.
-        needs_objects: Whether an image without objects under attack has nothing to ascend.
+        name: Name in records.
+        needs_objects: True if an image without objects under attack has nothing to ascend.
     """
 
     @property
     def name(self) -> str:
-        """What records call it."""
+        """Name in records."""
 
     @property
     def needs_objects(self) -> bool:
-        """Whether an image without objects under attack has nothing to ascend."""
+        """True if an image without objects under attack has nothing to ascend."""
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
-        """[B] one value an image, differentiable, higher where the detector does worse."""
+        """Return one differentiable value per image [B], higher where the detector does worse."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingLosses:
-    """The detector's own training losses, or those about one thing; of all objects, as the source sums them.
+    """Training losses of the detector, or a group of them, over all objects, summed as in its source.
 
     Raises:
-        ConfigError: The aim is at some objects only; or the detector has no such loss.
+        ConfigError: The aim selects some objects only, or the detector has no such loss.
     """
 
     name: str
@@ -126,23 +126,23 @@ class TrainingLosses:
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
-        """See `Objective`."""
+        """Return the sum of the selected training losses of each image."""
         if not situation.aim.everything:
             raise ConfigError(f"loss '{self.name}' is of all objects; for some of them use vanish, margin or mislabel")
-        found = situation.detector.losses(dense, situation.assignment, reduction="image")
-        chosen = [value for name, value in found.items() if self.terms is None or name in self.terms]
-        if not chosen:
+        losses = situation.detector.losses(dense, situation.assignment, reduction="image")
+        selected_losses = [value for name, value in losses.items() if self.terms is None or name in self.terms]
+        if not selected_losses:
             raise ConfigError(
-                f"{situation.detector.name} has no loss of {self.name}; its losses are {', '.join(found)}"
+                f"{situation.detector.name} has no loss of {self.name}; its losses are {', '.join(losses)}"
             )
-        return torch.stack(chosen).sum(0)
+        return torch.stack(selected_losses).sum(0)
 
 
 @dataclass(frozen=True, slots=True)
 class Vanish:
-    """Lower every score at every location, or at those of the aim.
+    """Suppression of every score at every location, or at the locations of the aim.
 
-    The loss is the log-probability that nothing is there, summed over locations and classes.
+    The loss is the log-probability that nothing is present, summed over locations and classes.
 
     Source: Chow et al., TOG (2020), untargeted vanishing, here for any head.
     """
@@ -151,7 +151,7 @@ class Vanish:
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
-        """See `Objective`."""
+        """Return the summed log-probability of absence of each image."""
         absent = torch.log1p(-log_scores(dense).exp())
         if not situation.aim.everything:
             absent = absent * _weights(dense, situation)[..., None]
@@ -162,13 +162,13 @@ class Vanish:
 class Margin:
     """Carlini and Wagner's margin, for heads of independent sigmoids.
 
-    For each location, it is how far the best class lies above the log-odds of a score that no longer counts, down to
+    At each location it is the distance of the best class above the log-odds of a score that no longer counts, down to
     `confidence` below it; summed over locations.
 
     Attributes:
         threshold: Score below which a detection does not count.
-        confidence: How far below the threshold, in log-odds, locations are pushed.
-        name: What records call it.
+        confidence: Distance below the threshold, in log-odds, to which locations are pushed.
+        name: Name in records.
         needs_objects: See `Objective`.
 
     Source: Carlini and Wagner, Towards Evaluating the Robustness of Neural Networks (2017), f6, with the threshold in
@@ -181,29 +181,30 @@ class Margin:
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
-        """See `Objective`."""
-        best = log_odds(log_scores(dense)).amax(-1)
-        above = (best - (math.log(self.threshold / (1 - self.threshold)) - self.confidence)).clamp_min(0.0)
+        """Return the negative summed margin of each image."""
+        best_log_odds = log_odds(log_scores(dense)).amax(-1)
+        excess = (best_log_odds - (math.log(self.threshold / (1 - self.threshold)) - self.confidence)).clamp_min(0.0)
         if not situation.aim.everything:
-            above = above * _weights(dense, situation)
-        return -above.sum(1)
+            excess = excess * _weights(dense, situation)
+        return -excess.sum(1)
 
 
 @dataclass(frozen=True, slots=True)
 class Hide:
-    """No box on an object with any score.
+    """Suppression of all boxes on an object.
 
-    log(1 - the largest score of its class times IoU over all locations), summed over the objects of the aim. `hide-any`
-    sums over the 20 best locations, each with its largest score of any class, so that an object is not hidden by
-    being taken for another, or for two.
+    log(1 - the largest score of its class times IoU over all locations), summed over the objects of the aim.
+    `hide-any` sums over the 20 best locations, each with its largest score of any class, so that an object is not
+    hidden by being mistaken for one or two others.
 
-    Source: the detection loss of ACTIVE and RAUCA (Suryanto et al. 2023, Zhou et al. 2024), with the score of any head.
+    Source: the detection loss of ACTIVE and RAUCA (Suryanto et al. 2023, Zhou et al. 2024), with the score of any
+    head.
 
     Attributes:
-        others: How many locations next to the best one count too, by their own value; 1 is the source's.
-        name: What records call it.
+        others: Number of best locations that count, each with its own value; 1 in the source.
+        name: Name in records.
         needs_objects: Without an object there is nothing to hide.
-        every: Whether boxes of all classes count, and not of the object's alone as in the source.
+        every: Count boxes of all classes instead of the object's class only, as in the source.
     """
 
     others: int = 1
@@ -212,28 +213,34 @@ class Hide:
     every: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
-        """See `Objective`."""
+        """Return the summed log-probability that the objects of each image are hidden."""
         score = log_scores(dense).exp()
         total = dense.logit.new_zeros(len(dense.logit))
-        for k, truth in enumerate(situation.assignment.truth):
-            for number in objects_of(situation, k):
-                overlap = _overlap(dense.box[k], truth.box[number].to(dense.box))
-                own = score[k].amax(-1) if self.every else score[k, :, int(truth.label[number])]
-                value = own * overlap
-                best = value.topk(min(self.others, len(value))).values.clamp_max(1 - 1e-6)
-                total[k] = total[k] + torch.log1p(-best).sum()
+        for image_index, truth in enumerate(situation.assignment.truth):
+            for object_index in objects_of(situation, image_index):
+                overlap = _overlap(dense.box[image_index], truth.box[object_index].to(dense.box))
+                class_score = (
+                    score[image_index].amax(-1) if self.every else score[image_index, :, int(truth.label[object_index])]
+                )
+                location_value = class_score * overlap
+                best_values = location_value.topk(min(self.others, len(location_value))).values.clamp_max(1 - 1e-6)
+                total[image_index] = total[image_index] + torch.log1p(-best_values).sum()
         return total
 
 
 @dataclass(frozen=True, slots=True)
 class Fabricate:
-    """Scores up everywhere: the mean over locations of the log-score of the best class (TOG's fabrication)."""
+    """Higher scores everywhere: the mean log-score of the best class over locations (TOG's fabrication)."""
 
     name: str = "fabricate"
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
-        """See `Objective`. Raises ConfigError for an aim at some classes or objects."""
+        """Return the mean best log-score of each image.
+
+        Raises:
+            ConfigError: The aim selects classes or objects.
+        """
         if not situation.aim.everything:
             raise ConfigError("fabricate makes objects where there are none; it takes no classes and no objects")
         return log_scores(dense).amax(-1).mean(1)
@@ -241,13 +248,13 @@ class Fabricate:
 
 @dataclass(frozen=True, slots=True)
 class Mislabel:
-    """At the locations of objects, raise a wrong class above the true one; mean over these locations of an image.
+    """Wrong class above the true one at the locations of objects; the mean over these locations of an image.
 
     The wrong class is the one that the aim names, or else the nearest.
 
     Attributes:
         confidence: Lead of the wrong class, in log-odds, beyond which nothing more is gained.
-        name: What records call it.
+        name: Name in records.
         needs_objects: See `Objective`.
     """
 
@@ -256,22 +263,26 @@ class Mislabel:
     needs_objects: bool = True
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
-        """See `Objective`. Raises ConfigError if the detector knows only one class, or not a class of the aim."""
+        """Return the mean lead of the wrong class of each image.
+
+        Raises:
+            ConfigError: The detector has one class only, or lacks a class of the aim.
+        """
         detector, label = situation.detector, situation.assignment.label
         if dense.logit.shape[-1] < 2:
             raise ConfigError(f"{detector.name} knows one class; there is nothing to mislabel")
-        chosen = situation.aim.places(detector, situation.assignment)
-        true = label.clamp_min(0)[..., None]
+        is_attacked = situation.aim.places(detector, situation.assignment)
+        true_label = label.clamp_min(0)[..., None]
         if situation.aim.becomes:
-            table = torch.arange(len(detector.classes), device=label.device)
-            for name, other in situation.aim.becomes.items():
-                table[_index(detector, name)] = _index(detector, other)
-            rival = dense.logit.gather(-1, table[true])[..., 0]
+            wrong_class_of = torch.arange(len(detector.classes), device=label.device)
+            for name, wrong_class in situation.aim.becomes.items():
+                wrong_class_of[_index(detector, name)] = _index(detector, wrong_class)
+            rival_logit = dense.logit.gather(-1, wrong_class_of[true_label])[..., 0]
         else:
-            rival = dense.logit.scatter(-1, true, -torch.inf).amax(-1)
-        ahead = (rival - dense.logit.gather(-1, true)[..., 0]).clamp_max(self.confidence)
-        ahead = torch.where(chosen, ahead, 0.0)
-        return ahead.sum(1) / chosen.sum(1).clamp_min(1)
+            rival_logit = dense.logit.scatter(-1, true_label, -torch.inf).amax(-1)
+        lead = (rival_logit - dense.logit.gather(-1, true_label)[..., 0]).clamp_max(self.confidence)
+        lead = torch.where(is_attacked, lead, 0.0)
+        return lead.sum(1) / is_attacked.sum(1).clamp_min(1)
 
 
 OBJECTIVES: Mapping[str, Callable[[], Objective]] = {
@@ -291,10 +302,10 @@ UNDIVIDED = frozenset({"full", *TERMS, "fabricate"})
 
 
 def make_objective(name: str) -> Objective:
-    """An objective by name.
+    """Create an objective by name.
 
     Raises:
-        UnknownNameError: There is none.
+        UnknownNameError: There is no such objective.
     """
     if name not in OBJECTIVES:
         raise unknown_name("loss", name, OBJECTIVES)
@@ -302,47 +313,52 @@ def make_objective(name: str) -> Objective:
 
 
 def log_scores(dense: Dense) -> Tensor:
-    """Logarithms [B, P, C] of the scores: class times quality, each a sigmoid; below 0 by a little at least."""
+    """Return the log-scores [B, P, C] (class times quality, each a sigmoid), kept slightly below 0."""
     score = functional.logsigmoid(dense.logit)
     if dense.quality is not None:
         score = score + functional.logsigmoid(dense.quality)[..., None]
+    # A score of exactly 1 would have infinite log-odds.
     return score.clamp_max(-1e-6)
 
 
 def log_odds(score: Tensor) -> Tensor:
-    """log(p / (1 - p)) of log p."""
+    """Return log(p / (1 - p)) of log p."""
     return score - torch.log1p(-score.exp())
 
 
 def _weights(dense: Dense, situation: Situation) -> Tensor:
-    """Which locations [B, P] count: those assigned to the objects of the aim, and those whose box lies on them."""
-    chosen = situation.aim.places(situation.detector, situation.assignment)
-    for k, truth in enumerate(situation.assignment.truth):
-        aimed = torch.unique(situation.assignment.owner[k][chosen[k]])
-        chosen[k] |= _on(dense.place, truth.box.to(dense.place)[aimed])
-    return chosen.to(dense.logit.dtype)
+    """Return 1 for locations [B, P] assigned to an attacked object or inside its box, else 0."""
+    is_weighted = situation.aim.places(situation.detector, situation.assignment)
+    for image_index, truth in enumerate(situation.assignment.truth):
+        object_indices = torch.unique(situation.assignment.owner[image_index][is_weighted[image_index]])
+        is_weighted[image_index] |= _on(dense.place, truth.box.to(dense.place)[object_indices])
+    return is_weighted.to(dense.logit.dtype)
 
 
 def objects_of(situation: Situation, image: int) -> list[int]:
     """Indices of the objects of an image that are under attack: those of the aim's numbers and classes."""
     aim, truth = situation.aim, situation.assignment.truth[image]
     names = list(aim.becomes) if aim.becomes else aim.classes
-    wanted = None if names is None else {_index(situation.detector, name) for name in names}
-    numbers = range(len(truth.label)) if aim.objects is None else aim.objects
+    class_indices = None if names is None else {_index(situation.detector, name) for name in names}
+    candidates = range(len(truth.label)) if aim.objects is None else aim.objects
     labels = truth.label.tolist()
-    return [k for k in numbers if k < len(labels) and (wanted is None or labels[k] in wanted)]
+    return [
+        object_index
+        for object_index in candidates
+        if object_index < len(labels) and (class_indices is None or labels[object_index] in class_indices)
+    ]
 
 
 def _overlap(box: Tensor, real: Tensor) -> Tensor:
     """IoU [P] of boxes [P, 4] with one box [4]."""
-    side = (torch.minimum(box[:, 2:], real[2:]) - torch.maximum(box[:, :2], real[:2])).clamp_min(0.0)
-    both = side.prod(1)
-    area = (box[:, 2:] - box[:, :2]).clamp_min(0.0).prod(1) + (real[2:] - real[:2]).prod() - both
-    return both / area.clamp_min(1e-9)
+    overlap_sides = (torch.minimum(box[:, 2:], real[2:]) - torch.maximum(box[:, :2], real[:2])).clamp_min(0.0)
+    intersection = overlap_sides.prod(1)
+    union = (box[:, 2:] - box[:, :2]).clamp_min(0.0).prod(1) + (real[2:] - real[:2]).prod() - intersection
+    return intersection / union.clamp_min(1e-9)
 
 
 def _on(place: Tensor, box: Tensor) -> Tensor:
-    """Which places [P, 2] lie in one of the boxes [N, 4]."""
+    """Return a mask of the places [P, 2] that lie in one of the boxes [N, 4]."""
     inside = (place[:, None] >= box[None, :, :2]) & (place[:, None] < box[None, :, 2:])
     return inside.all(-1).any(1)
 

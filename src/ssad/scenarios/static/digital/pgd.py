@@ -1,4 +1,4 @@
-"""Projected gradient ascent, with restarts, momentum and steps that shrink."""
+"""Projected gradient ascent with restarts, momentum and shrinking steps."""
 
 from __future__ import annotations
 
@@ -27,30 +27,29 @@ def starts(victim: Victim, budget: Budget, first: Start, restarts: int) -> Itera
         first: Where the first start lies.
         restarts: How many follow; where `first` is the clean image, they are uniform.
     """
-    for number in range(1 + restarts):
-        kind: Start = first if number == 0 or first != "none" else "uniform"
+    for start_index in range(1 + restarts):
+        kind: Start = first if start_index == 0 or first != "none" else "uniform"
         images = victim.clean
         if kind != "none":
-            draws = victim.draw(kind, "start", number)
+            draws = victim.draw(kind, "start", start_index)
             images = budget.around(victim.clean, budget.start(draws, kind))
         yield images
 
 
 @dataclass(frozen=True, slots=True)
 class PGD:
-    """Steps along the steepest direction, each followed by a projection into the ball; the best image met is kept.
-
-    Attributes:
-        steps: gradient steps of each start.
-        step: length of the first step as a share of the radius; None: the rule below.
-        schedule: "cosine": steps shrink from the first one to nothing, so that the last ones settle. "constant": all
-            are of one length.
-        start: where the first start begins: at the clean image, or at a random place of the ball.
-        restarts: further random starts.
-        decay: of the momentum of directions; 0: none (Dong et al. 2018 take 1).
+    """Steps along the steepest direction, each projected onto the ball; the best image of all steps is kept.
 
     Without `step`, constant steps are 2.5 / steps of the radius, so that an image can cross the ball and turn around
-    (Madry et al. 2018); shrinking ones begin with twice that, and at the radius at most, which is as much travel.
+    (Madry et al. 2018); shrinking steps begin with twice that, at most the radius, which gives the same total length.
+
+    Attributes:
+        steps: Gradient steps of each start.
+        step: Length of the first step as a share of the radius; None: the rule above.
+        schedule: "cosine": steps shrink to zero, so that the last ones settle. "constant": all have the same length.
+        start: Position of the first start: the clean image, or a random point of the ball.
+        restarts: Further random starts.
+        decay: Decay of the momentum of directions; 0: none (Dong et al. 2018 take 1).
 
     Raises:
         ConfigError: No step, a negative number of restarts, or a step of length 0.
@@ -72,7 +71,7 @@ class PGD:
             raise ConfigError(f"{self.name}: steps must be 1 or more, step above 0, restarts and decay 0 or more")
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`."""
+        """Run the ascent from every start and keep the best images."""
         best = victim.clean, victim.clean.new_full((len(victim),), -torch.inf, dtype=torch.float32)
         for images in starts(victim, budget, self.start, self.restarts):
             best = self._ascend(victim, budget, images, best)
@@ -82,17 +81,18 @@ class PGD:
         self, victim: Victim, budget: Budget, images: Tensor, best: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         momentum = torch.zeros_like(images)
-        for k in range(self.steps):
+        for step_index in range(self.steps):
             loss, gradient = victim.gradient(images)
             best = keep_best(best, images, loss.float())
             if self.decay:
+                # Normalised by the mean absolute value, as in Dong et al. (2018), so that all steps weigh the same.
                 gradient = gradient / gradient.abs().flatten(1).mean(1).clamp_min(1e-30)[:, None, None, None]
                 momentum = gradient = self.decay * momentum + gradient
-            images = budget.ascend(images, gradient, victim.clean, budget.radius * self.share(k))
+            images = budget.ascend(images, gradient, victim.clean, budget.radius * self.share(step_index))
         return keep_best(best, images, victim.loss(images).float())
 
     def share(self, k: int) -> float:
         """Length of step `k` as a share of the radius."""
         constant = self.schedule == "constant"
-        first = self.step if self.step is not None else min(2.5 / self.steps * (1 if constant else 2), 1.0)
-        return first if constant else first * 0.5 * (1 + math.cos(math.pi * k / self.steps))
+        first_share = self.step if self.step is not None else min(2.5 / self.steps * (1 if constant else 2), 1.0)
+        return first_share if constant else first_share * 0.5 * (1 + math.cos(math.pi * k / self.steps))

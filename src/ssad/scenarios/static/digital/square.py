@@ -1,4 +1,4 @@
-"""Square attack: random squares, of which those that raise the loss stay. It asks for losses only."""
+"""Square attack: random squares that are kept if they raise the loss. It queries losses only."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from ssad.scenarios.static.digital.victim import Victim
 
 HALVINGS = (10, 50, 200, 500, 1000, 2000, 4000, 6000, 8000)
 """After how many of 10,000 proposals the area of the squares is halved once more."""
-TILES = 5  # of a side, from which L2 starts
-TRIES = 10  # draws of signs until a square differs from what is there
+TILES = 5  # per side of the image, for the start under L2
+TRIES = 10  # draws of signs until a square differs from its old value
 TINY = 1e-10
 
 
@@ -26,21 +26,21 @@ TINY = 1e-10
 class Square:
     """Random search over squares; a proposal is kept if it raises the loss.
 
-    Under L-infinity, a proposal moves one square of the image to the border of the ball; under L2, it moves the mass of
-    one square into another.
+    Under L-infinity, a proposal moves one square of the image to the border of the ball; under L2, it moves the mass
+    of one square into another.
 
     Attributes:
-        queries: Number of losses asked for, including those of the clean image and of the start.
+        queries: Number of loss queries, including those of the clean image and of the start.
         share: Share of the image that the first squares cover; they shrink by the schedule of the source, stretched
             over `queries`.
-        name: What tables call it.
-        access: It asks only for losses.
+        name: Name shown in tables.
+        access: Queries losses only.
 
     Raises:
         ConfigError: Fewer than three queries, or a share outside (0, 1].
 
-    Source: Andriushchenko et al., Square Attack: a query-efficient black-box adversarial attack via random search (ECCV
-    2020), algorithms 1 to 3; for ImageNet it takes a share of 0.05 under L-infinity and of 0.1 under L2.
+    Source: Andriushchenko et al., Square Attack: a query-efficient black-box adversarial attack via random search
+    (ECCV 2020), algorithms 1 to 3; for ImageNet it takes a share of 0.05 under L-infinity and of 0.1 under L2.
     """
 
     queries: int = 1000
@@ -53,24 +53,34 @@ class Square:
             raise ConfigError(f"{self.name}: queries must be 3 or more, share above 0 and at most 1")
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`."""
+        """Search over random squares, starting from stripes (L-infinity) or tiles (L2)."""
         clean = victim.clean
-        chances = [victim.generator(key, "square") for key in victim.keys]
-        start = _stripes if budget.norm == "linf" else _tiles
+        generators = [victim.generator(key, "square") for key in victim.keys]
+        initial_change = _stripes if budget.norm == "linf" else _tiles
         propose = _square if budget.norm == "linf" else _moved
-        first = torch.stack([start(one, chance) for one, chance in zip(clean, chances, strict=True)])
-        change = budget.radius * (first if budget.norm == "linf" else first / lengths(first))
+        initial_changes = torch.stack(
+            [
+                initial_change(image_values, image_generator)
+                for image_values, image_generator in zip(clean, generators, strict=True)
+            ]
+        )
+        change = budget.radius * (
+            initial_changes if budget.norm == "linf" else initial_changes / lengths(initial_changes)
+        )
         images = budget.project(clean + change, clean)
-        kept = images, victim.loss(images).float()
-        proposals = self.queries - 2
-        for k in range(proposals):
-            side = self.side(k / proposals, clean.shape[2], clean.shape[3], least=1 if budget.norm == "linf" else 3)
-            change = kept[0] - clean
-            for one, chance in zip(change, chances, strict=True):
-                propose(one, side, budget.radius, chance)
+        best = images, victim.loss(images).float()
+        proposal_count = self.queries - 2
+        for proposal in range(proposal_count):
+            square_side = self.side(
+                proposal / proposal_count, clean.shape[2], clean.shape[3], least=1 if budget.norm == "linf" else 3
+            )
+            change = best[0] - clean
+            for image_values, image_generator in zip(change, generators, strict=True):
+                propose(image_values, square_side, budget.radius, image_generator)
             images = budget.project(clean + change, clean)
-            kept = keep_best(kept, images, victim.loss(images).float())
-        return keep_best((clean, victim.loss(clean).float()), *kept)[0]
+            best = keep_best(best, images, victim.loss(images).float())
+        # The clean image counts too: an image that no square makes worse is returned as it is.
+        return keep_best((clean, victim.loss(clean).float()), *best)[0]
 
     def side(self, done: float, height: int, width: int, *, least: int = 1) -> int:
         """Side of the squares in pixels.
@@ -81,7 +91,7 @@ class Square:
             width: Of the image.
             least: The smallest side.
         """
-        area = self.share / 2 ** sum(int(done * 10_000) > mark for mark in HALVINGS)
+        area = self.share / 2 ** sum(int(done * 10_000) > halving for halving in HALVINGS)
         return max(min(max(round(math.sqrt(area * height * width)), least), min(height, width) - 1), 1)
 
 
@@ -104,11 +114,13 @@ def _square(change: Tensor, side: int, radius: float, chance: np.random.Generato
 def _tiles(clean: Tensor, chance: np.random.Generator) -> Tensor:
     """Bumps side by side [3, H, W], each up or down by channel."""
     height, width = clean.shape[1:]
-    side = max(min(height, width) // TILES, 1)
+    tile_side = max(min(height, width) // TILES, 1)
     change = torch.full_like(clean, TINY)
-    for top in range(height % side // 2, height - side + 1, side):
-        for left in range(width % side // 2, width - side + 1, side):
-            change[:, top : top + side, left : left + side] += _bump(side, chance).to(clean) * _signs(clean, chance)
+    for top in range(height % tile_side // 2, height - tile_side + 1, tile_side):
+        for left in range(width % tile_side // 2, width - tile_side + 1, tile_side):
+            change[:, top : top + tile_side, left : left + tile_side] += _bump(tile_side, chance).to(clean) * _signs(
+                clean, chance
+            )
     return change
 
 
@@ -118,17 +130,17 @@ def _moved(change: Tensor, side: int, radius: float, chance: np.random.Generator
     The new length of the second window combines the lengths of both windows and what is left of the ball.
     """
     side = min(side + 1 - side % 2, *change.shape[1:])
-    taking, giving = _place(change, side, chance), _place(change, side, chance)
-    window = change[taking]
-    either = torch.zeros_like(change)
-    either[taking] = change[taking]
-    either[giving] = change[giving]
-    left = max(radius**2 - float((change**2).sum()), 0.0) / len(change)
-    room = ((either**2).sum((1, 2), keepdim=True) + left).sqrt()
-    fresh = _bump(side, chance).to(change) * _signs(change, chance)
-    fresh = fresh + window / (TINY + (window**2).sum((1, 2), keepdim=True).sqrt())
-    change[giving] = 0.0
-    change[taking] = fresh / (TINY + (fresh**2).sum((1, 2), keepdim=True).sqrt()) * room
+    target_window, source_window = _place(change, side, chance), _place(change, side, chance)
+    target_change = change[target_window]
+    window_change = torch.zeros_like(change)
+    window_change[target_window] = change[target_window]
+    window_change[source_window] = change[source_window]
+    free_mass = max(radius**2 - float((change**2).sum()), 0.0) / len(change)
+    target_length = ((window_change**2).sum((1, 2), keepdim=True) + free_mass).sqrt()
+    new_change = _bump(side, chance).to(change) * _signs(change, chance)
+    new_change = new_change + target_change / (TINY + (target_change**2).sum((1, 2), keepdim=True).sqrt())
+    change[source_window] = 0.0
+    change[target_window] = new_change / (TINY + (new_change**2).sum((1, 2), keepdim=True).sqrt()) * target_length
     change *= radius / (TINY + float((change**2).sum()) ** 0.5)
 
 
@@ -158,11 +170,11 @@ def _hill_and_hollow(side: int) -> Tensor:
 
 
 def _hill(height: int, width: int) -> Tensor:
-    """Rectangles [height, width] around the middle, each larger and lower than the last; of length 1."""
+    """Return nested rectangles [height, width] of length 1; each larger one adds less."""
     shape = torch.zeros(height, width)
     middle = height // 2, width // 2
-    for k in range(max(middle) + 1):
-        rows = slice(max(middle[0] - k, 0), middle[0] + k + 1)
-        columns = slice(max(middle[1] - k, 0), middle[1] + k + 1)
-        shape[rows, columns] += 1.0 / (k + 1) ** 2
+    for ring in range(max(middle) + 1):
+        rows = slice(max(middle[0] - ring, 0), middle[0] + ring + 1)
+        columns = slice(max(middle[1] - ring, 0), middle[1] + ring + 1)
+        shape[rows, columns] += 1.0 / (ring + 1) ** 2
     return shape / lengths(shape[None, None])[0, 0]

@@ -1,4 +1,4 @@
-"""Transfer: a picture that fools one detector is shown to another, which is asked nothing."""
+"""Transfer attacks: images that fool one detector are shown to another, which is never queried."""
 
 from __future__ import annotations
 
@@ -20,18 +20,16 @@ from ssad.scenarios.static.digital.victim import Victim, steady
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """Runs an attack on a surrogate, with the surrogate's own target assignment, and hands the images to the victim.
+    """Attack on a surrogate, with its own target assignment; the victim receives the resulting images.
 
-    The truth's labels are translated by the names of the classes; objects of classes that the surrogate does not know
-    are left out. A defence before the victim is not known to the surrogate.
+    Labels of the truth are translated by class name; objects of classes that the surrogate lacks are omitted. The
+    surrogate does not know a defence before the victim. The victim's costs stay 0, since it is not queried.
 
     Attributes:
-        surrogate: the detector that is attacked in the victim's place; afterwards it is as it was.
-        inner: the attack that runs on it.
-        objective: the loss of the surrogate that is ascended, or its name.
-        check: compare the surrogate's gradient with finite differences first, if the inner attack asks for gradients.
-
-    The victim's costs stay 0: nothing is asked of it.
+        surrogate: Detector that is attacked in place of the victim; it is restored afterwards.
+        inner: Attack that runs on it.
+        objective: Loss of the surrogate to ascend, or its name.
+        check: Compare the surrogate's gradient with finite differences first, if the inner attack queries gradients.
 
     Raises:
         ConfigError: There is no such loss.
@@ -48,62 +46,75 @@ class Transfer:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
         return f"transfer-{self.inner.name}-{self.surrogate.name}"
 
     def _loss(self) -> Objective:
         return make_objective(self.objective) if isinstance(self.objective, str) else self.objective
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
-        """See `Attack`.
+        """Attack the surrogate and return its images.
 
         Raises:
-            ConfigError: The surrogate finds 3D boxes, and the truth has none; it knows none of the classes that are
-                attacked.
+            ConfigError: The surrogate detects 3D boxes and the truth has none, or it knows none of the attacked
+                classes.
         """
-        known, aim = victim.detector.classes, victim.situation.aim
-        whole = [translate(one, known, self.surrogate.classes) for one in victim.situation.assignment.truth]
-        if self.surrogate.task == "3d" and any(one.solid is None for one, _ in whole):
+        class_names, aim = victim.detector.classes, victim.situation.aim
+        translations = [
+            translate(image_truth, class_names, self.surrogate.classes)
+            for image_truth in victim.situation.assignment.truth
+        ]
+        if self.surrogate.task == "3d" and any(image_truth.solid is None for image_truth, _ in translations):
             raise ConfigError(f"{self.name}: {self.surrogate.name} finds 3D boxes, and the truth has none")
-        aims = [_translated(aim, kept, self.surrogate) for _, kept in whole]
-        # numbers of objects differ from image to image once some are left out: such images go one by one
-        found = victim.clean.clone()
-        groups = [[k] for k in range(len(victim))] if aim.objects is not None else [list(range(len(victim)))]
-        loss, some = self._loss(), False
-        needed = loss.needs_objects or not aim.everything
+        aims = [_translated(aim, kept_objects, self.surrogate) for _, kept_objects in translations]
+        # object indices differ between images once some are omitted, so such images are attacked one by one
+        perturbed = victim.clean.clone()
+        groups = [[index] for index in range(len(victim))] if aim.objects is not None else [list(range(len(victim)))]
+        loss, any_attacked = self._loss(), False
+        needs_objects = loss.needs_objects or not aim.everything
         with steady(self.surrogate):
             for group in groups:
-                own = [k for k in group if not needed or _attacked(whole[k][0], aims[k], self.surrogate)]
-                if own:
-                    found[own] = self._on_surrogate(victim, own, [whole[k][0] for k in own], aims[own[0]], budget)
-                    some = True
-        if not some:
+                attackable = [
+                    index
+                    for index in group
+                    if not needs_objects or _attacked(translations[index][0], aims[index], self.surrogate)
+                ]
+                if attackable:
+                    perturbed[attackable] = self._on_surrogate(
+                        victim,
+                        attackable,
+                        [translations[index][0] for index in attackable],
+                        aims[attackable[0]],
+                        budget,
+                    )
+                    any_attacked = True
+        if not any_attacked:
             raise ConfigError(f"{self.name}: {self.surrogate.name} knows the class of none of the attacked objects")
-        return found
+        return perturbed
 
     def _on_surrogate(
         self, victim: Victim, own: Sequence[int], truth: Sequence[Truth], aim: Aim, budget: Budget
     ) -> Tensor:
         """What the inner attack finds for some images of the batch."""
         intrinsic = None if victim.intrinsic is None else victim.intrinsic[list(own)]
-        lenses = [one.intrinsic for one in truth if one.intrinsic is not None]
-        if intrinsic is None and len(lenses) == len(truth):
-            intrinsic = torch.stack(lenses).to(victim.clean)
+        intrinsics = [image_truth.intrinsic for image_truth in truth if image_truth.intrinsic is not None]
+        if intrinsic is None and len(intrinsics) == len(truth):
+            intrinsic = torch.stack(intrinsics).to(victim.clean)
         if intrinsic is None and self.surrogate.task == "3d":
             raise ConfigError(f"{self.name}: {self.surrogate.name} finds 3D boxes, and the intrinsics are missing")
-        asked = Victim(
+        surrogate_victim = Victim(
             self.surrogate,
             victim.clean[list(own)],
             truth,
             self._loss(),
             intrinsic=intrinsic,
             aim=aim,
-            keys=[victim.keys[k] for k in own],
+            keys=[victim.keys[index] for index in own],
         )
         if self.check and self.inner.access == "white-box":
-            check_gradient(asked)
-        images = self.inner.perturb(asked, budget).detach()
-        return torch.where(asked.idle[:, None, None, None], asked.clean, images)
+            check_gradient(surrogate_victim)
+        images = self.inner.perturb(surrogate_victim, budget).detach()
+        return torch.where(surrogate_victim.idle[:, None, None, None], surrogate_victim.clean, images)
 
 
 def translate(truth: Truth, known: Sequence[str], wanted: Sequence[str]) -> tuple[Truth, tuple[int, ...]]:
@@ -117,17 +128,21 @@ def translate(truth: Truth, known: Sequence[str], wanted: Sequence[str]) -> tupl
     Returns:
         The truth of the objects whose class is among the wanted ones, and which objects these are.
     """
-    table = [wanted.index(name) if name in wanted else -1 for name in known]
-    label = torch.tensor([table[one] for one in truth.label.tolist()], dtype=truth.label.dtype)
-    kept = torch.nonzero(label >= 0).flatten()
+    label_map = [wanted.index(name) if name in wanted else -1 for name in known]
+    label = torch.tensor([label_map[label_index] for label_index in truth.label.tolist()], dtype=truth.label.dtype)
+    kept_objects = torch.nonzero(label >= 0).flatten()
     solid = truth.solid
     if solid is not None:
         solid = Solids(
-            solid.centre[kept], solid.size_lhw[kept], solid.yaw[kept], solid.velocity[kept], solid.attribute[kept]
+            solid.centre[kept_objects],
+            solid.size_lhw[kept_objects],
+            solid.yaw[kept_objects],
+            solid.velocity[kept_objects],
+            solid.attribute[kept_objects],
         )
-    crowd = None if truth.crowd is None else truth.crowd[kept]
-    label = label[kept].to(truth.label.device)
-    return Truth(label, truth.box[kept], solid, truth.intrinsic, crowd), tuple(kept.tolist())
+    crowd = None if truth.crowd is None else truth.crowd[kept_objects]
+    label = label[kept_objects].to(truth.label.device)
+    return Truth(label, truth.box[kept_objects], solid, truth.intrinsic, crowd), tuple(kept_objects.tolist())
 
 
 def _translated(aim: Aim, kept: Sequence[int], surrogate: Detector) -> Aim:
@@ -135,21 +150,26 @@ def _translated(aim: Aim, kept: Sequence[int], surrogate: Detector) -> Aim:
     if aim.classes is not None:
         aim = replace(aim, classes=tuple(name for name in aim.classes if name in surrogate.classes))
     if aim.objects is not None:
-        aim = replace(aim, objects=tuple(place for place, one in enumerate(kept) if one in aim.objects))
+        aim = replace(
+            aim, objects=tuple(new_index for new_index, old_index in enumerate(kept) if old_index in aim.objects)
+        )
     becomes = {
-        name: other for name, other in aim.becomes.items() if name in surrogate.classes and other in surrogate.classes
+        name: wrong_class
+        for name, wrong_class in aim.becomes.items()
+        if name in surrogate.classes and wrong_class in surrogate.classes
     }
+    # An empty map would mean the nearest wrong class for all objects, so no class is attacked instead.
     if aim.becomes and not becomes:
         aim = replace(aim, classes=())
     return replace(aim, becomes=becomes)
 
 
 def _attacked(truth: Truth, aim: Aim, surrogate: Detector) -> bool:
-    """Whether some object of an image that is no crowd is under attack."""
+    """Check an image for an object under attack that is no crowd."""
     names = list(aim.becomes) if aim.becomes else aim.classes
-    for place, label in enumerate(truth.label.tolist()):
-        crowd = truth.crowd is not None and bool(truth.crowd[place])
-        wanted = names is None or surrogate.classes[label] in names
-        if wanted and not crowd and (aim.objects is None or place in aim.objects):
+    for index, label in enumerate(truth.label.tolist()):
+        crowd = truth.crowd is not None and bool(truth.crowd[index])
+        is_class_attacked = names is None or surrogate.classes[label] in names
+        if is_class_attacked and not crowd and (aim.objects is None or index in aim.objects):
             return True
     return False

@@ -1,4 +1,4 @@
-"""One change for many pictures: those of a data set, or the frames of a drive."""
+"""Universal perturbations: one change for many images, those of a data set or the frames of an episode."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Universal:
             raise ConfigError(f"universal: the change must be finite and of shape [1, 3, H, W], not {list(shape)}")
 
     def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
-        """See `Attack`."""
+        """Add the change, projected onto the budget."""
         _check_size(tuple(self.change.shape), victim)
         return budget.project(victim.clean + self.change.to(victim.clean), victim.clean)
 
@@ -82,11 +82,15 @@ class UniversalFit:
         return self.frames * (self.steps + 1)
 
     def fit(self, victims: Sequence[Victim], budget: Budget) -> Universal:
-        """The attack that adds the change that was found for some pictures."""
+        """Return the attack that adds the change fitted to these images."""
         return Universal(fit_universal(victims, budget, epochs=self.steps, step=self.step, method=self.method))
 
     def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
-        """See `Attack`. Raises ConfigError: what it adds must be found first."""
+        """Raise an error, since the change must be fitted first.
+
+        Raises:
+            ConfigError: Always.
+        """
         raise ConfigError("universal: find the change first (fit, or fit_universal)")
 
 
@@ -98,75 +102,78 @@ def fit_universal(
     step: float = 0.25,
     method: Literal["sign", "adam"] = "sign",
 ) -> Tensor:
-    """Look for one change that raises the sum of the losses of many pictures.
+    """Fit one change that raises the sum of the losses of many images.
 
-    Each epoch takes the gradient of the sum over all pictures and makes one step, so what is found does not depend on
-    how they are put into batches. Steps shrink to nothing by a cosine; the best change met is kept.
+    Each epoch takes the gradient of the sum over all images and makes one step, so the result does not depend on the
+    batching. Step lengths decay to zero by a cosine; the best change of all epochs is returned.
 
     Args:
-        batches: Victims whose pictures all have one size; or a function that gives them anew in each epoch, where they
-            do not fit into memory together.
-        budget: How far each value (L-infinity), or each picture (L2), may be moved.
-        epochs: Passes over all pictures.
+        batches: Victims whose images all have one size, or a function that returns them anew in each epoch, for
+            images that do not fit into memory together.
+        budget: Maximum change of each value (L-infinity), or of each image (L2).
+        epochs: Passes over all images.
         step: Length of the first step as a share of the radius; under Adam its first rate, likewise.
         method: "sign": the steepest direction of the norm. "adam": Adam with the gradient as it is.
 
     Returns:
-        [1, 3, H, W] a change within the ball.
+        [1, 3, H, W] change within the ball.
 
     Raises:
-        ConfigError: No pictures, pictures of different sizes, no epoch, or a step of 0 or less.
+        ConfigError: No images, images of different sizes, no epoch, or a step of 0 or less.
 
     Source: Moosavi-Dezfooli et al., Universal Adversarial Perturbations (CVPR 2017), fitted by ascent of the summed
     loss as in Shafahi et al., Universal Adversarial Training (AAAI 2020).
     """
     if epochs < 1 or step <= 0 or method not in ("sign", "adam"):
         raise ConfigError("universal: epochs must be 1 or more, step above 0, method sign or adam")
-    kept = batches if callable(batches) else list(batches)
-    first = next(iter(kept() if callable(kept) else kept), None)
-    if first is None:
+    victims = batches if callable(batches) else list(batches)
+    first_victim = next(iter(victims() if callable(victims) else victims), None)
+    if first_victim is None:
         raise ConfigError("universal: there are no pictures to fit it to")
-    change = torch.zeros_like(first.clean[:1], dtype=torch.float64)
-    best, most = change, -math.inf
+    change = torch.zeros_like(first_victim.clean[:1], dtype=torch.float64)
+    best_change, best_total = change, -math.inf
     adam = torch.optim.Adam([change], eps=1e-30, maximize=True)
-    unit = math.sqrt(change.numel()) if budget.norm == "l2" else 1.0  # length of a change whose values are all 1
-    for k in range(epochs + 1):
-        total, gradient = _summed(kept() if callable(kept) else kept, change)
-        if total > most:
-            best, most = change.clone(), total
-        if k == epochs:
+    unit_length = math.sqrt(change.numel()) if budget.norm == "l2" else 1.0  # norm of a change of all ones
+    for epoch in range(epochs + 1):
+        total, gradient = _summed(victims() if callable(victims) else victims, change)
+        if total > best_total:
+            best_change, best_total = change.clone(), total
+        # The last pass only evaluates the final change.
+        if epoch == epochs:
             break
-        rate = budget.radius * step * 0.5 * (1 + math.cos(math.pi * k / epochs))
+        rate = budget.radius * step * 0.5 * (1 + math.cos(math.pi * epoch / epochs))
         if method == "sign":
             change.add_(budget.steepest(gradient), alpha=rate)
         else:
-            adam.param_groups[0]["lr"] = rate / unit
+            adam.param_groups[0]["lr"] = rate / unit_length
             change.grad = gradient
             adam.step()
         budget.within(change)
-    return best.to(first.clean.dtype)
+    return best_change.to(first_victim.clean.dtype)
 
 
 def _summed(batches: Iterable[Victim], change: Tensor) -> tuple[float, Tensor]:
-    """The sum of all losses, and its gradient to the change; image by image in float64, whatever the batches."""
+    """Return the sum of all losses and its gradient with respect to the change, in float64."""
     total, gradient = 0.0, torch.zeros_like(change)
     for victim in batches:
         _check_size(tuple(change.shape), victim)
         moved = victim.clean + change.to(victim.clean)
-        inside = (moved >= 0.0) & (moved <= 1.0)
+        is_inside = (moved >= 0.0) & (moved <= 1.0)
         with steady(victim.detector):
-            losses, slopes = victim.gradient(moved.clamp(0.0, 1.0))
-        for k in range(len(victim)):
-            if not bool(victim.idle[k]):
-                total += float(losses[k])
-                gradient += (slopes[k] * inside[k])[None].double()
+            losses, gradients = victim.gradient(moved.clamp(0.0, 1.0))
+        # Image by image in float64: the result is the same for any batching.
+        for index in range(len(victim)):
+            if not bool(victim.idle[index]):
+                total += float(losses[index])
+                gradient += (gradients[index] * is_inside[index])[None].double()
     return total, gradient
 
 
 def _check_size(shape: tuple[int, ...], victim: Victim | Pictures) -> None:
-    wanted = tuple(victim.clean.shape[1:])
-    if shape[1:] != wanted:
+    image_shape = tuple(victim.clean.shape[1:])
+    if shape[1:] != image_shape:
         raise ConfigError(
-            f"universal: a change of {shape[2]} x {shape[3]} for pictures of {wanted[1]} x {wanted[2]}; all pictures "
+            f"universal: a change of {shape[2]} x {shape[3]} for pictures of {image_shape[1]} x "
+            f"{image_shape[2]}; all pictures "
             "must have one size"
         )

@@ -1,4 +1,4 @@
-"""What an attack may ask of the detector it attacks, and what each question costs."""
+"""Interface of an attack to the detector under attack, with the cost of each query."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Precision = Literal["float32", "bfloat16"]
 
 @dataclass(slots=True)
 class Cost:
-    """What an attack used, for one image.
+    """Cost of an attack, for one image.
 
     Attributes:
-        gradients: forward and backward passes.
-        queries: forward passes without a gradient.
+        gradients: Forward and backward passes.
+        queries: Forward passes without a gradient.
     """
 
     gradients: int = 0
@@ -37,16 +37,16 @@ class Cost:
 
 
 class NothingToAttackError(ConfigError):
-    """A loss or an aim needs objects, and there is none in any of the images."""
+    """Error of a loss or an aim that needs objects when no image contains one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """Clean images and their random numbers: all that an attack is given which asks no detector anything.
+    """Clean images and their random keys: the input of attacks that do not query a detector.
 
     Attributes:
         clean: [B, 3, H, W] in [0, 1].
-        keys: For each image what its random draws come from.
+        keys: Random key of each image.
     """
 
     clean: Tensor
@@ -58,31 +58,31 @@ class Pictures:
 
 
 class Victim:
-    """A detector, the images under attack with a frozen target assignment, and the loss that is ascended.
+    """Detector, images under attack with a frozen target assignment, and the loss to ascend.
 
-    The loss of an image depends on this image alone, whatever else is in the batch. The detector stays as it was:
-    use it within `steady`.
+    The loss of an image depends on this image alone, not on the rest of the batch. The detector must be used within
+    `steady`, which keeps it unchanged.
 
     Args:
-        detector: What is attacked.
+        detector: Detector under attack.
         images: [B, 3, H, W] float32 in [0, 1], multiples of 1/255.
-        truth: What is in each image, with labels of the detector's classes.
-        objective: The loss to ascend.
+        truth: Ground truth of each image, with labels of the detector's classes.
+        objective: Loss to ascend.
         intrinsic: [B, 3, 3], for 3D.
-        aim: Which objects are attacked.
-        keys: For each image what its random draws come from; default: its number in the batch.
-        through: What every picture passes on its way to the detector (a defence that the attack knows).
-        precision: What the detector computes gradients in, as far as autocast takes it; losses that are asked for
-            without a gradient, and the target assignment, are exact in any case.
+        aim: Objects under attack.
+        keys: Random key of each image; default: its index in the batch.
+        through: Defence that every image passes before the detector and that the attack knows.
+        precision: Precision of gradients, as far as autocast supports it; losses without a gradient and the target
+            assignment are always exact.
 
     Attributes:
-        clean: [B, 3, H, W] the images, equal to their code values over 255.
+        clean: [B, 3, H, W] images, equal to their code values over 255.
         codes: int32 [B, 3, H, W].
-        idle: [B] images in which there is nothing to attack: they are handed back as they are.
-        cost: for each image (all images of a batch cost the same).
+        idle: [B] mask of the images without anything to attack, which are returned unchanged.
+        cost: Cost per image (the same for all images of a batch).
 
     Raises:
-        ConfigError: Images of another type or not of 8 bits, none at all, truth of another number of images, or no
+        ConfigError: Images of another type or not of 8 bits, no images, truth of another number of images, or no
             object under attack in any image for a loss that needs some.
     """
 
@@ -106,14 +106,14 @@ class Victim:
         self.codes = codes_of(images)
         self.clean = (self.codes.to(images.dtype) / LEVELS).contiguous(memory_format=torch.channels_last)
         self.detector, self.objective, self.intrinsic, self.through = detector, objective, intrinsic, through
-        self.keys = [(k,) for k in range(len(images))] if keys is None else list(keys)
+        self.keys = [(index,) for index in range(len(images))] if keys is None else list(keys)
         self.cost, self.precision = Cost(), precision
         with torch.no_grad():
             dense = self._dense(self.clean)
             assignment = detector.assign(dense, truth)
             self.situation = Situation(detector, assignment, aim)
-            needed = objective.needs_objects or not aim.everything
-            self.idle = ~aim.places(detector, assignment).any(1) if needed else torch.zeros(len(images)) > 0
+            needs_objects = objective.needs_objects or not aim.everything
+            self.idle = ~aim.places(detector, assignment).any(1) if needs_objects else torch.zeros(len(images)) > 0
         self.idle = self.idle.to(images.device)
         if bool(self.idle.all()):
             raise NothingToAttackError(
@@ -127,34 +127,35 @@ class Victim:
         return self.detector.dense(images if self.through is None else self.through(images), self.intrinsic)
 
     def loss(self, images: Tensor) -> Tensor:
-        """The loss [B] of images, without a gradient: one query each."""
+        """Return the loss [B] of images without a gradient; costs one query each."""
         self.cost.queries += 1
         with torch.no_grad():
             return self.objective(self._dense(images), self.situation).detach()
 
     def gradient(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Loss [B] and its gradient [B, 3, H, W] at images.
+        """Return the loss [B] and its gradient [B, 3, H, W] at images.
 
         Raises:
-            ConfigError: The loss does not depend on the images as far as the detector tells, or is not finite.
+            ConfigError: The loss does not depend on the images, or its gradient is not finite.
         """
         self.cost.gradients += 1
         images = images.detach().requires_grad_()
         with torch.enable_grad():
             with torch.autocast(images.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
                 dense = self._dense(images)
+            # Outside autocast: only the detector runs in reduced precision.
             loss = self.objective(dense, self.situation)
-            found: tuple[Tensor | None, ...] = (None,)
+            gradients: tuple[Tensor | None, ...] = (None,)
             if loss.requires_grad:
-                found = torch.autograd.grad(loss.sum(), images, allow_unused=True)
-        if found[0] is None:
+                gradients = torch.autograd.grad(loss.sum(), images, allow_unused=True)
+        if gradients[0] is None:
             raise ConfigError(
                 f"{self.detector.name} gives no gradient of loss '{self.objective.name}' to the image; a white-box "
                 "attack needs one: choose a black-box attack (square, nes)"
             )
-        if not bool(found[0].sum().isfinite()):
+        if not bool(gradients[0].sum().isfinite()):
             raise ConfigError(f"{self.detector.name}: the gradient of loss '{self.objective.name}' is not finite")
-        return loss.detach(), found[0]
+        return loss.detach(), gradients[0]
 
     def draw(self, kind: str, *use: object) -> Tensor:
         """Random numbers [B, 3, H, W] of each image; see `draw`."""
@@ -176,39 +177,40 @@ def draw(clean: Tensor, keys: Sequence[tuple[object, ...]], kind: str, *use: obj
         *use: What they are for.
     """
     draws = np.empty(tuple(clean.shape), np.float32)
-    for own, key in zip(draws, keys, strict=True):
-        chance = Victim.generator(key, *use)
+    for image_draws, key in zip(draws, keys, strict=True):
+        image_generator = Victim.generator(key, *use)
         if kind == "uniform":
-            chance.random(dtype=np.float32, out=own)
+            image_generator.random(dtype=np.float32, out=image_draws)
         else:
-            chance.standard_normal(dtype=np.float32, out=own)
-    found = torch.from_numpy(draws)
+            image_generator.standard_normal(dtype=np.float32, out=image_draws)
+    result = torch.from_numpy(draws)
     if kind == "uniform":
-        found.mul_(2).sub_(1)
-    return found.to(clean).contiguous(memory_format=torch.channels_last)
+        result.mul_(2).sub_(1)
+    return result.to(clean).contiguous(memory_format=torch.channels_last)
 
 
 @contextmanager
 def steady(detector: Any) -> Iterator[None]:
-    """Keep every part of a detector in eval mode, and its parameters without gradients, within the block.
+    """Keep every part of a detector in eval mode, with frozen parameters, within the block.
 
-    Afterwards modes, flags, gradients and buffers are restored, whatever an attack or the detector did.
+    Modes, flags, gradients and buffers are restored afterwards.
     """
     roots = [detector] if isinstance(detector, nn.Module) else []
+    # A wrapper that is no module itself may hold its networks as attributes.
     roots += [value for value in getattr(detector, "__dict__", {}).values() if isinstance(value, nn.Module)]
-    flags = [(one, one.requires_grad, one.grad) for root in roots for one in root.parameters()]
-    buffers = [(one, one.clone()) for root in roots for one in root.buffers()]
-    for weight, _, _ in flags:
-        weight.requires_grad_(False)
+    flags = [(tensor, tensor.requires_grad, tensor.grad) for module in roots for tensor in module.parameters()]
+    buffers = [(tensor, tensor.clone()) for module in roots for tensor in module.buffers()]
+    for parameter, _, _ in flags:
+        parameter.requires_grad_(False)
     try:
         with ExitStack() as stack:
-            for root in roots:
-                stack.enter_context(evaluating(root))
+            for module in roots:
+                stack.enter_context(evaluating(module))
             yield
     finally:
-        for weight, flag, grad in flags:
-            weight.requires_grad_(flag)
-            weight.grad = grad
+        for parameter, requires_grad, gradient in flags:
+            parameter.requires_grad_(requires_grad)
+            parameter.grad = gradient
         with torch.no_grad():
-            for one, kept in buffers:
-                one.copy_(kept)
+            for tensor, saved in buffers:
+                tensor.copy_(saved)

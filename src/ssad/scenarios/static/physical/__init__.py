@@ -1,4 +1,4 @@
-"""Physical adversarial attacks on detectors (paper III.A.1): textures that a target wears while it drives.
+"""Physical adversarial attacks on detectors (paper III.A.1): textures on a driving target.
 
 `train_texture(make_physical("vanishing"), detector, Camouflage().on(mesh), views, start=...)`.
 """

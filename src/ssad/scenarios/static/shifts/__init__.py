@@ -1,4 +1,4 @@
-"""The 11 natural distribution shifts on images and LiDAR sweeps (paper III.A.2), and some more.
+"""Natural distribution shifts on images and LiDAR sweeps: the 11 of the paper (III.A.2) and a few more.
 
 `shift_images` for cameras, `shift_points` for the LiDAR twin, `transformed_boxes` for labels that follow the objects.
 """

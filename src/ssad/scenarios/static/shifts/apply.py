@@ -1,4 +1,4 @@
-"""The shifts on images: one image, a batch on any device, or the files of a folder go through here."""
+"""Application of shifts to images: a single image, a batch on any device, or the files of a folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.scenarios.static.shifts.sun import add_sun
 from ssad.scenarios.static.shifts.weather import add_fog, add_precipitation
 
-_ENOUGH = 100  # pixels of sky, of a picture looked at in 160 columns
+_ENOUGH = 100  # minimum number of sky pixels, of an image sampled in 160 columns
 
 
 def shift_images(
@@ -34,15 +34,15 @@ def shift_images(
     The result for an image depends only on its frame and spec, never on the rest of the batch.
 
     Args:
-        images: uint8 RGB [H, W, 3] or [B, H, W, 3] (numpy or torch), or torch float32 [B, 3, H, W] in [0, 1] (a camera
-            has 8 bits: they are rounded to 255 levels).
-        frames: What is known of each; None: a typical camera, and a different sample for each.
+        images: uint8 RGB [H, W, 3] or [B, H, W, 3] (numpy or torch), or torch float32 [B, 3, H, W] in [0, 1] (a
+            camera has 8 bits: they are rounded to 255 levels).
+        frames: Frame of each image; None: a typical camera, and a different sample for each.
         spec: One for all or one for each, of one name and calibration.
-        contexts: What is constant over a scene, by its key; missing: measured on each image alone.
-        device: Where to compute; None: where the images are.
+        contexts: Constants of each scene, by its key; missing ones are measured on each image alone.
+        device: Device of the computation; None: that of the images.
 
     Returns:
-        The images, in the kind and shape in which they came, and what was done to each.
+        The images, in the type and shape of the input, and a record of the shift for each.
 
     Raises:
         ConfigError: The arguments do not fit together.
@@ -50,22 +50,23 @@ def shift_images(
     batch = to_batch(images, device)
     if frames is None:
         cameras = Camera.typical(batch.seen, batch.height)
-        frames = [Frame(cameras, sample=str(b)) for b in range(batch.count)]
+        frames = [Frame(cameras, sample=str(index)) for index in range(batch.count)]
     elif isinstance(frames, Frame):
         frames = [frames]
     specs = [spec] * batch.count if isinstance(spec, ShiftSpec) else list(spec)
     check_batch(batch, frames)
     if len(specs) != batch.count:
         raise ConfigError(f"{batch.count} images, but {len(specs)} shift specs")
-    if len({(s.name, s.calibration) for s in specs}) > 1:
+    # A batch is one sequence of kernel launches, hence of one shift.
+    if len({(image_spec.name, image_spec.calibration) for image_spec in specs}) > 1:
         raise ConfigError("a batch has one shift and one calibration; severities and seeds may differ")
-    chosen = [b for b, s in enumerate(specs) if s.severity > 0]
-    if not chosen:
+    shifted = [index for index, image_spec in enumerate(specs) if image_spec.severity > 0]
+    if not shifted:
         return images, [Applied(True, {"severity": 0}) for _ in specs]
-    if len(chosen) < batch.count:
-        return _some(images, batch, frames=list(frames), specs=specs, chosen=chosen, contexts=contexts)
-    out, done = _dispatch(batch, frames, specs, contexts)
-    return like_input(out, images), done
+    if len(shifted) < batch.count:
+        return _some(images, batch, frames=list(frames), specs=specs, chosen=shifted, contexts=contexts)
+    result, records = _dispatch(batch, frames, specs, contexts)
+    return like_input(result, images), records
 
 
 def _some(
@@ -79,14 +80,18 @@ def _some(
 ) -> tuple[Any, list[Applied]]:
     """Severity 0 among others: only the others are computed."""
     pixels = batch.numpy().copy()
-    part, records = shift_images(
-        pixels[chosen], [frames[b] for b in chosen], [specs[b] for b in chosen], contexts=contexts, device=batch.device
+    shifted_pixels, records = shift_images(
+        pixels[chosen],
+        [frames[index] for index in chosen],
+        [specs[index] for index in chosen],
+        contexts=contexts,
+        device=batch.device,
     )
-    pixels[chosen] = part
-    done = [Applied(True, {"severity": 0})] * batch.count
-    for b, record in zip(chosen, records, strict=True):
-        done[b] = record
-    return like_input(to_batch(pixels, batch.device), images), done
+    pixels[chosen] = shifted_pixels
+    all_records = [Applied(True, {"severity": 0})] * batch.count
+    for index, record in zip(chosen, records, strict=True):
+        all_records[index] = record
+    return like_input(to_batch(pixels, batch.device), images), all_records
 
 
 def _dispatch(
@@ -113,10 +118,10 @@ def _dispatch(
             return paper_shift(batch, frames, specs)
     if specs[0].family == "object":
         return move_objects(batch, frames, specs)
-    known = [_context(batch, b, frame, contexts) for b, frame in enumerate(frames)]
+    image_contexts = [_context(batch, index, frame, contexts) for index, frame in enumerate(frames)]
     if name == "sunlight":
-        return add_sun(batch, frames, specs, known)
-    return (add_fog if name == "fog" else add_precipitation)(batch, frames, specs, known)
+        return add_sun(batch, frames, specs, image_contexts)
+    return (add_fog if name == "fog" else add_precipitation)(batch, frames, specs, image_contexts)
 
 
 def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneContext] | None) -> SceneContext:
@@ -126,34 +131,34 @@ def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneCon
 
 
 def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night: bool = False) -> float:
-    """Brightness in [0, 1] of the brightest thirtieth of the sky, which is what fog scatters.
+    """Return the brightness in [0, 1] of the brightest thirtieth of the sky, which fog scatters.
 
-    Where too little of the sky is known, the upper halves of all images stand for it; by night their median, since
-    lamps and walls in lamp light are brighter than the sky.
+    If too little of the sky is known, the upper halves of all images stand for it; by night their median, since
+    lamps and lit walls are brighter than the sky.
 
     Args:
-        images: Pictures [H, W, 3].
-        depths: Maps [h, w] of any size, inf where there is sky; None for images without one.
-        night: Whether it is night.
+        images: Images [H, W, 3].
+        depths: Depth maps [h, w] of any size, inf in the sky; None for images without one.
+        night: True by night.
     """
-    found, sky = [], []
-    for n, image in enumerate(images):
+    brightness, sky_pixels = [], []
+    for index, image in enumerate(images):
         step = max(1, image.shape[1] // 160)
-        light = image[: max(1, image.shape[0] // 2) : step, ::step].astype(np.float32)
-        light = light @ np.array([0.299, 0.587, 0.114], np.float32)
-        found.append(light.ravel())
-        depth = depths[n] if n < len(depths) else None
+        luminance = image[: max(1, image.shape[0] // 2) : step, ::step].astype(np.float32)
+        luminance = luminance @ np.array([0.299, 0.587, 0.114], np.float32)
+        brightness.append(luminance.ravel())
+        depth = depths[index] if index < len(depths) else None
         if depth is not None:
-            y = np.arange(light.shape[0]) * step * depth.shape[0] // image.shape[0]
-            x = np.arange(light.shape[1]) * step * depth.shape[1] // image.shape[1]
-            sky.append(light[np.isinf(depth[y][:, x])])
-    known = np.concatenate(sky) if sky else np.zeros(0)
-    enough = len(known) >= _ENOUGH
-    seen = known if enough else np.concatenate(found)
-    return float(np.clip(np.quantile(seen, 0.5 if night and not enough else 0.97) / 255, 0.06, 1.0))
+            rows = np.arange(luminance.shape[0]) * step * depth.shape[0] // image.shape[0]
+            columns = np.arange(luminance.shape[1]) * step * depth.shape[1] // image.shape[1]
+            sky_pixels.append(luminance[np.isinf(depth[rows][:, columns])])
+    known_sky = np.concatenate(sky_pixels) if sky_pixels else np.zeros(0)
+    enough = len(known_sky) >= _ENOUGH
+    sample = known_sky if enough else np.concatenate(brightness)
+    return float(np.clip(np.quantile(sample, 0.5 if night and not enough else 0.97) / 255, 0.06, 1.0))
 
 
 def viewing_direction(frame: Frame) -> float:
-    """Heading of the optical axis in the world, radians."""
+    """Return the heading of the optical axis in the world, radians."""
     axis = camera_to_world(frame)[:3, 2]
     return float(np.arctan2(axis[1], axis[0]))

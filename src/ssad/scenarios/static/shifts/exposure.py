@@ -1,4 +1,4 @@
-"""Overexposure: the picture of a camera that exposes for longer, in light, through its own tone curve."""
+"""Overexposure: the image of a longer exposure in linear light, through the tone curve of the camera."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 
 @lru_cache(maxsize=16)
 def exposure_table(stops: float) -> U8:
-    """The code [256] of each code in a picture exposed by `stops` EV more.
+    """Return the code [256] of each code in an image exposed by `stops` EV more.
 
-    The curve of `ssad.rendering.camera`: linear up to `KNEE`, a soft shoulder above, full at `BRIGHTEST`. What is white
-    in the given picture is taken for just so bright.
+    The curve of `ssad.camera`: linear up to `KNEE`, a soft shoulder above, saturated at `BRIGHTEST`. White in the
+    given image is assumed to be exactly saturated.
     """
-    shown = to_linear(np.arange(256))
-    most = KNEE + (1 - KNEE) * (1 - np.exp(-(BRIGHTEST - KNEE) / SHOULDER))
-    rest = 1 - (np.clip(shown, KNEE, most) - KNEE) / (1 - KNEE)
-    light = np.where(shown > KNEE, KNEE - SHOULDER * np.log(rest), shown)
-    longer = np.minimum(light * 2.0**stops, BRIGHTEST)
-    soft = KNEE + (1 - KNEE) * (1 - np.exp(-(np.maximum(longer, KNEE) - KNEE) / SHOULDER))
-    return np.rint(to_codes(np.where(longer > KNEE, soft, longer))).astype(np.uint8)
+    displayed = to_linear(np.arange(256))
+    max_displayed = KNEE + (1 - KNEE) * (1 - np.exp(-(BRIGHTEST - KNEE) / SHOULDER))
+    # Inverse of the tone curve above the knee.
+    headroom = 1 - (np.clip(displayed, KNEE, max_displayed) - KNEE) / (1 - KNEE)
+    exposure = np.where(displayed > KNEE, KNEE - SHOULDER * np.log(headroom), displayed)
+    longer_exposure = np.minimum(exposure * 2.0**stops, BRIGHTEST)
+    compressed = KNEE + (1 - KNEE) * (1 - np.exp(-(np.maximum(longer_exposure, KNEE) - KNEE) / SHOULDER))
+    return np.rint(to_codes(np.where(longer_exposure > KNEE, compressed, longer_exposure))).astype(np.uint8)
 
 
 def overexpose(batch: Batch, specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
-    """overexposure, in both calibrations."""
+    """Apply overexposure, in both calibrations."""
     stops = [OVEREXPOSURE[spec.severity - 1] for spec in specs]
-    out = batch.like()
-    dim, words, chunk = batch.chunks()
+    result = batch.like()
+    thread_shape, word_count, chunk_size = batch.chunks()
     tables = on(batch, np.stack([exposure_table(value) for value in stops]), wp.uint8)
-    batch.launch(recode, dim, [batch.words(), tables, words, chunk], out.words())
-    return out, [Applied(True, {"stops": value}) for value in stops]
+    batch.launch(recode, thread_shape, [batch.words(), tables, word_count, chunk_size], result.words())
+    return result, [Applied(True, {"stops": value}) for value in stops]

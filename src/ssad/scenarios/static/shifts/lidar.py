@@ -1,4 +1,4 @@
-"""The LiDAR twin of each shift that has one: the same weather, sun and objects, in the points of a sweep.
+"""LiDAR twins of the shifts: the same weather, sun and objects in the points of a sweep.
 
 Points [P, 5] float32 in the sensor frame: x, y, z (m), intensity (0 to 255), ring; more columns are kept. Lost points
 are removed.
@@ -20,14 +20,27 @@ from ssad.scenarios.static.shifts.spec import CAMERA_ONLY, ShiftSpec
 from ssad.scenarios.static.shifts.sun import AT_NIGHT, NIGHT, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
 
-FARTHEST = 70.0  # m at which a dark target (intensity 1) is just seen in clear air by the 32-beam sensor of nuScenes
+FARTHEST = 70.0  # m: range at which the 32-beam sensor of nuScenes just detects intensity 1 in clear air
 _BETA_0 = 1e-6 / np.pi  # reflectivity constant of Hahner et al. 2021
 
 
 def shift_points(
     points: npt.ArrayLike, frame: SweepFrame, spec: ShiftSpec, *, contexts: Mapping[str, SceneContext] | None = None
 ) -> tuple[F32, Applied]:
-    """Applies a shift to the points of a sweep. ConfigError unless they are [P, 4 or more]."""
+    """Apply a shift to the points of a sweep.
+
+    Args:
+        points: [P, 4 or more].
+        frame: Frame of the sweep.
+        spec: The shift.
+        contexts: Constants of each scene, by its key.
+
+    Returns:
+        The points, and a record of the shift.
+
+    Raises:
+        ConfigError: The points have another shape.
+    """
     cloud = np.array(points, np.float32)
     if cloud.ndim != 2 or cloud.shape[1] < 4:
         raise ConfigError(f"points must be [P, 5] (x, y, z, intensity, ring), not {list(cloud.shape)}")
@@ -59,22 +72,24 @@ def _ranges(cloud: F32) -> F64:
 
 
 def _noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
-    """Gaussian or uniform noise of the range (paper: of each coordinate); impulse: some ranges are wrong."""
-    count, step = len(cloud), spec.severity - 1
-    paper = spec.calibration == "paper"
+    """Add range noise (paper: noise of each coordinate); for impulse noise, replace some ranges."""
+    count, level_index = len(cloud), spec.severity - 1
+    is_paper = spec.calibration == "paper"
     if spec.name == "impulse":
-        share = table.LIDAR_IMPULSE[step]
-        struck = draws.permutation(count)[: int(count * share)]
-        if paper:
-            cloud[struck, :3] += draws.choice([-0.1, 0.1], size=(len(struck), 3)).astype(np.float32)
+        share = table.LIDAR_IMPULSE[level_index]
+        struck_indices = draws.permutation(count)[: int(count * share)]
+        if is_paper:
+            cloud[struck_indices, :3] += draws.choice([-0.1, 0.1], size=(len(struck_indices), 3)).astype(np.float32)
         else:
-            ranges = _ranges(cloud[struck])
-            cloud[struck, :3] *= (draws.uniform(1.0, np.maximum(ranges, 1.5)) / ranges).astype(np.float32)[:, None]
-        return cloud, Applied(len(struck) > 0, {"points": len(struck)})
-    level = table.LIDAR_NOISE[step]
-    size = (count, 3) if paper else (count,)
+            ranges = _ranges(cloud[struck_indices])
+            cloud[struck_indices, :3] *= (draws.uniform(1.0, np.maximum(ranges, 1.5)) / ranges).astype(np.float32)[
+                :, None
+            ]
+        return cloud, Applied(len(struck_indices) > 0, {"points": len(struck_indices)})
+    level = table.LIDAR_NOISE[level_index]
+    size = (count, 3) if is_paper else (count,)
     noise = draws.normal(0, level, size) if spec.name == "gaussian" else draws.uniform(-level, level, size)
-    if paper:
+    if is_paper:
         cloud[:, :3] += noise.astype(np.float32)
     else:
         cloud[:, :3] *= (1 + noise / _ranges(cloud)).astype(np.float32)[:, None]
@@ -82,136 +97,148 @@ def _noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32
 
 
 def inside(cloud: F32 | F64, matrix: F64, centre: F64) -> Bool:
-    """Which points [P] lie in the box that the matrix [3, 3] makes of the unit cube."""
+    """Return a mask of the points [P] in the box that the matrix [3, 3] makes of the unit cube."""
     local = (cloud[:, :3] - centre) @ np.linalg.inv(matrix).T
     return np.asarray((np.abs(local) <= 0.5).all(1))
 
 
 def _objects(cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
-    """The points in each box move with it. Each point belongs to one box, the first that holds it."""
+    """Move the points in each box with it. Each point belongs to the first box that contains it."""
     boxes = frame.boxes
     if not len(boxes) or not len(cloud):
         return cloud, Applied(False, {"objects": 0})
     pose = frame.ego_to_world @ frame.to_ego
-    turn, place = pose[:3, :3].T, pose[:3, 3]
-    old, old_centre = affine(boxes)
-    new, new_centre = deformed(spec, boxes, scene=frame.scene, sample=frame.sample, lidar=True)
-    old, new = turn @ old, turn @ new
-    old_centre, new_centre = (old_centre - place) @ turn.T, (new_centre - place) @ turn.T
-    free = np.ones(len(cloud), bool)
-    result, moved, done, still = cloud.copy(), 0, 0, 0
+    world_to_sensor, sensor_position = pose[:3, :3].T, pose[:3, 3]
+    old_maps, old_centres = affine(boxes)
+    new_maps, new_centres = deformed(spec, boxes, scene=frame.scene, sample=frame.sample, lidar=True)
+    old_maps, new_maps = world_to_sensor @ old_maps, world_to_sensor @ new_maps
+    old_centres, new_centres = (
+        (old_centres - sensor_position) @ world_to_sensor.T,
+        (new_centres - sensor_position) @ world_to_sensor.T,
+    )
+    is_unassigned = np.ones(len(cloud), bool)
+    result, moved_count, object_count, still_count = cloud.copy(), 0, 0, 0
     reach = np.linalg.norm(boxes.size_lwh, axis=1) / 2 + 0.5
-    for n in range(len(boxes)):
-        near = np.flatnonzero(free & (np.abs(cloud[:, :2] - old_centre[n, :2]).max(1) < reach[n]))
-        mine = near[inside(cloud[near], old[n], old_centre[n])]
-        if not len(mine):
+    for box_index in range(len(boxes)):
+        nearby = np.flatnonzero(
+            is_unassigned & (np.abs(cloud[:, :2] - old_centres[box_index, :2]).max(1) < reach[box_index])
+        )
+        object_points = nearby[inside(cloud[nearby], old_maps[box_index], old_centres[box_index])]
+        if not len(object_points):
             continue
-        free[mine] = False
-        local = (cloud[mine, :3] - old_centre[n]) @ np.linalg.inv(old[n]).T
+        is_unassigned[object_points] = False
+        local = (cloud[object_points, :3] - old_centres[box_index]) @ np.linalg.inv(old_maps[box_index]).T
         if spec.name == "motion_blur":
-            shift = _streak(local, boxes.velocity[n] @ turn.T, spec, draws)
-            if shift is None:
-                still += 1
+            displacement = _streak(local, boxes.velocity[box_index] @ world_to_sensor.T, spec, draws)
+            if displacement is None:
+                still_count += 1
                 continue
-            result[mine, :3] = cloud[mine, :3] + shift
+            result[object_points, :3] = cloud[object_points, :3] + displacement
         else:
-            result[mine, :3] = local @ new[n].T + new_centre[n]
-        moved, done = moved + len(mine), done + 1
-    skipped = {"it does not move or its velocity is unknown": still} if still else {}
-    return result, Applied(done > 0, {"objects": done, "points": moved}, skipped)
+            result[object_points, :3] = local @ new_maps[box_index].T + new_centres[box_index]
+        moved_count, object_count = moved_count + len(object_points), object_count + 1
+    skipped = {"it does not move or its velocity is unknown": still_count} if still_count else {}
+    return result, Applied(object_count > 0, {"objects": object_count, "points": moved_count}, skipped)
 
 
 def _streak(local: F64, velocity: F64, spec: ShiftSpec, draws: np.random.Generator) -> F32 | None:
-    """Displacement of an object's points. Physical: by its velocity over the exposure; paper: thirds shifted apart."""
+    """Return the displacement of an object's points: by its velocity over the exposure; paper: by shifted thirds."""
     speed = float(np.linalg.norm(velocity))
     if not np.isfinite(speed) or speed < 0.2:
         return None
     if spec.calibration == "paper":
-        third = np.clip(np.floor((local[:, 0] + 0.5) * 3), 0, 2) - 1
-        return np.asarray(third[:, None] * 0.2 * spec.severity * velocity / speed, np.float32)
-    late = draws.uniform(-0.5, 0.5, len(local)) * table.BLUR_EXPOSURE[spec.severity - 1]
-    return np.asarray(late[:, None] * velocity, np.float32)
+        part_index = np.clip(np.floor((local[:, 0] + 0.5) * 3), 0, 2) - 1
+        return np.asarray(part_index[:, None] * 0.2 * spec.severity * velocity / speed, np.float32)
+    time_offset = draws.uniform(-0.5, 0.5, len(local)) * table.BLUR_EXPOSURE[spec.severity - 1]
+    return np.asarray(time_offset[:, None] * velocity, np.float32)
 
 
 def _sun(
     cloud: F32, frame: SweepFrame, spec: ShiftSpec, context: SceneContext, draws: np.random.Generator
 ) -> tuple[F32, Applied]:
-    """Towards the sun the receiver is blind; background light makes some ranges noise of 2 m."""
-    step = spec.severity - 1
-    toward = (frame.ego_to_world @ frame.to_ego)[:3, :3].T @ sun_direction(spec, context)
+    """Remove the points around the sun, where the receiver is blind, and replace some ranges by noise of 2 m."""
+    level_index = spec.severity - 1
+    sun_in_sensor = (frame.ego_to_world @ frame.to_ego)[:3, :3].T @ sun_direction(spec, context)
     ranges = _ranges(cloud)
-    angle = np.degrees(np.arccos(np.clip((cloud[:, :3] @ toward) / ranges, -1, 1)))
-    seen = angle > table.LIDAR_SUN_CONE[step]
-    struck = draws.random(len(cloud)) < table.LIDAR_SUN[step]
+    angle = np.degrees(np.arccos(np.clip((cloud[:, :3] @ sun_in_sensor) / ranges, -1, 1)))
+    is_returned = angle > table.LIDAR_SUN_CONE[level_index]
+    is_noisy = draws.random(len(cloud)) < table.LIDAR_SUN[level_index]
     noise = np.maximum(1 + draws.normal(0, 2.0, len(cloud)) / ranges, 0.2)
-    cloud[struck, :3] *= noise[struck].astype(np.float32)[:, None]
-    return cloud[seen], Applied(True, {"lost": int((~seen).sum()), "noisy": int((struck & seen).sum())})
+    cloud[is_noisy, :3] *= noise[is_noisy].astype(np.float32)[:, None]
+    return cloud[is_returned], Applied(
+        True, {"lost": int((~is_returned).sum()), "noisy": int((is_noisy & is_returned).sum())}
+    )
 
 
 def fog_response(beta: float) -> tuple[F64, F64, F64]:
-    """Strongest echo of the fog itself, in front of a hard target.
+    """Return the strongest echo of the fog itself in front of a hard target.
 
     Args:
         beta: Extinction, 1/m.
 
     Returns:
         Three arrays [K]. Ranges R of the hard target, m; the strongest echo of the fog before it, s / m^2 (multiplied
-        by R^2 and by backscatter over beta_0, it is relative to the hard target's echo in clear air); range from which
-        it comes, m.
+        by R^2 and by backscatter over beta_0, it is relative to the hard target's echo in clear air); range from
+        which it comes, m.
 
-    Source: Hahner, Sakaridis, Dai and Van Gool, ICCV 2021, equation 10: the echo integrated over a pulse of 2 x 10 ns.
+    Source: Hahner, Sakaridis, Dai and Van Gool, ICCV 2021, equation 10: the echo integrated over a pulse of 2 x 10
+    ns.
     """
     ranges = np.arange(0.5, 120.0, 0.1)
-    half_pulse, light = 10e-9, 2.998e8
-    t = np.linspace(0, 2 * half_pulse, 41)
-    back = ranges[:, None] - light * t[None] / 2
-    crossover = np.clip((back - 0.9) / 0.1, 0, 1)
-    safe = np.maximum(back, 0.5)
-    echo = np.sin(np.pi * t / (2 * half_pulse)) ** 2 * np.exp(-2 * beta * safe) / safe**2 * crossover
-    strength = np.trapezoid(echo, t, axis=1)
-    best = np.maximum.accumulate(strength)
-    place = np.maximum.accumulate(np.where(strength >= best, np.arange(len(ranges)), 0))
-    return ranges, best, ranges[place]
+    half_pulse, light_speed = 10e-9, 2.998e8
+    pulse_time = np.linspace(0, 2 * half_pulse, 41)
+    echo_range = ranges[:, None] - light_speed * pulse_time[None] / 2
+    crossover = np.clip((echo_range - 0.9) / 0.1, 0, 1)
+    safe_range = np.maximum(echo_range, 0.5)
+    echo = (
+        np.sin(np.pi * pulse_time / (2 * half_pulse)) ** 2 * np.exp(-2 * beta * safe_range) / safe_range**2 * crossover
+    )
+    strength = np.trapezoid(echo, pulse_time, axis=1)
+    # A running maximum serves all target ranges with one integral.
+    strongest = np.maximum.accumulate(strength)
+    strongest_index = np.maximum.accumulate(np.where(strength >= strongest, np.arange(len(ranges)), 0))
+    return ranges, strongest, ranges[strongest_index]
 
 
 def _fog(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
-    """Echoes get weaker by exp(-2 beta R); where the fog's own echo is stronger it is taken for the target."""
+    """Attenuate echoes by exp(-2 beta R); a stronger echo of the fog replaces that of the target."""
     beta = extinction(spec)
     ranges = _ranges(cloud)
-    grid, best, place = fog_response(beta)
+    range_grid, strongest, echo_ranges = fog_response(beta)
     backscatter = 0.046 * beta / 3.0  # 0.046 / MOR
-    index = np.clip(((ranges - grid[0]) / 0.1).astype(int), 0, len(grid) - 1)
-    before = cloud[:, 3].copy()
-    hard = before * np.exp(-2 * beta * ranges)
-    soft = cloud[:, 3] * ranges**2 * backscatter / _BETA_0 * best[index]
-    fooled = soft > hard
-    near = np.clip(place[index] + draws.normal(0, 0.3, len(cloud)), 0.8, None)
-    cloud[fooled, :3] *= (np.minimum(near, ranges) / ranges)[fooled].astype(np.float32)[:, None]
-    cloud[:, 3] = np.where(fooled, np.minimum(soft, 255), hard).astype(np.float32)
-    seen = _detected(before, ranges, beta) | fooled
-    return cloud[seen], Applied(True, {"lost": int((~seen).sum()), "moved": int(fooled.sum())})
+    range_index = np.clip(((ranges - range_grid[0]) / 0.1).astype(int), 0, len(range_grid) - 1)
+    intensity = cloud[:, 3].copy()
+    target_echo = intensity * np.exp(-2 * beta * ranges)
+    fog_echo = cloud[:, 3] * ranges**2 * backscatter / _BETA_0 * strongest[range_index]
+    is_fog_echo = fog_echo > target_echo
+    echo_range = np.clip(echo_ranges[range_index] + draws.normal(0, 0.3, len(cloud)), 0.8, None)
+    cloud[is_fog_echo, :3] *= (np.minimum(echo_range, ranges) / ranges)[is_fog_echo].astype(np.float32)[:, None]
+    cloud[:, 3] = np.where(is_fog_echo, np.minimum(fog_echo, 255), target_echo).astype(np.float32)
+    is_returned = _detected(intensity, ranges, beta) | is_fog_echo
+    return cloud[is_returned], Applied(True, {"lost": int((~is_returned).sum()), "moved": int(is_fog_echo.sum())})
 
 
 def _detected(intensity: F32, ranges: F64, beta: float) -> Bool:
-    """Echoes still above the sensor's threshold: that of intensity 1 at FARTHEST in clear air. What was there stays."""
-    lit = np.maximum(intensity, 1) / ranges**2
-    return np.asarray(lit * np.exp(-2 * beta * ranges) >= np.minimum(1.0 / FARTHEST**2, 0.5 * lit))
+    """Return a mask of the echoes above the threshold, that of intensity 1 at the maximum range in clear air."""
+    clear_echo = np.maximum(intensity, 1) / ranges**2
+    # Half the clear echo is also enough: returns that were already faint are not all lost.
+    return np.asarray(clear_echo * np.exp(-2 * beta * ranges) >= np.minimum(1.0 / FARTHEST**2, 0.5 * clear_echo))
 
 
 def _precipitation(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
-    """Echoes get weaker; now and then a drop or flake near the sensor is hit first (Goodin et al. 2019)."""
+    """Attenuate echoes and replace some by nearby drops or flakes (Goodin et al. 2019)."""
     beta = extinction(spec)
     ranges = _ranges(cloud)
-    before = cloud[:, 3].copy()
-    hard = before * np.exp(-2 * beta * ranges)
-    # a beam meets particles at the rate beta; one is seen if large and near enough
+    intensity = cloud[:, 3].copy()
+    target_echo = intensity * np.exp(-2 * beta * ranges)
+    # a beam meets particles at the rate beta; it detects one that is large and near enough
     rate = beta * (0.06 if spec.name == "rain" else 0.4)
-    meets = draws.exponential(1 / rate, len(cloud)) + 1.0
-    hit = meets < np.minimum(ranges, 25.0 if spec.name == "snow" else 12.0)
-    cloud[hit, :3] *= (meets / ranges)[hit].astype(np.float32)[:, None]
-    bright = draws.uniform(0, 12 if spec.name == "rain" else 40, len(cloud))
-    cloud[:, 3] = np.where(hit, bright, hard).astype(np.float32)
+    particle_range = draws.exponential(1 / rate, len(cloud)) + 1.0
+    is_particle = particle_range < np.minimum(ranges, 25.0 if spec.name == "snow" else 12.0)
+    cloud[is_particle, :3] *= (particle_range / ranges)[is_particle].astype(np.float32)[:, None]
+    particle_echo = draws.uniform(0, 12 if spec.name == "rain" else 40, len(cloud))
+    cloud[:, 3] = np.where(is_particle, particle_echo, target_echo).astype(np.float32)
     jitter = draws.normal(0, 0.02 * (1 - np.exp(-beta * ranges)), len(cloud))
-    cloud[~hit, :3] *= (1 + jitter / ranges)[~hit].astype(np.float32)[:, None]
-    seen = _detected(before, ranges, beta) | hit
-    return cloud[seen], Applied(True, {"lost": int((~seen).sum()), "moved": int(hit.sum())})
+    cloud[~is_particle, :3] *= (1 + jitter / ranges)[~is_particle].astype(np.float32)[:, None]
+    is_returned = _detected(intensity, ranges, beta) | is_particle
+    return cloud[is_returned], Applied(True, {"lost": int((~is_returned).sum()), "moved": int(is_particle.sum())})

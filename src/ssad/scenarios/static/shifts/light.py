@@ -1,6 +1,6 @@
-"""From sRGB codes to linear light and back, as whole numbers in tables.
+"""Conversion from sRGB codes to linear light and back, with integer tables.
 
-Light adds up in the air, the lens and the sensor, so what mixes light does it in linear light; a picture holds codes.
+Light adds up in the air, the lens and the sensor, so mixing is done in linear light; images hold codes.
 """
 
 from __future__ import annotations
@@ -16,24 +16,27 @@ from ssad.scenarios.static.shifts.kernels.light import CODES, FULL
 
 
 def to_linear(codes: Any) -> F64:
-    """Linear light, 1 for white, of sRGB codes in 0..255."""
+    """Return the linear light, 1 for white, of sRGB codes in 0..255."""
     share = np.asarray(codes, np.float64) / 255
+    # Clamped, since `where` evaluates both branches.
     return np.where(share <= 0.04045, share / 12.92, ((np.maximum(share, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def to_codes(light: Any) -> F64:
-    """Linear light in 0..1 as sRGB codes in 0..255, not rounded."""
-    given = np.asarray(light, np.float64)
-    return 255 * np.where(given <= 0.0031308, given * 12.92, 1.055 * np.maximum(given, 0.0031308) ** (1 / 2.4) - 0.055)
+    """Return linear light in 0..1 as sRGB codes in 0..255, not rounded."""
+    linear = np.asarray(light, np.float64)
+    return 255 * np.where(
+        linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    )
 
 
 def code_table() -> U8:
-    """The codes of `CODES` equal parts of linear light, each of its middle."""
+    """Return the codes of `CODES` equal intervals of linear light, each at its centre."""
     return np.rint(to_codes((np.arange(CODES) + 0.5) / CODES)).astype(np.uint8)
 
 
 @lru_cache(maxsize=16)
 def tables(device: str) -> tuple[Any, Any]:
-    """On a device: light (`FULL` is white) of each code, int32 [256], and the codes of `CODES` parts of it, uint8."""
+    """Return two tables on a device: light (`FULL` is white) of each code, and codes of `CODES` parts of light."""
     linear = np.rint(to_linear(np.arange(256)) * FULL).astype(np.int32)
     return wp.array(linear, dtype=wp.int32, device=device), wp.array(code_table(), dtype=wp.uint8, device=device)

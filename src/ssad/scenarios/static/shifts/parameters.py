@@ -1,4 +1,4 @@
-"""Severity tables: index 0 is severity 1. Each says where its figures come from.
+"""Severity tables (index 0 is severity 1), each with the source of its figures.
 
 [3DC] 3D_Corruptions_AD (Dong et al. 2023), [IC] imagecorruptions (Hendrycks and Dietterich 2019), [imgaug] imgaug's
 RainLayer as 3DC calls it.
@@ -103,20 +103,24 @@ PAPER_LIDAR_ROTATION: Final[Five] = (1.0, 3.0, 5.0, 7.0, 9.0)
 
 
 def rain_extinction(rate: float) -> float:
-    """Extinction of visible light in rain of `rate` mm/h, 1/m: 1.07 rate^(2/3) dB/km (Carbonneau and Wisely 1998)."""
+    """Return the extinction of light in rain of `rate` mm/h, 1/m (Carbonneau and Wisely 1998)."""
+    # 1.07 rate^(2/3) dB/km; 0.2303 = ln(10) / 10 converts dB to nepers.
     return float(1.07 * rate ** (2 / 3) / 1000 * 0.2303)
 
 
 def snow_extinction(rate: float) -> float:
-    """Extinction in snow of `rate` mm/h of water, 1/m: a visual range of 1 km / rate."""
+    """Return the extinction in snow of `rate` mm/h of water, 1/m: a visual range of 1 km / rate."""
     return 3.0 * rate / 1000
 
 
 def rain_slope(rate: float) -> float:
-    """Exponent of the drop sizes, 1/mm (Marshall and Palmer 1948); 8000 drops a m^3 and mm at diameter 0."""
+    """Return the exponent of the drop sizes, 1/mm; 8000 drops per m^3 and mm at diameter 0.
+
+    Source: Marshall and Palmer 1948.
+    """
     return float(4.1 * rate**-0.21)
 
 
 def snow_slope(rate: float) -> float:
-    """Exponent of the melted flake sizes, 1/mm (Sekhon and Srivastava 1970)."""
+    """Return the exponent of the melted flake sizes, 1/mm (Sekhon and Srivastava 1970)."""
     return float(2.29 * rate**-0.45)

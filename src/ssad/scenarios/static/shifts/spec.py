@@ -1,6 +1,6 @@
-"""What a shift is called, how strong it is, and where its random numbers come from.
+"""Names, severities and random keys of shifts.
 
-The 11 shifts are those of the paper (III.A.2); some more stand beside them. Two calibrations: `paper`, the published
+The 11 shifts are those of the paper (III.A.2), plus a few more. There are two calibrations: `paper`, the published
 severity tables of 3D_Corruptions_AD (Dong et al., CVPR 2023), image by image; `physical` (default), parameters with
 units, one weather in the world for all cameras and the LiDAR, object by object.
 """
@@ -31,13 +31,13 @@ SHIFTS: Final[dict[str, tuple[Family, str]]] = {
     "rotation": ("object", "objects turned about the vertical"),
     "motion_blur": ("object", "objects blurred along their motion"),
 }
-# beside the paper's, used only where they are named: suites and tables keep to the paper's by default
+# additions to the paper's, used only if named: suites and tables default to the paper's
 EXTRA: Final[dict[str, tuple[Family, str]]] = {
     "overexposure": ("sensor", "exposed for too long: bright parts are white"),
     "anomaly": ("environment", "objects of no class on the road: debris, animals, overturned vehicles, fallen trees"),
 }
 KNOWN: Final = SHIFTS | EXTRA
-PLACING: Final = ("anomaly",)  # put objects into the scene before its sensors
+PLACING: Final = ("anomaly",)  # shifts that add objects to the scene
 CAMERA_ONLY: Final = ("overexposure",)  # no LiDAR twin
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
@@ -46,10 +46,10 @@ VERSIONS: Final[dict[Calibration, int]] = {"physical": 3, "paper": 3}
 
 @dataclass(frozen=True, slots=True)
 class ShiftSpec:
-    """A shift to apply.
+    """Shift to apply.
 
-    Random numbers depend on the seed, the shift and what they are for, not on the severity: a sun stays where it is
-    when it becomes stronger, so that severities can be compared in pairs.
+    Random numbers depend on the seed, the shift and their purpose, not on the severity: a sun stays in place as it
+    gets stronger, so that severities can be compared in pairs.
 
     Attributes:
         name: Name of the shift.
@@ -76,16 +76,16 @@ class ShiftSpec:
 
     @property
     def family(self) -> Family:
-        """environment, sensor or object."""
+        """Family of the shift: environment, sensor or object."""
         return KNOWN[self.name][0]
 
     @property
     def places_objects(self) -> bool:
-        """Whether it puts objects into the scene, which its sensors then see."""
+        """True if the shift adds objects to the scene, which its sensors then observe."""
         return self.name in PLACING
 
     def at(self, severity: int) -> ShiftSpec:
-        """The same shift at another severity."""
+        """Return the same shift at another severity."""
         return replace(self, severity=severity)
 
     def key(self, *scope: object) -> int:
@@ -98,20 +98,20 @@ class ShiftSpec:
 
 
 def random_severity(spec: ShiftSpec, scene: str, sample: str) -> int:
-    """Severity 1 to 5 for "random": by sample in the paper's calibration, by scene in the physical one.
+    """Draw severity 1 to 5 for "random": by sample in the paper's calibration, by scene in the physical one.
 
-    The paper says only that the strength is a random value from 1 to 5; weather does not change twice a second.
+    The paper only says that the strength is a random value from 1 to 5; weather does not change twice a second.
     """
     scope = sample if spec.calibration == "paper" else scene
     return int(spec.generator("severity", scope).integers(1, 6))
 
 
 def dealt_severities(spec: ShiftSpec, scenes: Iterable[str]) -> dict[str, int]:
-    """Severity 1 to 5 of each scene, dealt: each severity as often as any other, give or take one.
+    """Deal severities 1 to 5 to scenes, each as often as any other, plus or minus one.
 
-    For the physical calibration, where a scene has one. Draws of one scene by itself (`random_severity`) make the mean
-    severity of a few dozen scenes a matter of luck; here it depends on which other scenes there are.
+    For the physical calibration, which has one severity per scene. Independent draws (`random_severity`) leave the
+    mean severity of a few dozen scenes to chance; dealing makes it depend on the set of scenes instead.
     """
     order = sorted(set(scenes), key=lambda scene: (spec.key("deal", scene), scene))
     first = int(spec.generator("deal").integers(5))
-    return {scene: 1 + (first + place) % 5 for place, scene in enumerate(order)}
+    return {scene: 1 + (first + index) % 5 for index, scene in enumerate(order)}

@@ -1,4 +1,4 @@
-"""A low sun of the physical calibration: one in the world, in the pictures of the cameras that face it."""
+"""Low sun of the physical calibration: one in the world, visible to the cameras that face it."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ssad.scenarios.static.shifts.kernels import veil
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
 AT_NIGHT, HIDDEN = "it is night", "the sun is behind something"
-NO_SUN = frozenset({AT_NIGHT, HIDDEN})  # reasons for which a whole drive may be left as it is
-SKY = 120.0  # m from which on nothing hides the sun
+NO_SUN = frozenset({AT_NIGHT, HIDDEN})  # reasons for which a whole episode may stay unchanged
+SKY = 120.0  # m: surfaces beyond this distance do not hide the sun
 NIGHT = 0.35  # brightness of the sky below which there is no sun
 FACING = 75.0  # degrees from the optical axis beyond which the sun adds no light
 
 
 def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
-    """Unit vector towards the sun [3], world.
+    """Return the unit vector towards the sun [3], world.
 
     It is the context's, or else drawn 2 to 12 degrees high, within 15 degrees of the ego's initial heading.
     """
@@ -35,51 +35,54 @@ def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
 def choose_sun(
     spec: ShiftSpec, context: SceneContext, pictures: Sequence[tuple[Frame, U8]]
 ) -> tuple[float, float, float]:
-    """A sun that is visible in one of the pictures of a moment.
+    """Return a sun that is visible in one of the images of a moment.
 
     Up to 16 directions are tried, each drawn one degree higher than the one before, the first as by `sun_direction`.
 
     Args:
         spec: The shift.
         context: The scene.
-        pictures: Frame and picture [H, W, 3] of each camera.
+        pictures: Frame and image [H, W, 3] of each camera.
 
     Returns:
         Unit vector, world: the first direction in which the sun is visible; the first of all if it is always hidden.
     """
-    drawn = list(islice(_draws(spec, context), 16))
+    candidates = list(islice(_draws(spec, context), 16))
     depths: dict[int, F32 | None] = {}
-    for toward in drawn:
-        direction = np.array(toward)
-        for n, (frame, image) in enumerate(pictures):
+    for candidate in candidates:
+        direction = np.array(candidate)
+        for camera_index, (frame, image) in enumerate(pictures):
             if sun_in_picture(frame, direction):
-                if n not in depths:
-                    depths[n] = sun_depth(frame, image)
-                if free_sun(frame, depths[n], direction) > 0.5:
-                    return toward
-    return drawn[0]
+                # Depth is costly, so it is computed once, and only for cameras that a candidate falls into.
+                if camera_index not in depths:
+                    depths[camera_index] = sun_depth(frame, image)
+                if free_sun(frame, depths[camera_index], direction) > 0.5:
+                    return candidate
+    return candidates[0]
 
 
 def _draws(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, float, float]]:
-    """Unit vectors, world, without end."""
+    """Yield unit vectors towards the sun, world, without end."""
     draws = spec.generator("sun", context.scene)
-    for number in count():
+    for attempt in count():
         heading = context.heading + np.radians(draws.uniform(-15, 15))
-        height = np.radians(draws.uniform(2, 12) + number)
-        toward = np.cos(heading) * np.cos(height), np.sin(heading) * np.cos(height), np.sin(height)
-        yield float(toward[0]), float(toward[1]), float(toward[2])
+        elevation = np.radians(draws.uniform(2, 12) + attempt)
+        direction = np.cos(heading) * np.cos(elevation), np.sin(heading) * np.cos(elevation), np.sin(elevation)
+        yield float(direction[0]), float(direction[1]), float(direction[2])
 
 
 def sun_angle(frame: Frame, toward: F64) -> float:
     """Angle between a direction [3] in the world and the optical axis, degrees."""
-    seen = camera_to_world(frame)[:3, 2] @ toward
-    return float(np.degrees(np.arccos(np.clip(seen, -1, 1))))
+    cosine = camera_to_world(frame)[:3, 2] @ toward
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _place(frame: Frame, toward: F64) -> tuple[float, float]:
     """Pixel x, y of a direction [3] in the world that lies in front of the camera."""
-    seen, k = camera_to_world(frame)[:3, :3].T @ toward, frame.camera.intrinsic
-    return float(k[0, 0] * seen[0] / seen[2] + k[0, 2]), float(k[1, 1] * seen[1] / seen[2] + k[1, 2])
+    local, intrinsic = camera_to_world(frame)[:3, :3].T @ toward, frame.camera.intrinsic
+    return float(intrinsic[0, 0] * local[0] / local[2] + intrinsic[0, 2]), float(
+        intrinsic[1, 1] * local[1] / local[2] + intrinsic[1, 2]
+    )
 
 
 def sun_in_picture(frame: Frame, toward: F64) -> bool:
@@ -91,7 +94,7 @@ def sun_in_picture(frame: Frame, toward: F64) -> bool:
 
 
 def sun_depth(frame: Frame, image: U8) -> F32 | None:
-    """Depth of a picture [H, W, 3] on the quarter grid, metres, by which the sun is hidden; None: nothing is known."""
+    """Return the depth of an image [H, W, 3] on the quarter grid, metres; None if it is only assumed."""
     height, width = image.shape[:2]
     grid, source = depth_of(frame, image, -(-height // 4), -(-width // 4))
     return None if source == "assumed" else grid
@@ -111,52 +114,57 @@ def free_sun(frame: Frame, depth: F32 | None, toward: F64) -> float:
     if depth is None:
         return 1.0
     x, y = _place(frame, toward)
-    row, column, reach = int(y / 4), int(x / 4), max(2, depth.shape[1] // 65)
-    around = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-    return float((around > SKY).mean())
+    row, column, radius = int(y / 4), int(x / 4), max(2, depth.shape[1] // 65)
+    neighbourhood = depth[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
+    return float((neighbourhood > SKY).mean())
 
 
 def add_sun(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """sunlight: glare is added, the exposure goes down with it; none by night, or where the sun is hidden."""
-    toward = np.zeros((batch.count, 3))
-    place = np.zeros((batch.count, 3))
+    """Apply sunlight: add glare and lower the exposure with it; nothing by night or with a hidden sun."""
+    local_directions = np.zeros((batch.count, 3))
+    sun_pixels = np.zeros((batch.count, 3))
     strength, gain = np.zeros(batch.count), np.ones(batch.count)
-    done: list[Applied] = []
+    records: list[Applied] = []
 
-    for b, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
+    for index, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
         if context.light < NIGHT:
-            done.append(Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
+            records.append(Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
             continue
-        world = sun_direction(spec, context)
-        toward[b] = camera_to_world(frame)[:3, :3].T @ world
-        angle = sun_angle(frame, world)
+        direction = sun_direction(spec, context)
+        local_directions[index] = camera_to_world(frame)[:3, :3].T @ direction
+        angle = sun_angle(frame, direction)
         if angle > FACING:
-            done.append(Applied(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1}))
+            records.append(
+                Applied(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1})
+            )
             continue
-        x, y = _place(frame, world)
-        place[b] = x, y, 1
-        inside, free = sun_in_picture(frame, world), frame.sun
-        if free is None:
-            free = free_sun(frame, sun_depth(frame, batch.picture(b)), world) if inside else 1.0
-        details: dict[str, Any] = {"angle_deg": round(angle, 1), "in_view": inside, "free": round(free, 2)}
-        details["direction"] = [round(float(v), 6) for v in world]
-        if not free:
-            done.append(Applied(False, details, {HIDDEN: 1}))
+        x, y = _place(frame, direction)
+        sun_pixels[index] = x, y, 1
+        in_image, visible_share = sun_in_picture(frame, direction), frame.sun
+        if visible_share is None:
+            visible_share = free_sun(frame, sun_depth(frame, batch.picture(index)), direction) if in_image else 1.0
+        details: dict[str, Any] = {"angle_deg": round(angle, 1), "in_view": in_image, "free": round(visible_share, 2)}
+        details["direction"] = [round(float(coordinate), 6) for coordinate in direction]
+        if not visible_share:
+            records.append(Applied(False, details, {HIDDEN: 1}))
             continue
-        strength[b] = table.SUN_STRENGTH[spec.severity - 1] * free
-        # the camera exposes for what it sees: the nearer the sun to the picture, the darker the rest
+        strength[index] = table.SUN_STRENGTH[spec.severity - 1] * visible_share
+        # the camera adapts its exposure: the nearer the sun is to the image, the darker the rest
         outside = max(0.0, -x / batch.width, x / batch.width - 1, -y / batch.height, y / batch.height - 1)
-        gain[b] = 1 - 0.06 * spec.severity * free * max(0.0, 1 - 2 * outside)
-        done.append(Applied(True, details))
+        gain[index] = 1 - 0.06 * spec.severity * visible_share * max(0.0, 1 - 2 * outside)
+        records.append(Applied(True, details))
     rows, columns = grid_size(batch)
-    light = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
-    rays = [float(s.generator("star", f.camera.channel).uniform(0, 1)) for s, f in zip(specs, frames, strict=True)]
-    sight = [on(batch, toward, wp.vec3), on(batch, place, wp.vec3), lens(batch, frames)]
-    batch.launch(veil.glare, (batch.count, rows), [*sight, on(batch, strength), on(batch, rays)], light)
-    out = batch.like()
+    glare = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
+    rays = [
+        float(image_spec.generator("star", image_frame.camera.channel).uniform(0, 1))
+        for image_spec, image_frame in zip(specs, frames, strict=True)
+    ]
+    camera_inputs = [on(batch, local_directions, wp.vec3), on(batch, sun_pixels, wp.vec3), lens(batch, frames)]
+    batch.launch(veil.glare, (batch.count, rows), [*camera_inputs, on(batch, strength), on(batch, rays)], glare)
+    result = batch.like()
     tint = on(batch, np.tile([1.0, 0.97, 0.9], (batch.count, 1)), wp.vec3)
-    inputs = [batch.words(), light, tint, on(batch, gain), batch.width, batch.stride // 4]
-    batch.launch(veil.blend_glare, (batch.count, batch.height), inputs, out.words())
-    return out, done
+    inputs = [batch.words(), glare, tint, on(batch, gain), batch.width, batch.stride // 4]
+    batch.launch(veil.blend_glare, (batch.count, batch.height), inputs, result.words())
+    return result, records

@@ -1,4 +1,4 @@
-"""Non-invasive physical attacks (paper III.A.1): light and shadow on a target, which itself stays as it is."""
+"""Non-invasive physical attacks (paper III.A.1): light and shadow on an unmodified target."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ LIGHTS: dict[str, Callable[..., Shadow | Laser | Projector | Flashlight]] = {
 
 
 def make_light(name: str, options: Mapping[str, Any]) -> Shadow | Laser | Projector | Flashlight:
-    """A light attack by name.
+    """Create a light attack by name.
 
     Args:
-        name: Of `LIGHTS`.
-        options: Its fields that differ.
+        name: Key of `LIGHTS`.
+        options: Fields that differ from the defaults.
 
     Raises:
         UnknownNameError: There is no such attack.
-        ConfigError: An option that it does not have, or a value that it refuses.
+        ConfigError: An option is unknown or has an invalid value.
     """
     if name not in LIGHTS:
         raise unknown_name("light attack", name, LIGHTS)

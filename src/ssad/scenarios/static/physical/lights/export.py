@@ -1,4 +1,4 @@
-"""A light attack as files: what shines, and how, to be set up outside or filmed in a drive."""
+"""A light attack as files: the lamp and its settings, to be set up outside or filmed in a drive."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from ssad.scenarios.static.physical.textures.export import Print, load_print
 
 @dataclass(frozen=True, slots=True)
 class Shining:
-    """A light attack with what it takes to make it shine again.
+    """Light attack with all settings that are needed to show it again.
 
     Attributes:
-        attack: Its name (`ssad.scenarios.static.physical.lights.LIGHTS`).
-        options: Of the attack.
-        hour: When it shines (see `ssad.rendering.hours.HOURS`).
-        target: Whom it was found for, as for `ssad record --target`.
-        values: Its settings, in the units of their names; of a projector none.
-        colour: What a projector shows, sRGB [3, H, W] in 0 to 1; else None.
+        attack: Its name (`ssad.scenarios.static.physical.noninvasive.LIGHTS`).
+        options: Options of the attack.
+        hour: Hour at which it shines (see `ssad.recording.lit_clips.HOURS`).
+        target: Target that it was searched for, as for `ssad record --target`.
+        values: Its settings, in the units of their names; empty for a projector.
+        colour: Image of a projector, sRGB [3, H, W] in 0 to 1; else None.
     """
 
     attack: str
@@ -47,19 +47,27 @@ class Shining:
     colour: Tensor | None = None
 
     def edit(self, mesh: Mesh) -> SceneEdit:
-        """It shines on a body. ConfigError: it cannot be."""
-        made = make_light(self.attack, self.options)
-        low, high = mesh.bounds()
-        length, width, height = (high - low).tolist()
+        """Return the edit of a scene in which it shines on a body.
+
+        Raises:
+            ConfigError: A projector has no image.
+        """
+        light = make_light(self.attack, self.options)
+        lower, upper = mesh.bounds()
+        length, width, height = (upper - lower).tolist()
         target = Target(length, width, height)
-        if not isinstance(made, Projector):
-            return made.edit(self.values, target)
+        if not isinstance(light, Projector):
+            return light.edit(self.values, target)
         if self.colour is None:
             raise ConfigError(f"{self.attack}: there is no picture that it shows")
-        return made.edit(self.colour, target)
+        return light.edit(self.colour, target)
 
     def live(self, agent: int) -> LiveAttack:
-        """It shines on an agent of the closed loop."""
+        """Return the edit in which it shines on an agent of the closed loop.
+
+        Raises:
+            ConfigError: The light is not made for a car.
+        """
         car = parse_target(self.target)
         if not isinstance(car, TargetCar):
             raise ConfigError(f"this light is made for {self.target}; only cars drive")
@@ -78,7 +86,7 @@ def export_light(out: Path, made: Shining, *, name: str = "") -> list[Path]:
         What was written.
     """
     attack = make_light(made.attack, made.options)
-    about: dict[str, Any] = {
+    description: dict[str, Any] = {
         "name": name,
         "attack": made.attack,
         "options": dict(made.options),
@@ -90,45 +98,54 @@ def export_light(out: Path, made: Shining, *, name: str = "") -> list[Path]:
     written = [out / "light.json"]
     if made.colour is not None:
         assert isinstance(attack, Projector)
-        numbers = safeio.npz_bytes({"colour": made.colour.numpy()})
-        safeio.write_atomic(out / "picture.npz", numbers)
-        everywhere = np.ones(tuple(made.colour.shape[1:]), np.bool_)
-        save_picture(out / "picture.png", texture_picture(made.colour, everywhere))
-        about |= {"lumens": attack.power(made.colour), "sha256": hashlib.sha256(numbers).hexdigest()}
+        # PNG rounds to 8 bits; the file of floats is what `load_light` verifies and reads.
+        colour_bytes = safeio.npz_bytes({"colour": made.colour.numpy()})
+        safeio.write_atomic(out / "picture.npz", colour_bytes)
+        full_mask = np.ones(tuple(made.colour.shape[1:]), np.bool_)
+        save_picture(out / "picture.png", texture_picture(made.colour, full_mask))
+        description |= {"lumens": attack.power(made.colour), "sha256": hashlib.sha256(colour_bytes).hexdigest()}
         written += [out / "picture.png", out / "picture.npz"]
     elif not isinstance(attack, Projector):
-        about["lumens"] = attack.power(made.values)
-    safeio.write_atomic(out / "light.json", safeio.dump_json(about, indent=1) + "\n")
+        description["lumens"] = attack.power(made.values)
+    safeio.write_atomic(out / "light.json", safeio.dump_json(description, indent=1) + "\n")
     return written
 
 
 def load_light(folder: Path) -> Shining:
-    """What `export_light` wrote.
+    """Read a light attack that `export_light` wrote.
 
     Raises:
-        FormatError: A file is missing or broken, or the picture is not the one that was exported.
-        SSADError: A light attack or an hour that there is not.
+        FormatError: A file is missing or broken, or the image is not the one that was exported.
+        SSADError: Unknown light attack or hour.
     """
-    about, colour = safeio.read_json(folder / "light.json"), None
+    description, colour = safeio.read_json(folder / "light.json"), None
     try:
-        if "sha256" in about:
-            numbers = safeio.read_bytes(folder / "picture.npz")
-            if hashlib.sha256(numbers).hexdigest() != about["sha256"]:
+        if "sha256" in description:
+            colour_bytes = safeio.read_bytes(folder / "picture.npz")
+            if hashlib.sha256(colour_bytes).hexdigest() != description["sha256"]:
                 raise FormatError(f"{folder / 'picture.npz'}: not what light.json describes; export it again")
             colour = torch.from_numpy(safeio.load_npz(folder / "picture.npz")["colour"].copy())
-        found = Shining(about["attack"], about["options"], about["hour"], about["target"], about["values"], colour)
-        make_light(found.attack, found.options)
-        at_hour(Weather(), found.hour)
-        return found
+        light = Shining(
+            description["attack"],
+            description["options"],
+            description["hour"],
+            description["target"],
+            description["values"],
+            colour,
+        )
+        # Both calls only validate: a bad name should fail here, not in the middle of a drive.
+        make_light(light.attack, light.options)
+        at_hour(Weather(), light.hour)
+        return light
     except (KeyError, TypeError) as error:
         raise FormatError(f"{folder / 'light.json'}: no exported light ({error}); export it again") from None
 
 
 def load_worn(folder: Path) -> Print | Shining:
-    """What `ssad export texture` or `ssad export light` wrote.
+    """Read the export of `ssad export texture` or `ssad export light`.
 
     Raises:
-        FormatError: Neither, or a broken one.
+        FormatError: The folder holds neither, or a broken one.
     """
     if (folder / "light.json").is_file():
         return load_light(folder)

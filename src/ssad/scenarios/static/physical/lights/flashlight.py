@@ -1,4 +1,4 @@
-"""Flashlight: one strong spot light from behind; where it stands, where it aims, how wide, which colour."""
+"""Flashlight attack: one strong spot light from behind, with a searched position, aim, width and colour."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from ssad.scenarios.static.physical.lights.lit_image import LitPicture
 
 @dataclass(frozen=True, slots=True, config=VALUES)
 class Flashlight:
-    """A spot light with a colour filter, held by somebody behind the target or carried by a drone.
+    """Spot light with a colour filter behind the target, held by a person or carried by a drone.
 
-    No paper gives one for vehicles; this is the smallest light attack, against which the others can be compared.
+    No paper describes one for vehicles; it is the smallest light attack, a baseline for the others.
 
     Attributes:
-        lumens: Most that it gives, lumen (3000 is a strong hand lamp).
-        distance: Least and greatest distance from the target's rear, m.
-        height: Least and greatest height above the road, m.
-        aside: Greatest angle from straight behind, rad.
-        beam: Least and greatest tangent of the half angle of its beam.
+        lumens: Maximum luminous flux, lumen (3000 is a strong hand lamp).
+        distance: Minimum and maximum distance from the target's rear, m.
+        height: Minimum and maximum height above the road, m.
+        aside: Maximum angle from straight behind, rad.
+        beam: Minimum and maximum tangent of the half angle of its beam.
         soft: Share of the beam over which it fades.
-        name: What tables call it.
-        search: Its light has exact gradients.
+        name: Name shown in tables.
+        search: Default search; its light has exact gradients.
     """
 
     lumens: Least = 3000.0
@@ -46,7 +46,7 @@ class Flashlight:
     search: Literal["swarm", "greedy", "gradient"] = "gradient"
 
     def ranges(self, target: Target) -> Ranges:
-        """See `LightAttack`."""
+        """Return the ranges of power, position, aim, beam and colour."""
         return {
             "lumens": (0.0, self.lumens),
             "distance": self.distance,
@@ -61,29 +61,31 @@ class Flashlight:
         }
 
     def _lamp(self, values: Mapping[str, Tensor], target: Target) -> dict[str, Tensor]:
-        """Pose, power, spread and colour of N settings."""
-        away, aside = values["distance"], values["aside"]
-        place = torch.stack([target.rear - away * torch.cos(aside), away * torch.sin(aside), values["height"]], -1)
-        point = torch.stack([torch.full_like(away, target.rear), values["aim_left"], values["aim_up"]], -1)
+        """Return pose, power, spread and colour of N settings."""
+        distance, aside = values["distance"], values["aside"]
+        position = torch.stack(
+            [target.rear - distance * torch.cos(aside), distance * torch.sin(aside), values["height"]], -1
+        )
+        aim_point = torch.stack([torch.full_like(distance, target.rear), values["aim_left"], values["aim_up"]], -1)
         colour = torch.stack([values["red"], values["green"], values["blue"]], -1)
         return {
-            "pose": aimed(place, point),
+            "pose": aimed(position, aim_point),
             "power": values["lumens"],
             "spread": values["beam"][:, None].expand(-1, 2),
             "colour": colour,
         }
 
     def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
-        """See `LightAttack`."""
+        """Return the radiance that the spot light adds to an image."""
         return added_light(Lamp(_IDENTITY, 1.0, soft=self.soft), picture, **self._lamp(values, target))
 
     def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
-        """See `LightAttack`."""
-        found = {name: numbers(value) for name, value in self._lamp(at_values(values), target).items()}
-        return SceneEdit(lamps=(lamp_of(found, soft=self.soft),))
+        """Return the spot light as a scene edit."""
+        lamp_values = {name: numbers(value) for name, value in self._lamp(at_values(values), target).items()}
+        return SceneEdit(lamps=(lamp_of(lamp_values, soft=self.soft),))
 
     def power(self, values: Mapping[str, float]) -> float:
-        """See `LightAttack`: what passes the filter."""
+        """Return the luminous flux behind the filter, lumen."""
         return values["lumens"] * (0.2126 * values["red"] + 0.7152 * values["green"] + 0.0722 * values["blue"])
 
 
@@ -92,6 +94,6 @@ _IDENTITY: F64 = numbers(torch.eye(4, dtype=torch.float64)[None])
 
 def lamp_of(found: Mapping[str, F64], **more: Any) -> Lamp:
     """A lamp with a pose, a power, a spread and a colour."""
-    across, down = found["spread"].tolist()
+    spread_x, spread_y = found["spread"].tolist()
     red, green, blue = found["colour"].tolist()
-    return Lamp(found["pose"], float(found["power"]), (across, down), (red, green, blue), **more)
+    return Lamp(found["pose"], float(found["power"]), (spread_x, spread_y), (red, green, blue), **more)

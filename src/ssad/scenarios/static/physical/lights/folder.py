@@ -1,4 +1,4 @@
-"""The light attacks of a folder: each searched once and kept, with its power and what it has asked."""
+"""Folder of light attacks: each is searched once and stored with its power and its number of queries."""
 
 from __future__ import annotations
 
@@ -56,29 +56,34 @@ class LightSpec:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Self:
-        """From plain data with these keys, among others."""
-        return cls(**{one.name: row[one.name] for one in fields(cls)})
+        """Create a specification from plain data with these keys, among others."""
+        return cls(**{field_info.name: row[field_info.name] for field_info in fields(cls)})
 
     @property
     def device(self) -> str:
-        """What shines, or casts a shadow."""
+        """Name of the light or card, also for random settings."""
         return self.of or self.attack
 
     @property
     def name(self) -> str:
-        """What it depends on, in short."""
-        about = self.source, self.hour, self.number, *map(safeio.dump_json, (self.options, self.settings, self.pair))
-        return f"{self.attack}{f'-{self.of}' if self.of else ''}-{digest('light', self.of, *about)[:12]}"
+        """Short name of everything that the attack depends on."""
+        key_parts = (
+            self.source,
+            self.hour,
+            self.number,
+            *map(safeio.dump_json, (self.options, self.settings, self.pair)),
+        )
+        return f"{self.attack}{f'-{self.of}' if self.of else ''}-{digest('light', self.of, *key_parts)[:12]}"
 
 
 @dataclass(frozen=True, slots=True)
 class LightFolder:
-    """Light attacks that are kept.
+    """Folder of light attacks.
 
     Attributes:
-        path: The folder.
-        seed: Root of the random numbers of searches.
-        device: Where detectors are.
+        path: Path of the folder.
+        seed: Root seed of the searches.
+        device: Device of the detectors.
     """
 
     path: Path
@@ -86,11 +91,11 @@ class LightFolder:
     device: str = "cpu"
 
     def kept(self, spec: LightSpec) -> Path:
-        """Where an attack is when it is found."""
+        """Return the path of a finished attack."""
         return self.path / f"{spec.name}.json"
 
     def picture(self, spec: LightSpec) -> Path:
-        """What a projector shows."""
+        """Return the path of a projector's image."""
         return self.path / f"{spec.name}.png"
 
     def edit(
@@ -102,14 +107,14 @@ class LightFolder:
         projected: Callable[[SceneEdit], Sequence[View]],
         detector: Callable[[], Detector],
     ) -> SceneEdit:
-        """An attack as an edit of a scene; searched now if it has to be.
+        """Return an attack as a scene edit, searched first if necessary.
 
         Args:
-            spec: Which.
-            target: What it lights.
-            views: Makes the pictures of the search.
-            projected: Makes pictures whose target is lit by what an edit projects.
-            detector: Makes the detector that is attacked.
+            spec: Specification of the attack.
+            target: Target that it lights.
+            views: Function that renders the images of the search.
+            projected: Function that renders images whose target is lit by the projection of an edit.
+            detector: Function that creates the detector under attack.
 
         Raises:
             ConfigError: It cannot be searched.
@@ -119,26 +124,26 @@ class LightFolder:
             return self._projected(spec, attack, target, projected, detector)
         if not path.is_file():
             if spec.source:
-                budget, how = budget_of(spec.settings, attack.name)
-                found = search_light(
-                    attack, detector(), target, views(), budget=budget, search=how, key=(self.seed, spec.name)
+                budget, method = budget_of(spec.settings, attack.name)
+                result = search_light(
+                    attack, detector(), target, views(), budget=budget, search=method, key=(self.seed, spec.name)
                 )
-                about = {
-                    "values": found.values,
-                    "queries": found.queries,
-                    "loss_before": found.before,
-                    "loss_after": found.loss,
+                record = {
+                    "values": result.values,
+                    "queries": result.queries,
+                    "loss_before": result.before,
+                    "loss_after": result.loss,
                 }
             else:
                 values = random_settings(attack, target, key=(self.seed, spec.number))
-                about = {"values": values, "queries": 0}
-            about["lumens"] = attack.power(about["values"])  # type: ignore[arg-type]
-            _write(path, about)
+                record = {"values": values, "queries": 0}
+            record["lumens"] = attack.power(record["values"])  # type: ignore[arg-type]
+            _write(path, record)
         values, _ = self.found(spec)
         return attack.edit(values, target)
 
     def found(self, spec: LightSpec) -> tuple[dict[str, float], Tensor | None]:
-        """The settings of an attack that was found; of a projector none, and its picture [3, H, W] in sRGB."""
+        """Load the settings of a finished attack; for a projector none, but its image [3, H, W] in sRGB."""
         if spec.device != "projector":
             return dict(safeio.read_json(self.kept(spec))["values"]), None
         return {}, torch.from_numpy(safeio.load_npz(self.kept(spec).with_suffix(".npz"))["colour"].copy())
@@ -151,11 +156,11 @@ class LightFolder:
         projected: Callable[[SceneEdit], Sequence[View]],
         detector: Callable[[], Detector],
     ) -> SceneEdit:
-        """A projector with its picture."""
+        """Return a projector with its image, trained first if necessary."""
         surface, path = attack.surface(target), self.kept(spec)
-        numbers = path.with_suffix(".npz")
+        colour_path = path.with_suffix(".npz")
         if not path.is_file():
-            about: dict[str, Any] = {"queries": 0}
+            record: dict[str, Any] = {"queries": 0}
             if spec.source:
                 training = attack.training(**spec.settings)
                 views = projected(attack.edit(control("grey", surface.size), target))
@@ -171,38 +176,38 @@ class LightFolder:
                     checkpoint=path.with_suffix(".checkpoint.npz"),
                 )
                 colour = trained.colour
-                about = {
+                record = {
                     "queries": len(views) * len(trained.losses),
                     "loss_before": trained.losses[0],
                     "loss_after": trained.losses[-1],
                 }
             else:
                 colour = control("random", surface.size, seed=spec.number)
-            safeio.save_npz(numbers, {"colour": colour.numpy()})
+            safeio.save_npz(colour_path, {"colour": colour.numpy()})
             save_picture(self.picture(spec), texture_picture(colour, surface.mask))
-            _write(path, about | {"values": {"white": attack.lumens}, "lumens": attack.power(colour)})
-        _, shown = self.found(spec)
-        assert shown is not None
-        return attack.edit(shown, target)
+            _write(path, record | {"values": {"white": attack.lumens}, "lumens": attack.power(colour)})
+        _, image_colour = self.found(spec)
+        assert image_colour is not None
+        return attack.edit(image_colour, target)
 
     def history(self, spec: LightSpec) -> dict[str, Any]:
-        """Power, settings and queries of an attack that was found, for records."""
-        kept = safeio.read_json(self.kept(spec))
-        values = {name: float(f"{value:.4g}") for name, value in kept.pop("values").items()}
-        return {**kept, "light": values}
+        """Return power, settings and queries of a finished attack for records."""
+        record = safeio.read_json(self.kept(spec))
+        values = {name: float(f"{value:.4g}") for name, value in record.pop("values").items()}
+        return {**record, "light": values}
 
 
 def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[Budget, Any]:
-    """The budget of an attack's search, and its kind (None: the attack's own).
+    """Return the budget of an attack's search, and its method (None: the attack's own).
 
     Raises:
-        ConfigError: A setting that it does not have, or a value that it refuses.
+        ConfigError: A setting is unknown or has an invalid value.
     """
-    given = dict(settings)
-    how = given.pop("search", None)
-    if how not in (None, "swarm", "greedy", "gradient"):
-        raise ConfigError(f"attack {attack}: search={how!r}: choose swarm, greedy or gradient")
-    return checked(Budget, given, what=f"attack {attack}"), how
+    options = dict(settings)
+    method = options.pop("search", None)
+    if method not in (None, "swarm", "greedy", "gradient"):
+        raise ConfigError(f"attack {attack}: search={method!r}: choose swarm, greedy or gradient")
+    return checked(Budget, options, what=f"attack {attack}"), method
 
 
 def _write(path: Path, about: Mapping[str, Any]) -> None:

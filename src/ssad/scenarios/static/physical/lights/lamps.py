@@ -1,4 +1,4 @@
-"""What lamps add to pictures, many settings at once."""
+"""Light that lamps add to images, for many settings at once."""
 
 from __future__ import annotations
 
@@ -29,6 +29,6 @@ def added_light(
             lamp, picture.position, picture.normal, pose=pose, power=power, spread=spread, fog=picture.fog
         )
 
-    kind = picture.position
-    given = torch.vmap(light)(pose.to(kind), power.to(kind) * picture.per_lux, spread.to(kind))
-    return given * colour.to(kind)[:, None, None] * picture.answer
+    position = picture.position
+    irradiance = torch.vmap(light)(pose.to(position), power.to(position) * picture.per_lux, spread.to(position))
+    return irradiance * colour.to(position)[:, None, None] * picture.answer

@@ -1,4 +1,4 @@
-"""Laser beam: a line of one wavelength across the target, found by a greedy search (AdvLB)."""
+"""Laser beam attack: a line of one wavelength across the target, found by a greedy search (AdvLB)."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ TO_SRGB = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.20
 
 @dataclass(frozen=True, slots=True, config=VALUES)
 class Laser:
-    """A laser whose beam a cylindrical lens spreads to a line.
+    """Laser whose beam a cylindrical lens spreads to a line.
 
     Its colour follows from the wavelength, its brightness from power, wavelength and the area of the line.
 
-    Source: Duan et al., Adversarial Laser Beam (CVPR 2021): wavelength, place, angle and width of a line; there it is
-    added to the picture, here it lights the target.
+    Source: Duan et al., Adversarial Laser Beam (CVPR 2021): wavelength, place, angle and width of a line; the source
+    adds it to the image, this implementation lights the target with it.
 
     Attributes:
-        watts: Most optical power, W (0.5 is far beyond a pointer, and dangerous).
-        distance: From the target's rear, m.
-        height: Above the road, m.
+        watts: Maximum optical power, W (0.5 is far beyond a pointer, and dangerous).
+        distance: Distance from the target's rear, m.
+        height: Height above the road, m.
         fan: Tangent of the half angle of the line.
-        width: Least and greatest width of the line on the target, m; a narrower one falls between the samples of a
-            picture from 20 m.
-        wavelength: Least and greatest, nm.
-        name: What tables call it.
-        search: As in the source.
+        width: Minimum and maximum width of the line on the target, m; a narrower one falls between the samples of an
+            image from 20 m.
+        wavelength: Minimum and maximum wavelength, nm.
+        name: Name shown in tables.
+        search: Default search, as in the source.
     """
 
     watts: Least = 0.5
@@ -54,7 +54,7 @@ class Laser:
     search: Literal["swarm", "greedy", "gradient"] = "greedy"
 
     def ranges(self, target: Target) -> Ranges:
-        """See `LightAttack`."""
+        """Return the ranges of power, wavelength, width, angle and aim."""
         return {
             "watts": (0.0, self.watts),
             "wavelength": self.wavelength,
@@ -65,43 +65,43 @@ class Laser:
         }
 
     def _lamp(self, values: Mapping[str, Tensor], target: Target) -> dict[str, Tensor]:
-        """Pose, power, spread and colour of N settings."""
-        left = values["aim_left"]
-        place = left.new_tensor([target.rear - self.distance, 0.0, self.height]).expand(len(left), 3)
-        point = torch.stack([torch.full_like(left, target.rear), left, values["aim_up"]], -1)
-        down = 0.5 * values["width"] / self.distance
+        """Return pose, power, spread and colour of N settings."""
+        aim_left = values["aim_left"]
+        position = aim_left.new_tensor([target.rear - self.distance, 0.0, self.height]).expand(len(aim_left), 3)
+        aim_point = torch.stack([torch.full_like(aim_left, target.rear), aim_left, values["aim_up"]], -1)
+        half_width = 0.5 * values["width"] / self.distance
         return {
-            "pose": aimed(place, point, values["angle"]),
+            "pose": aimed(position, aim_point, values["angle"]),
             "power": values["watts"] * LUMEN_PER_WATT,
-            "spread": torch.stack([torch.full_like(down, self.fan), down], -1),
+            "spread": torch.stack([torch.full_like(half_width, self.fan), half_width], -1),
             "colour": spectral_colour(values["wavelength"]),
         }
 
     def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
-        """See `LightAttack`."""
+        """Return the radiance that the laser adds to an image."""
         return added_light(Lamp(_IDENTITY, 1.0, square=True), picture, **self._lamp(values, target))
 
     def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
-        """See `LightAttack`."""
-        found = {name: numbers(value) for name, value in self._lamp(at_values(values), target).items()}
-        return SceneEdit(lamps=(lamp_of(found, square=True),))
+        """Return the laser as a scene edit."""
+        lamp_values = {name: numbers(value) for name, value in self._lamp(at_values(values), target).items()}
+        return SceneEdit(lamps=(lamp_of(lamp_values, square=True),))
 
     def power(self, values: Mapping[str, float]) -> float:
-        """See `LightAttack`."""
-        wave = torch.tensor([values["wavelength"]], dtype=torch.float64)
-        return values["watts"] * LUMEN_PER_WATT * float(matching(wave)[0, 1])
+        """Return the luminous flux of the laser, lumen."""
+        wavelength = torch.tensor([values["wavelength"]], dtype=torch.float64)
+        return values["watts"] * LUMEN_PER_WATT * float(matching(wavelength)[0, 1])
 
 
 def matching(wavelength: Tensor) -> Tensor:
-    """The CIE 1931 colour matching functions x, y, z of wavelengths [N] in nm: [N, 3].
+    """Return the CIE 1931 colour matching functions x, y, z of wavelengths [N] in nm: [N, 3].
 
-    Source: the multi-lobe fit of Wyman, Sloan and Shirley, Simple Analytic Approximations to the CIE XYZ Color Matching
-    Functions (JCGT 2013).
+    Source: the multi-lobe fit of Wyman, Sloan and Shirley, Simple Analytic Approximations to the CIE XYZ Color
+    Matching Functions (JCGT 2013).
     """
 
     def lobe(height: float, middle: float, below: float, above: float) -> Tensor:
-        away = wavelength - middle
-        scaled = away * torch.where(away < 0.0, below, above)
+        offset = wavelength - middle
+        scaled = offset * torch.where(offset < 0.0, below, above)
         return height * torch.exp(-0.5 * scaled * scaled)
 
     x = lobe(1.056, 599.8, 0.0264, 0.0323) + lobe(0.362, 442.0, 0.0624, 0.0374) - lobe(0.065, 501.1, 0.0490, 0.0382)
@@ -111,8 +111,8 @@ def matching(wavelength: Tensor) -> Tensor:
 
 
 def spectral_colour(wavelength: Tensor) -> Tensor:
-    """Linear RGB [N, 3] of light of wavelengths [N] in nm, for a power in lumen at 555 nm.
+    """Return the linear RGB [N, 3] of light of wavelengths [N] in nm, for a power in lumen at 555 nm.
 
-    White light of the same luminance is (y, y, y). What lies outside the gamut of sRGB is cut off at 0.
+    White light of the same luminance is (y, y, y). Components outside the gamut of sRGB are clipped at 0.
     """
     return (matching(wavelength) @ wavelength.new_tensor(TO_SRGB).T).clamp_min(0.0)

@@ -1,4 +1,4 @@
-"""Light attacks: what they have in common."""
+"""Common parts of light attacks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Away = Annotated[Number, Field(ge=1.0)]
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The size of a target, for what shines on its rear.
+    """Dimensions of a target for the light on its rear.
 
     Attributes:
         length: In m.
@@ -39,46 +39,46 @@ class Target:
 
     @property
     def rear(self) -> float:
-        """Where its rear is along x, m."""
+        """Position of the rear along x, m."""
         return -0.5 * self.length
 
 
 class LightAttack(Protocol):
-    """What is searched, and what light the values that are found make.
+    """Search space of a light attack, and the light of a point in it.
 
     Attributes:
-        name: What tables call it.
-        search: How it is searched by default: swarm, greedy or gradient (see `search`).
+        name: Name shown in tables.
+        search: Default search: swarm, greedy or gradient (see `search`).
     """
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Name shown in tables."""
 
     @property
     def search(self) -> Literal["swarm", "greedy", "gradient"]:
-        """How it is searched."""
+        """Default search."""
 
     def ranges(self, target: Target) -> Ranges:
-        """What is searched."""
+        """Return the ranges of the searched settings."""
 
     def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
-        """What settings add to the radiance of a picture.
+        """Return the radiance that settings add to an image.
 
         Args:
-            values: Each of the ranges' names [N].
-            picture: The picture.
-            target: Whose picture it is.
+            values: Values [N] of each name in the ranges.
+            picture: Image to light.
+            target: Target in the image.
 
         Returns:
             [N, h, w, 3]; differentiable where `search` is gradient.
         """
 
     def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
-        """The settings as an edit of a scene, to be rendered."""
+        """Return the settings as a scene edit, to be rendered."""
 
     def power(self, values: Mapping[str, float]) -> float | None:
-        """Light that leaves the device, lumen; None for one without light."""
+        """Return the luminous flux of the device, lumen; None for one without light."""
 
 
 def aimed(place: Tensor, point: Tensor, roll: Tensor | None = None) -> Tensor:
@@ -96,16 +96,16 @@ def aimed(place: Tensor, point: Tensor, roll: Tensor | None = None) -> Tensor:
     if roll is not None:
         cos, sin = torch.cos(roll)[:, None], torch.sin(roll)[:, None]
         across, down = cos * across + sin * down, cos * down - sin * across
-    top = torch.cat([torch.stack([across, down, ahead], -1), place[..., None]], -1)
-    last = place.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(place), 1, 4)
-    return torch.cat([top, last], 1)
+    upper_rows = torch.cat([torch.stack([across, down, ahead], -1), place[..., None]], -1)
+    last_row = place.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(place), 1, 4)
+    return torch.cat([upper_rows, last_row], 1)
 
 
 def at_values(values: Mapping[str, float]) -> dict[str, Tensor]:
-    """One setting as tensors [1] of double precision."""
+    """Convert one setting to tensors [1] of double precision."""
     return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
 
 
 def numbers(tensor: Any) -> F64:
-    """The first of a batch as an array."""
+    """Convert the first element of a batch to an array."""
     return np.asarray(tensor[0].detach().cpu().numpy(), np.float64)

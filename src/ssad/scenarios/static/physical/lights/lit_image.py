@@ -1,8 +1,8 @@
-"""A picture as a function of the light on its target.
+"""Image as a function of the light on its target.
 
-A search asks for thousands of pictures. So a picture is rendered once, with what its surfaces are; what a lamp adds to
-it, or a shadow takes away, then follows for many settings at once. What is found is rendered in full afterwards: lamps
-with their shadows and mirror images, cards with the sun's shadow maps.
+A search needs thousands of images. So an image is rendered once, with the properties of its surfaces; the effect of
+a lamp or a shadow then follows for many settings at once. The result of the search is rendered in full afterwards:
+lamps with their shadows and mirror images, cards with the sun's shadow maps.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ BLIND: Final = Card(np.array([[0.0, y, z] for y, z in ((-9.0, -9.0), (9.0, -9.0)
 
 @dataclass(frozen=True, slots=True)
 class LitPicture:
-    """A picture whose target can be lit and shaded.
+    """Image whose target can be lit and shaded.
 
     Attributes:
-        before: The whole picture without any attack [1, 3, H, W] in 0 to 1.
-        corner: Row and column at which the part around the target begins, both even.
-        radiance: Of this part, linear [h, w, 3].
-        sun: What of it comes from the sun [h, w, 3].
-        answer: What the radiance gains for irradiance over pi of 1 [h, w, 3].
-        position: What each pixel shows, in the target's frame, m [h, w, 3].
-        normal: Its normal there [h, w, 3].
-        sun_direction: Towards the sun, in the target's frame [3]; None by night.
-        exposure: What radiance is multiplied by.
-        per_lux: Irradiance over pi of one lux (see `ssad.rendering.camera.photometry`).
+        before: Whole image without any attack [1, 3, H, W] in 0 to 1.
+        corner: First row and column of the crop around the target, both even.
+        radiance: Radiance of the crop, linear [h, w, 3].
+        sun: Part of the radiance that comes from the sun [h, w, 3].
+        answer: Gain in radiance for irradiance over pi of 1 [h, w, 3].
+        position: Surface point of each pixel, in the target's frame, m [h, w, 3].
+        normal: Surface normal of each pixel [h, w, 3].
+        sun_direction: Direction to the sun, in the target's frame [3]; None by night.
+        exposure: Factor from radiance to exposure.
+        per_lux: Irradiance over pi of one lux (see `ssad.camera.photometry`).
         fog: Extinction, 1/m.
-        sensor: The camera's.
+        sensor: Sensor of the camera.
     """
 
     before: Tensor
@@ -59,20 +59,20 @@ class LitPicture:
     sensor: Sensor
 
     def show(self, change: Tensor) -> Tensor:
-        """Pictures with more or less light in the part around the target.
+        """Return images with more or less light in the crop around the target.
 
         Args:
-            change: What is added to its radiance [N, h, w, 3].
+            change: Radiance to add [N, h, w, 3].
 
         Returns:
             [N, 3, H, W] in 0 to 1, differentiable in the change.
         """
-        part = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor)
+        crop = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor)
         (top, left), (height, width) = self.corner, self.radiance.shape[:2]
         margin = 4 if min(height, width) > 16 else 0  # at the border of the part the lens lacks what lies beyond it
         whole = self.before.repeat(len(change), 1, 1, 1)
         rows, columns = slice(margin, height - margin), slice(margin, width - margin)
-        whole[:, :, top + margin : top + height - margin, left + margin : left + width - margin] = part[
+        whole[:, :, top + margin : top + height - margin, left + margin : left + width - margin] = crop[
             :, :, rows, columns
         ]
         return whole
@@ -84,24 +84,25 @@ def lit_picture(
     """Render a view once, as a function of the light on a target.
 
     Args:
-        scene: Its street and bodies, and the body of `BLIND`.
-        view: The view.
-        tag: Of the target in it.
-        rows: The part around the target; its first row and column are even.
+        scene: Scene with its street and bodies, and the body of `BLIND`.
+        view: View to render.
+        tag: Tag of the target in it.
+        rows: Rows of the crop around the target; its first row and column are even.
         columns: See `rows`.
         blind: Index of the body of `BLIND` in the scene.
-        device: Where pictures are made.
+        device: Device of the images.
     """
     picture = render(scene, [view], surface=True)
-    surface, place = picture.surface, (0, rows, columns)
+    surface, crop = picture.surface, (0, rows, columns)
     assert surface is not None
-    pose = next(thing.pose for thing in view.things if thing.tag == tag)
+    pose = next(scene_object.pose for scene_object in view.things if scene_object.tag == tag)
     sun = np.array(light_of(view.weather)[0][0])
+    # Two renderings, with and without the sun on the target, give the sun's share.
     shaded = picture.radiance
     if sun[2] > 0.0:
         shaded = render(scene, [SceneEdit(cards=(BLIND,)).on(view, tag, cards=(blind,))]).radiance
-    irradiance = surface.irradiance[place]
-    gain = np.where(irradiance > 0.0, surface.gain[place] / np.maximum(irradiance, 1e-12), 0.0)
+    irradiance = surface.irradiance[crop]
+    surface_gain = np.where(irradiance > 0.0, surface.gain[crop] / np.maximum(irradiance, 1e-12), 0.0)
 
     def on_device(array: Any) -> Tensor:
         return torch.from_numpy(np.array(array, np.float32)).to(device)
@@ -109,11 +110,11 @@ def lit_picture(
     return LitPicture(
         on_device(picture.image).permute(0, 3, 1, 2) / 255,
         (rows.start, columns.start),
-        on_device(picture.radiance[place]),
-        on_device((picture.radiance - shaded)[place]),
-        on_device(surface.albedo[place] * gain),
-        on_device((surface.position[place].astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]),
-        on_device(surface.normal[place] @ pose[:3, :3]),
+        on_device(picture.radiance[crop]),
+        on_device((picture.radiance - shaded)[crop]),
+        on_device(surface.albedo[crop] * surface_gain),
+        on_device((surface.position[crop].astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]),
+        on_device(surface.normal[crop] @ pose[:3, :3]),
         pose[:3, :3].T @ sun if sun[2] > 0.0 else None,
         float(picture.exposure[0]),
         per_lux(view.weather),

@@ -1,4 +1,4 @@
-"""Light attacks on a car in the drives of suites of kind `gap`: drawn at random, or as a search has found them."""
+"""Light attacks on a car in the drives of suites of kind `gap`: drawn at random, or found by a search."""
 
 from __future__ import annotations
 
@@ -23,49 +23,51 @@ LAMPS: Final = {"laser": "watts", "projector": "lumens", "flashlight": "lumens"}
 
 
 def shining(name: str, severity: int = 3, seed: int = 0) -> Shining | None:
-    """The light of a perturbation; None where it is night and nothing shines.
+    """Return the light of a perturbation; None for a dark night.
 
     Args:
-        name: night; shine-LIGHT: settings drawn at random at full power, lamps by night, a shadow at the hour of the
-            drive; shine:FOLDER: as it was found, at its hour.
-        severity: 1 to 5, how strong a lamp is; of no account to a shadow and to what was found.
-        seed: Of the settings.
+        name: night; shine-LIGHT: settings drawn at random at full power, lamps by night, a shadow at the hour of
+            the drive; shine:FOLDER: an exported light, at its hour.
+        severity: 1 to 5, power of a lamp; ignored for a shadow and an exported light.
+        seed: Seed of the settings.
 
     Raises:
-        FormatError: There is no exported light in the folder.
+        FormatError: The folder holds no exported light.
     """
     if name == NIGHT:
         return None
     if name.startswith(FOUND):
         return load_light(Path(name.removeprefix(FOUND)).expanduser())
-    light = name.removeprefix(SHINE)
+    light_name = name.removeprefix(SHINE)
     options: dict[str, Any] = {}
-    if light in LAMPS:
-        options = {LAMPS[light]: POWERS[severity - 1] * getattr(make_light(light, {}), LAMPS[light])}
-    made, car = make_light(light, options), TargetCar()
-    hour = NIGHT if light in LAMPS else "recorded"
-    low, high = car.mesh().bounds()
-    target = Target(*(high - low).tolist())
-    if isinstance(made, Projector):
-        size = made.surface(target).size
-        colour = torch.from_numpy(generator("random light", light, seed).random((3, *size)).astype("float32"))
-        return Shining(light, options, hour, "sedan", {}, colour)
-    return Shining(light, options, hour, "sedan", random_settings(made, target, key=("loop", seed)))
+    if light_name in LAMPS:
+        options = {LAMPS[light_name]: POWERS[severity - 1] * getattr(make_light(light_name, {}), LAMPS[light_name])}
+    light_attack, car = make_light(light_name, options), TargetCar()
+    hour = NIGHT if light_name in LAMPS else "recorded"
+    lower, upper = car.mesh().bounds()
+    target = Target(*(upper - lower).tolist())
+    if isinstance(light_attack, Projector):
+        texture_size = light_attack.surface(target).size
+        colour = torch.from_numpy(
+            generator("random light", light_name, seed).random((3, *texture_size)).astype("float32")
+        )
+        return Shining(light_name, options, hour, "sedan", {}, colour)
+    return Shining(light_name, options, hour, "sedan", random_settings(light_attack, target, key=("loop", seed)))
 
 
 def hour_of(name: str) -> str:
-    """When the drives of a perturbation are: "recorded" (as they are), or an hour of `lit_clips.HOURS`."""
-    found = shining(name)
-    return NIGHT if found is None else found.hour
+    """Return the hour of the drives of a perturbation: "recorded" (unchanged), or one of `lit_clips.HOURS`."""
+    light = shining(name)
+    return NIGHT if light is None else light.hour
 
 
 def light_version(name: str) -> str:
-    """Hash of what `ssad export light` wrote; "" of other lights, which the code decides."""
+    """Return the hash of an export of `ssad export light`; "" for other lights, which the code decides."""
     if not name.startswith(FOUND):
         return ""
     folder = Path(name.removeprefix(FOUND)).expanduser()
-    total = hashlib.sha256()
-    for file in ("light.json", "picture.npz"):
-        if (folder / file).is_file():
-            total.update(safeio.read_bytes(folder / file))
-    return total.hexdigest()
+    hasher = hashlib.sha256()
+    for file_name in ("light.json", "picture.npz"):
+        if (folder / file_name).is_file():
+            hasher.update(safeio.read_bytes(folder / file_name))
+    return hasher.hexdigest()

@@ -1,4 +1,4 @@
-"""Projector: a picture thrown onto the target's rear, trained by gradient as a texture is (SLAP, OPAD)."""
+"""Projector attack: an image on the target's rear, trained by gradient in the same way as a texture (SLAP, OPAD)."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ AIMED = Expectation((0.9, 1.1), 0.05, 0.02, 0.03, 0.03)
 
 @dataclass(frozen=True, slots=True, config=VALUES)
 class Projector:
-    """A projector behind the target, on a vehicle or a drone that keeps its distance.
+    """Projector behind the target, on a vehicle or a drone that keeps its distance.
 
     Source: Lovisotto et al., SLAP (USENIX Security 2021): a coarse image, expectation over view, light and place; the
-    model from projector to camera, which is fitted there, is the renderer's own light here.
+    model from projector to camera, which the source fits, is the renderer's own light in this implementation.
 
     Attributes:
-        lumens: With a white picture (5000 is a strong one).
-        distance: From the target's rear, m.
+        lumens: Luminous flux of a white image (5000 is a strong one).
+        distance: Distance from the target's rear, m.
         aside: Angle from straight behind, rad.
-        height: Above the road, m.
-        size: Width and height of the picture on the rear, in sides of the rear.
-        texels: Along its longer side.
+        height: Height above the road, m.
+        size: Width and height of the image on the rear, in sides of the rear.
+        texels: Texels along its longer side.
         leak: Light of black parts, share of white (1 / contrast).
-        name: What tables call it.
+        name: Name shown in tables.
     """
 
     lumens: Least = 5000.0
@@ -56,51 +56,55 @@ class Projector:
     search: str = field(default="gradient", init=False)
 
     def lamp(self, target: Target) -> Lamp:
-        """The projector in the target's frame, power in lumen; it shows texture 0."""
-        place = [
+        """Return the projector as a lamp in the target's frame, power in lumen; it shows texture 0."""
+        position = [
             target.rear - self.distance * float(np.cos(self.aside)),
             self.distance * float(np.sin(self.aside)),
             self.height,
         ]
-        middle = [target.rear, 0.0, 0.5 * target.height]
-        pose = numbers(aimed(*(torch.tensor([v], dtype=torch.float64) for v in (place, middle))))
-        away = float(np.linalg.norm(np.subtract(middle, place)))
+        rear_centre = [target.rear, 0.0, 0.5 * target.height]
+        pose = numbers(
+            aimed(*(torch.tensor([coordinates], dtype=torch.float64) for coordinates in (position, rear_centre)))
+        )
+        range_to_rear = float(np.linalg.norm(np.subtract(rear_centre, position)))
         spread = (
-            0.5 * self.size[0] * target.width * float(np.cos(self.aside)) / away,
-            0.5 * self.size[1] * target.height / away,
+            # Seen from the side, the rear is narrower by the cosine of the angle.
+            0.5 * self.size[0] * target.width * float(np.cos(self.aside)) / range_to_rear,
+            0.5 * self.size[1] * target.height / range_to_rear,
         )
         return Lamp(pose, self.lumens, spread, square=True, texture=0)
 
     def surface(self, target: Target) -> Surface:
-        """What is trained: all texels are seen."""
+        """Return the surface to train; all texels are visible."""
         width, height = self.size[0] * target.width, self.size[1] * target.height
         longest = max(width, height)
         size = max(1, round(self.texels * height / longest)), max(1, round(self.texels * width / longest))
         return Surface(Layer(0), size, np.ones(size, bool), (width, height))
 
     def light_of(self, colour: Tensor) -> Tensor:
-        """Share of the light [3, H, W] that a picture in sRGB lets through."""
+        """Return the transmitted share of the light [3, H, W] for an image in sRGB."""
         return self.leak + (1.0 - self.leak) * to_linear(colour.clamp(0.0, 1.0))
 
     def edit(self, colour: Tensor, target: Target) -> SceneEdit:
-        """A picture, sRGB [3, H, W], as an edit of a scene."""
+        """Return an image, sRGB [3, H, W], as a scene edit."""
         return SceneEdit(lamps=(self.lamp(target),), textures={0: self.light_of(colour)})
 
     def power(self, colour: Tensor) -> float:
-        """Light that leaves it while it shows a picture, lumen."""
+        """Return the luminous flux of an image, lumen."""
         share = self.light_of(colour).mean((1, 2)).double()
+        # Luminance weights of linear sRGB.
         return float(self.lumens * (share @ share.new_tensor([0.2126, 0.7152, 0.0722])))
 
     def training(self, /, **settings: Any) -> TextureAttack:
-        """How its picture is trained: no ink, so nothing about printing; it is aimed well, not perfectly.
+        """Return the settings of the training: no terms for print, and an aim with small errors.
 
         Args:
-            **settings: Fields of `TextureAttack` that differ; of `expectation` those of its fields that differ.
+            **settings: Fields of `TextureAttack` that differ; of `expectation`, the fields that differ.
 
         Raises:
-            ConfigError: A setting that it does not have, or a value that it refuses.
+            ConfigError: A setting is unknown or has an invalid value.
         """
-        given: dict[str, Any] = {
+        options: dict[str, Any] = {
             "epochs": 40,
             "rate": 0.1,
             "smooth": 0.02,
@@ -109,10 +113,10 @@ class Projector:
             "expectation": AIMED,
             **settings,
         }
-        if isinstance(given["expectation"], Mapping):
-            given["expectation"] = {**asdict(AIMED), **given["expectation"]}
-        what = f"attack {self.name}"
-        made = checked(partial(TextureAttack, self.name), given, what=what, kind=TextureAttack)
-        if made.stealth:
-            raise ConfigError(f"{what}: stealth={made.stealth:g}: it is for what is printed on something")
-        return made
+        if isinstance(options["expectation"], Mapping):
+            options["expectation"] = {**asdict(AIMED), **options["expectation"]}
+        label = f"attack {self.name}"
+        attack = checked(partial(TextureAttack, self.name), options, what=label, kind=TextureAttack)
+        if attack.stealth:
+            raise ConfigError(f"{label}: stealth={attack.stealth:g}: it is for what is printed on something")
+        return attack

@@ -24,17 +24,17 @@ from ssad.scenarios.static.physical.lights.light import LightAttack, Target
 from ssad.scenarios.static.physical.lights.lit_image import LitPicture
 from ssad.scenarios.static.physical.zoom import around_target
 
-TARGET = Aim(objects=(0,))  # the first object of each picture's truth
+TARGET = Aim(objects=(0,))  # the target is the first object of each image's truth
 INERTIA, PULL = 0.7298, 1.4962  # of a swarm that converges (Clerc and Kennedy, IEEE Trans. Evol. Comput. 6, 2002)
-FASTEST = 0.3  # of a particle, sides of the space a round
-STEPS = (0.2, 0.1, 0.05)  # of the greedy search, one after the other
-POWER = ("watts", "lumens")  # settings that say how strong a light is
-AT_ONCE = 16  # pictures that a detector gets in one call
+FASTEST = 0.3  # maximum speed of a particle, sides of the space per round
+STEPS = (0.2, 0.1, 0.05)  # step sizes of the greedy search, one after the other
+POWER = ("watts", "lumens")  # settings that determine the strength of a light
+AT_ONCE = 16  # images per call of a detector
 
 
 @dataclass(frozen=True, slots=True)
 class LitView:
-    """A picture to search on, and what is in it, the target first."""
+    """Image to search on, and its ground truth, the target first."""
 
     picture: LitPicture
     truth: Truth
@@ -42,14 +42,14 @@ class LitView:
 
 @checked_dataclass(frozen=True, slots=True, config=VALUES)
 class Budget:
-    """How long is searched.
+    """Budget of a search.
 
     Attributes:
-        settings: How many settings are tried, each on all pictures; gradient descent makes so many steps.
+        settings: Number of settings to try, each on all images; for gradient descent the number of steps.
         members: Particles of a swarm; starts of the greedy search and of gradient descent.
-        rate: Of gradient descent, in sides of the space.
-        window: Side of the square part around the target that the detector is shown, px; None: the whole picture.
-        searches: How many searches are made, each from draws of its own and with all `settings`; the best one counts.
+        rate: Learning rate of gradient descent, in sides of the space.
+        window: Side of the square crop around the target for the detector, px; None: the whole image.
+        searches: Number of searches, each with its own draws and all `settings`; the best one counts.
     """
 
     settings: Whole = 120
@@ -70,14 +70,14 @@ USUAL = Budget()
 
 @dataclass(slots=True)
 class Found:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
-        values: The best settings, in the units of their names.
-        loss: Mean over the pictures of what is ascended, with these settings: log(1 - score times overlap).
-        before: The same of the first settings that were tried.
-        queries: Pictures that the detector was asked about.
-        best: The best loss so far after each batch of settings.
+        values: Best settings, in the units of their names.
+        loss: Mean of the ascended loss over the images, with these settings: log(1 - score times overlap).
+        before: Mean loss of the first settings.
+        queries: Number of images shown to the detector.
+        best: Best loss so far after each batch of settings.
     """
 
     values: dict[str, float]
@@ -101,70 +101,78 @@ def search_light(
     search: Literal["swarm", "greedy", "gradient"] | None = None,
     key: tuple[object, ...] = (),
 ) -> Found:
-    """Find the settings of a light under which a target is found worst.
+    """Search for the settings of a light under which a target is detected worst.
 
     Args:
-        attack: What is searched.
-        detector: What is attacked.
-        target: Its size.
-        views: Pictures to search on.
-        budget: How long.
-        search: In place of the attack's own.
-        key: What all draws come from.
+        attack: Light attack to search.
+        detector: Detector under attack.
+        target: Size of the target.
+        views: Images to search on.
+        budget: Budget of the search.
+        search: Search method; None: the attack's own.
+        key: Key of all random draws.
 
     Raises:
-        ConfigError: There are no pictures, or no such search.
+        ConfigError: There are no images, or there is no such search.
     """
     if not views:
         raise ConfigError(f"attack {attack.name}: no pictures to search on")
-    how = search or attack.search
-    if how not in ("swarm", "greedy", "gradient"):
-        raise ConfigError(f"attack {attack.name}: search '{how}'; choose swarm, greedy or gradient")
+    method = search or attack.search
+    if method not in ("swarm", "greedy", "gradient"):
+        raise ConfigError(f"attack {attack.name}: search '{method}'; choose swarm, greedy or gradient")
     ranges = attack.ranges(target)
-    asked = [0]
+    query_count = [0]
 
     def loss(points: Tensor) -> Tensor:
-        values = {name: low + (high - low) * points[:, k] for k, (name, (low, high)) in enumerate(ranges.items())}
+        values = {
+            name: lowest + (highest - lowest) * points[:, column]
+            for column, (name, (lowest, highest)) in enumerate(ranges.items())
+        }
         total = points.new_zeros(len(points))
-        for number, view in enumerate(views):
+        for view_index, view in enumerate(views):
             images, truth = view.picture.show(attack.change(values, view.picture, target)), view.truth
-            asked[0] += len(images)
-            if budget.window is not None:  # the same part at every call
-                place = torch.Generator().manual_seed(int(digest("light window", attack.name, *key, number)[:15], 16))
-                images, truth = around_target(images, truth, budget.window, place)
-            losses = [_loss(detector, part, truth) for part in torch.split(images, AT_ONCE)]
+            query_count[0] += len(images)
+            if budget.window is not None:  # the same crop at every call
+                crop_generator = torch.Generator().manual_seed(
+                    int(digest("light window", attack.name, *key, view_index)[:15], 16)
+                )
+                images, truth = around_target(images, truth, budget.window, crop_generator)
+            losses = [_loss(detector, batch_images, truth) for batch_images in torch.split(images, AT_ONCE)]
             total = total + torch.cat(losses).to(total)
         return total / len(views)
 
-    point, best = np.empty(0), list[float]()
-    for number in range(budget.searches):
-        draws = generator("light search", attack.name, *key, *([number] if number else []))
+    best_point, best_losses = np.empty(0), list[float]()
+    for search_index in range(budget.searches):
+        draws = generator("light search", attack.name, *key, *([search_index] if search_index else []))
         with steady(detector):
-            if how == "gradient":
-                found, losses = _descend(loss, len(ranges), budget, draws)
+            if method == "gradient":
+                candidate, losses = _descend(loss, len(ranges), budget, draws)
             else:
                 with torch.no_grad():
-                    ask: Ask = lambda points: loss(torch.from_numpy(points)).numpy()  # noqa: E731
-                    found, losses = (_swarm if how == "swarm" else _greedy)(ask, len(ranges), budget, draws)
-        if not best or losses[-1] > best[-1]:
-            point = found
-        best += [max([*best[-1:], value]) for value in losses]
+                    loss_function: Ask = lambda settings: loss(torch.from_numpy(settings)).numpy()  # noqa: E731
+                    candidate, losses = (_swarm if method == "swarm" else _greedy)(
+                        loss_function, len(ranges), budget, draws
+                    )
+        if not best_losses or losses[-1] > best_losses[-1]:
+            best_point = candidate
+        # The history continues over all searches and never falls.
+        best_losses += [max([*best_losses[-1:], value]) for value in losses]
     values = {
-        name: float(low + (high - low) * share)
-        for (name, (low, high)), share in zip(ranges.items(), point.tolist(), strict=True)
+        name: float(lowest + (highest - lowest) * share)
+        for (name, (lowest, highest)), share in zip(ranges.items(), best_point.tolist(), strict=True)
     }
-    return Found(values, best[-1], best[0], asked[0], best)
+    return Found(values, best_losses[-1], best_losses[0], query_count[0], best_losses)
 
 
 def random_settings(attack: LightAttack, target: Target, *, key: tuple[object, ...]) -> dict[str, float]:
-    """Settings that no search has seen: each uniform over its range, at full power, as a search may have it."""
+    """Draw settings uniformly over their ranges, at full power, the strongest that a search can choose."""
     draws = generator("random light", attack.name, *key)
-    drawn = {name: float(draws.uniform(low, high)) for name, (low, high) in attack.ranges(target).items()}
-    return {name: attack.ranges(target)[name][1] if name in POWER else value for name, value in drawn.items()}
+    values = {name: float(draws.uniform(lowest, highest)) for name, (lowest, highest) in attack.ranges(target).items()}
+    return {name: attack.ranges(target)[name][1] if name in POWER else value for name, value in values.items()}
 
 
 def _loss(detector: Detector, images: Tensor, truth: Truth) -> Tensor:
-    """What is ascended, of each picture [N]: log(1 - best score times overlap on the target)."""
+    """Return the ascended loss of each image [N]: log(1 - best score times overlap on the target)."""
     dense = detector.dense(images)
     with torch.no_grad():
         assignment = detector.assign(dense, [truth] * len(images))
@@ -173,23 +181,28 @@ def _loss(detector: Detector, images: Tensor, truth: Truth) -> Tensor:
 
 def _swarm(ask: Ask, dimensions: int, budget: Budget, draws: np.random.Generator) -> tuple[F64, list[float]]:
     """A particle swarm in the unit cube (Kennedy and Eberhart 1995)."""
-    place = draws.random((budget.members, dimensions))
-    speed = draws.uniform(-FASTEST, FASTEST, place.shape)
-    own, own_loss = place.copy(), ask(place)
-    best = [float(own_loss.max())]
+    positions = draws.random((budget.members, dimensions))
+    velocities = draws.uniform(-FASTEST, FASTEST, positions.shape)
+    personal_best, personal_loss = positions.copy(), ask(positions)
+    best_losses = [float(personal_loss.max())]
     for _ in range(budget.settings // budget.members - 1):
-        leader = own[int(own_loss.argmax())]
-        pulls = draws.random((2, *place.shape))
-        speed = INERTIA * speed + PULL * (pulls[0] * (own - place) + pulls[1] * (leader - place))
-        speed = speed.clip(-FASTEST, FASTEST)
-        place = place + speed
-        out = (place < 0.0) | (place > 1.0)
-        place, speed = place.clip(0.0, 1.0), np.where(out, -0.5 * speed, speed)  # it bounces off the walls
-        now = ask(place)
-        better = now > own_loss
-        own[better], own_loss[better] = place[better], now[better]
-        best.append(float(own_loss.max()))
-    return own[int(own_loss.argmax())], best
+        leader = personal_best[int(personal_loss.argmax())]
+        weights = draws.random((2, *positions.shape))
+        velocities = INERTIA * velocities + PULL * (
+            weights[0] * (personal_best - positions) + weights[1] * (leader - positions)
+        )
+        velocities = velocities.clip(-FASTEST, FASTEST)
+        positions = positions + velocities
+        is_outside = (positions < 0.0) | (positions > 1.0)
+        positions, velocities = (
+            positions.clip(0.0, 1.0),
+            np.where(is_outside, -0.5 * velocities, velocities),
+        )  # it bounces off the walls
+        losses = ask(positions)
+        improved = losses > personal_loss
+        personal_best[improved], personal_loss[improved] = positions[improved], losses[improved]
+        best_losses.append(float(personal_loss.max()))
+    return personal_best[int(personal_loss.argmax())], best_losses
 
 
 def _greedy(ask: Ask, dimensions: int, budget: Budget, draws: np.random.Generator) -> tuple[F64, list[float]]:
@@ -197,42 +210,46 @@ def _greedy(ask: Ask, dimensions: int, budget: Budget, draws: np.random.Generato
 
     The greedy search of AdvLB: of its candidates in a coordinate the best is taken if it is better than what was there.
     """
-    starts = draws.random((budget.members, dimensions))
-    losses = ask(starts)
-    point, top = starts[int(losses.argmax())].copy(), float(losses.max())
-    best, left = [float(losses[0]), top], budget.settings - budget.members
+    initial_points = draws.random((budget.members, dimensions))
+    losses = ask(initial_points)
+    point, best_loss = initial_points[int(losses.argmax())].copy(), float(losses.max())
+    best_losses, remaining = [float(losses[0]), best_loss], budget.settings - budget.members
     for step in STEPS:
         improved = True
-        while improved and left >= 2:
+        while improved and remaining >= 2:
             improved = False
-            for k in draws.permutation(dimensions).tolist():
-                if left < 2:
+            for axis in draws.permutation(dimensions).tolist():
+                if remaining < 2:
                     break
-                moved = np.stack([point, point])
-                moved[:, k] = np.clip(point[k] + np.array([-step, step]), 0.0, 1.0)
-                tried = ask(moved)
-                left -= 2
-                if float(tried.max()) > top:
-                    point, top, improved = moved[int(tried.argmax())], float(tried.max()), True
-            best.append(top)
-    return point, best
+                candidates = np.stack([point, point])
+                candidates[:, axis] = np.clip(point[axis] + np.array([-step, step]), 0.0, 1.0)
+                candidate_losses = ask(candidates)
+                remaining -= 2
+                if float(candidate_losses.max()) > best_loss:
+                    point, best_loss, improved = (
+                        candidates[int(candidate_losses.argmax())],
+                        float(candidate_losses.max()),
+                        True,
+                    )
+            best_losses.append(best_loss)
+    return point, best_losses
 
 
 def _descend(
     loss: Callable[[Tensor], Tensor], dimensions: int, budget: Budget, draws: np.random.Generator
 ) -> tuple[F64, list[float]]:
-    """Adam from the best of some random starts; a point that leaves the unit cube is put back to its wall."""
+    """Run Adam from the best of some random starts, with points clipped to the unit cube."""
     with torch.no_grad():
-        starts = torch.from_numpy(draws.random((budget.members, dimensions)))
-        first = loss(starts)
-    point = starts[int(first.argmax())].clone()[None].requires_grad_()
-    kept, top = point.detach().clone(), float(first.max())
-    best = [float(first[0]), top]
+        initial_points = torch.from_numpy(draws.random((budget.members, dimensions)))
+        initial_losses = loss(initial_points)
+    point = initial_points[int(initial_losses.argmax())].clone()[None].requires_grad_()
+    best_point, best_loss = point.detach().clone(), float(initial_losses.max())
+    best_losses = [float(initial_losses[0]), best_loss]
     optimiser = torch.optim.Adam([point], lr=budget.rate)
     for _ in range(max(budget.settings - budget.members, 0)):
         value = loss(point)
-        if float(value.detach()) > top:
-            kept, top = point.detach().clone(), float(value.detach())
+        if float(value.detach()) > best_loss:
+            best_point, best_loss = point.detach().clone(), float(value.detach())
         optimiser.zero_grad()
         torch.autograd.backward(-value.sum())
         assert point.grad is not None
@@ -240,5 +257,5 @@ def _descend(
         optimiser.step()
         with torch.no_grad():
             point.clamp_(0.0, 1.0)
-        best.append(top)
-    return np.asarray(kept[0].numpy(), np.float64), best
+        best_losses.append(best_loss)
+    return np.asarray(best_point[0].numpy(), np.float64), best_losses

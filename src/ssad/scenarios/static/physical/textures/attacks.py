@@ -1,4 +1,4 @@
-"""The table of attacks that train a texture."""
+"""Registry of the attacks that train a texture."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ ATTACKS: dict[str, str] = {
 
 
 def physical_names() -> dict[str, str]:
-    """All names of attacks that train a texture -> where they come from."""
+    """Return the names of all attacks that train a texture and the objects that define them."""
     return names("physical-attack", ATTACKS)
 
 
 def make_physical(name: str, /, **settings: Any) -> TextureAttack:
-    """An attack that trains a texture, by name.
+    """Create an attack that trains a texture, by name.
 
     Args:
-        name: Of `ATTACKS`, or "module:object".
+        name: Key of `ATTACKS`, or "module:object".
         **settings: Fields of `TextureAttack` that differ from the attack's own.
 
     Raises:
         UnknownNameError: There is no such attack.
-        ConfigError: A setting that it does not have, or a value that it refuses.
+        ConfigError: A setting is unknown or has an invalid value.
     """
-    build = resolve("physical-attack", ATTACKS, name)
-    make = build if callable(build) else partial(replace, build)
+    definition = resolve("physical-attack", ATTACKS, name)
+    factory = definition if callable(definition) else partial(replace, definition)
     try:
-        made = checked(make, settings, what=f"attack {name}", kind=TextureAttack)
+        attack = checked(factory, settings, what=f"attack {name}", kind=TextureAttack)
     except TypeError as error:
         raise ConfigError(f"attack {name}: {error}") from None
-    if not isinstance(made, TextureAttack):
-        raise ConfigError(f"attack {name}: expected a TextureAttack, not {type(made).__name__}")
-    return made
+    if not isinstance(attack, TextureAttack):
+        raise ConfigError(f"attack {name}: expected a TextureAttack, not {type(attack).__name__}")
+    return attack
 
 
 def default_carrier(name: str) -> str:
-    """What a texture is printed on if a suite does not say."""
+    """Return the carrier of an attack for suites that do not name one."""
     return "patch" if name == "adv-patch" else "camouflage"

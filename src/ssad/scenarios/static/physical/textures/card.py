@@ -1,4 +1,4 @@
-"""Trained textures as files: a picture of what is printed and a card that says where it comes from."""
+"""Trained textures as files: the printed image, and a card with its origin."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ SHIPPED = Path(__file__).parent / "trained"
 
 @dataclass(frozen=True, slots=True)
 class TextureCard:
-    """What a texture is and where it comes from.
+    """Description and origin of a texture.
 
     Attributes:
-        attack: That trained it.
-        carrier: Name of what it is printed on.
-        options: Of the carrier.
-        source: The detector that was attacked.
+        attack: Attack that trained it.
+        carrier: Name of the carrier.
+        options: Options of the carrier.
+        source: Detector under attack.
         weights: Hash of that detector's weights.
-        target: What wears it, as for `ssad record --target`.
-        data: What it was trained on.
+        target: Target that wears it, as for `ssad record --target`.
+        data: Training data.
         command: Command that reproduces it.
-        epochs: Of the training.
-        metrics: Measured on the town of the test, which `data` names.
-        hash: SHA-256 of size and texels; `save_texture` fills it in.
-        version: Version of SSAD; `save_texture` fills it in.
+        epochs: Training epochs.
+        metrics: Results on the town of the test, which `data` names.
+        hash: SHA-256 of size and texels; set by `save_texture`.
+        version: Version of SSAD; set by `save_texture`.
     """
 
     attack: str
@@ -55,32 +55,32 @@ class TextureCard:
 
 
 def shipped_textures() -> list[str]:
-    """Names of the textures that SSAD ships."""
+    """Return the names of the textures that SSAD ships."""
     return sorted(path.stem for path in SHIPPED.glob("*.json"))
 
 
 def load_texture(name: str) -> tuple[Tensor, TextureCard]:
-    """A texture and its card.
+    """Load a texture and its card.
 
     Args:
-        name: Of a shipped texture, or the path of a card (NAME.json, with NAME.png beside it).
+        name: Name of a shipped texture, or path of a card (NAME.json, with NAME.png beside it).
 
     Returns:
         sRGB [3, H, W] in 0 to 1, and the card.
 
     Raises:
         UnknownNameError: No shipped texture has the name.
-        FormatError: A file is missing or broken, or the picture is not the one that the card describes.
+        FormatError: A file is missing or broken, or the image does not match the card.
     """
     path = Path(name).expanduser() if name.endswith(".json") else SHIPPED / f"{name}.json"
     if not name.endswith(".json") and not path.is_file():
         raise unknown_name("texture", name, shipped_textures())
-    data = safeio.read_json(path)
-    known = {one.name for one in fields(TextureCard)}
-    if not isinstance(data, dict) or not known >= set(data):
-        raise FormatError(f"{path}: not the card of a texture; its keys are {', '.join(sorted(known))}")
+    card_data = safeio.read_json(path)
+    field_names = {field_info.name for field_info in fields(TextureCard)}
+    if not isinstance(card_data, dict) or not field_names >= set(card_data):
+        raise FormatError(f"{path}: not the card of a texture; its keys are {', '.join(sorted(field_names))}")
     try:
-        card = TextureCard(**data)
+        card = TextureCard(**card_data)
     except TypeError as error:
         raise FormatError(f"{path}: not the card of a texture ({error})") from None
     picture = read_image(path.with_suffix(".png"))
@@ -93,13 +93,13 @@ def save_texture(path: Path, picture: U8, card: TextureCard) -> None:
     """Write PATH.png and PATH.json.
 
     Args:
-        path: Without a suffix.
+        path: Path without a suffix.
         picture: RGB [H, W, 3].
-        card: Hash and version are filled in.
+        card: Card; its hash and version are set here.
     """
-    about = asdict(card) | {"hash": _hash(picture), "version": __version__}
+    card_data = asdict(card) | {"hash": _hash(picture), "version": __version__}
     save_picture(path.with_suffix(".png"), picture)
-    safeio.write_atomic(path.with_suffix(".json"), safeio.dump_json(about, indent=1) + "\n")
+    safeio.write_atomic(path.with_suffix(".json"), safeio.dump_json(card_data, indent=1) + "\n")
 
 
 def _hash(picture: U8) -> str:

@@ -1,4 +1,4 @@
-"""A texture for printing and for other programs: pictures at true size, and the target as OBJ that wears it."""
+"""A texture for printing and for other programs: images at true size, and the target as OBJ with the texture."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ ATLAS = 2048  # texels of a side of the atlas that shows a patch
 
 @dataclass(frozen=True, slots=True)
 class Print:
-    """A texture with what it takes to put it on its target again.
+    """Texture with all settings that are needed to put it on its target again.
 
     Attributes:
         colour: sRGB [3, H, W] in 0 to 1.
         carrier: Name of its carrier (`ssad.scenarios.static.physical.CARRIERS`).
-        options: Of the carrier.
-        target: Whom it is made for, as for `ssad record --target`.
-        hour: When it is shown: as it comes.
+        options: Options of the carrier.
+        target: Target of the texture, as for `ssad record --target`.
+        hour: Hour at which it is shown: that of the drive.
     """
 
     colour: Tensor
@@ -51,7 +51,11 @@ class Print:
     hour: str = field(default="recorded", init=False)
 
     def on(self, mesh: Mesh) -> Surface:
-        """Where it goes on a body. ConfigError: it does not fit."""
+        """Return the surface of the texture on a body.
+
+        Raises:
+            ConfigError: It does not fit.
+        """
         surface = make_carrier(self.carrier, self.options).on(mesh)
         if surface.size != tuple(self.colour.shape[1:]):
             raise ConfigError(
@@ -61,12 +65,12 @@ class Print:
         return surface
 
     def edit(self, mesh: Mesh) -> SceneEdit:
-        """The body wears it."""
+        """Return the edit of a scene in which the body has the texture."""
         surface = self.on(mesh)
-        shown, masks = {0: albedo_of(self.colour)}, {0: surface.mask}
+        textures, masks = {0: albedo_of(self.colour)}, {0: surface.mask}
         if isinstance(surface.layer, Decal):
-            return SceneEdit(decals=(surface.layer,), textures=shown, masks=masks)
-        return SceneEdit((surface.layer,), textures=shown, masks=masks)
+            return SceneEdit(decals=(surface.layer,), textures=textures, masks=masks)
+        return SceneEdit((surface.layer,), textures=textures, masks=masks)
 
     def live(self, agent: int) -> LiveAttack:
         """An agent of the closed loop, a car or a walker, wears it, or every stop sign."""
@@ -74,17 +78,17 @@ class Print:
 
 
 def load_print(folder: Path) -> Print:
-    """What `export_texture` wrote.
+    """Read a texture that `export_texture` wrote.
 
     Raises:
         FormatError: A file is missing or broken, or the numbers are not those that were exported.
     """
-    about, numbers = safeio.read_json(folder / "texture.json"), safeio.read_bytes(folder / "texture.npz")
+    description, colour_bytes = safeio.read_json(folder / "texture.json"), safeio.read_bytes(folder / "texture.npz")
     try:
-        if hashlib.sha256(numbers).hexdigest() != about["sha256"]:
+        if hashlib.sha256(colour_bytes).hexdigest() != description["sha256"]:
             raise FormatError(f"{folder / 'texture.npz'}: not the texture that texture.json describes; export it again")
         colour = torch.from_numpy(safeio.load_npz(folder / "texture.npz")["colour"].copy())
-        return Print(colour, about["carrier"], about["options"], about["target"])
+        return Print(colour, description["carrier"], description["options"], description["target"])
     except (KeyError, TypeError) as error:
         raise FormatError(f"{folder / 'texture.json'}: no exported texture ({error}); export it again") from None
 
@@ -117,75 +121,83 @@ def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") 
     safeio.make_folder(out)
     _save(out / "print.png", _resized(texels, (height, width)), dots)
     _save(out / "atlas.png", _atlas(texels, surface, target), None)
-    painted = replace(mesh, materials=tuple(replace(m, colour=target.colour) if m.paint else m for m in mesh.materials))
-    write_obj(out / "target.obj", painted, texture="atlas.png")
-    numbers = safeio.npz_bytes({"colour": colour.numpy()})
-    safeio.write_atomic(out / "texture.npz", numbers)
+    painted_mesh = replace(
+        mesh,
+        materials=tuple(
+            replace(material, colour=target.colour) if material.paint else material for material in mesh.materials
+        ),
+    )
+    write_obj(out / "target.obj", painted_mesh, texture="atlas.png")
+    colour_bytes = safeio.npz_bytes({"colour": colour.numpy()})
+    safeio.write_atomic(out / "texture.npz", colour_bytes)
     mask = torch.from_numpy(surface.mask.copy())
-    score = float(non_printability(colour, printable_colours(), mask))
-    away = float(conspicuousness(albedo_of(colour), covered(surface, mesh, target.colour), mask))
-    about = {
+    printability = float(non_printability(colour, printable_colours(), mask))
+    colour_distance = float(conspicuousness(albedo_of(colour), covered(surface, mesh, target.colour), mask))
+    description = {
         "name": name,
         "target": made.target,
         "carrier": made.carrier,
         "options": dict(made.options),
         "dots_per_metre": dots,
-        "sha256": hashlib.sha256(numbers).hexdigest(),
-        "metres": [round(one, 4) for one in surface.metres],
+        "sha256": hashlib.sha256(colour_bytes).hexdigest(),
+        "metres": [round(metre, 4) for metre in surface.metres],
         "texels": [colour.shape[2], colour.shape[1]],
-        "rectangle": [round(v, 6) for v in _rectangle(surface)],
+        "rectangle": [round(coordinate, 6) for coordinate in _rectangle(surface)],
         "panels": _panels(mesh),
-        "non_printability": round(score, 4),
-        "delta_e": round(away, 2),
+        "non_printability": round(printability, 4),
+        "delta_e": round(colour_distance, 2),
     }
-    safeio.write_atomic(out / "texture.json", safeio.dump_json(about, indent=1) + "\n")
+    safeio.write_atomic(out / "texture.json", safeio.dump_json(description, indent=1) + "\n")
     return [
-        out / file for file in ("print.png", "atlas.png", "target.obj", "target.mtl", "texture.npz", "texture.json")
+        out / file_name
+        for file_name in ("print.png", "atlas.png", "target.obj", "target.mtl", "texture.npz", "texture.json")
     ]
 
 
 def _resized(texels: Any, size: tuple[int, int]) -> U8:
-    """A texture with more texels, as the renderer looks it up between them, RGB."""
-    whole = cv2.resize(texels, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray((whole.clip(0.0, 1.0) * 255).round(), np.uint8)
+    """Enlarge a texture as the renderer interpolates it between texels, RGB."""
+    enlarged = cv2.resize(texels, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray((enlarged.clip(0.0, 1.0) * 255).round(), np.uint8)
 
 
 def _rectangle(surface: Surface) -> tuple[float, float, float, float]:
-    """What a texture covers of the atlas; nothing if it lies beside the target."""
+    """Return the rectangle of a texture in the atlas; an empty one if it lies beside the target."""
     return (0.0, 0.0, 0.0, 0.0) if isinstance(surface.layer, Decal) else surface.layer.rectangle
 
 
 def _atlas(texels: Any, surface: Surface, target: Target) -> U8:
-    """The picture of the whole atlas: paint, and the texture where it is."""
+    """Return the image of the whole atlas: paint, and the texture on it."""
     u0, v0, u1, v1 = _rectangle(surface)
     if (u0, v0, u1, v1) == (0.0, 0.0, 1.0, 1.0):
         return _resized(texels, (max(ATLAS, texels.shape[0]), max(ATLAS, texels.shape[1])))
     paint = np.asarray(target.colour)
+    # The transfer function of sRGB (IEC 61966-2-1).
     srgb = np.where(paint <= 0.0031308, 12.92 * paint, 1.055 * paint ** (1 / 2.4) - 0.055)
-    whole = np.empty((ATLAS, ATLAS, 3), np.uint8)
-    whole[:] = (srgb * 255).round()
-    left, top, right, bottom = (round(v * ATLAS) for v in (u0, v0, u1, v1))
+    atlas = np.empty((ATLAS, ATLAS, 3), np.uint8)
+    atlas[:] = (srgb * 255).round()
+    left, top, right, bottom = (round(edge * ATLAS) for edge in (u0, v0, u1, v1))
     if right > left and bottom > top:  # else smaller than a texel
-        whole[top:bottom, left:right] = _resized(texels, (bottom - top, right - left))
-    return whole
+        atlas[top:bottom, left:right] = _resized(texels, (bottom - top, right - left))
+    return atlas
 
 
 def _panels(mesh: Mesh) -> dict[str, dict[str, list[float]]]:
-    """Where each panel is in the atlas, and how large it is."""
-    found = {}
+    """Return the rectangle of each panel in the atlas, and its size in metres."""
+    panels = {}
     for panel in mesh.panels:
         u0, v0, u1, v1 = mesh.panel_rectangle(panel)
         try:
-            across, down = metres_of(mesh, panel)
+            metres_per_u, metres_per_v = metres_of(mesh, panel)
         except ConfigError:  # a panel without faces at this level of detail
             continue
-        metres = [round((u1 - u0) * across, 3), round((v1 - v0) * down, 3)]
-        found[panel] = {"rectangle": [round(v, 6) for v in (u0, v0, u1, v1)], "metres": metres}
-    return found
+        size_metres = [round((u1 - u0) * metres_per_u, 3), round((v1 - v0) * metres_per_v, 3)]
+        panels[panel] = {"rectangle": [round(edge, 6) for edge in (u0, v0, u1, v1)], "metres": size_metres}
+    return panels
 
 
 def _save(path: Path, image: U8, dots: int | None) -> None:
-    """A PNG that says how many dots a metre has."""
-    options: dict[str, Any] = {} if dots is None else {"dpi": (dots * 0.0254, dots * 0.0254)}
+    """Write a PNG that declares its resolution."""
+    # PNG readers print at true size from this number; an inch has 0.0254 m.
+    png_options: dict[str, Any] = {} if dots is None else {"dpi": (dots * 0.0254, dots * 0.0254)}
     with safeio.atomic_path(path) as file:
-        Image.fromarray(image).save(file, "PNG", **options)
+        Image.fromarray(image).save(file, "PNG", **png_options)

@@ -1,4 +1,4 @@
-"""The textures of a folder: each trained once and kept, as numbers and as a picture."""
+"""Folder of textures: each is trained once and stored as numbers and as an image."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from ssad.scenarios.static.physical.textures.spec import TextureSpec
 
 @dataclass(frozen=True, slots=True)
 class TextureFolder:
-    """Textures that are kept.
+    """Folder of trained textures.
 
     Attributes:
-        path: The folder.
-        seed: Root of the random numbers of trainings.
-        device: Where textures are trained.
+        path: Path of the folder.
+        seed: Root seed of the trainings.
+        device: Device of the trainings.
     """
 
     path: Path
@@ -39,11 +39,11 @@ class TextureFolder:
     device: str = "cpu"
 
     def kept(self, spec: TextureSpec) -> Path:
-        """Where a trained texture is when it is done."""
+        """Return the path of a finished texture."""
         return self.path / f"{spec.name}.npz"
 
     def picture(self, spec: TextureSpec) -> Path:
-        """Where a texture is as a picture."""
+        """Return the path of a texture's image."""
         return self.path / spec.picture
 
     def texture(
@@ -55,14 +55,14 @@ class TextureFolder:
         detector: Callable[[], Detector],
         paint: Tensor | None = None,
     ) -> Tensor:
-        """A texture; trained now if it has to be. Written as a picture too.
+        """Return a texture, trained first if necessary; its image is written too.
 
         Args:
-            spec: Which.
-            surface: What it is printed on.
-            views: Makes the pictures of the training.
-            detector: Makes the detector that is attacked.
-            paint: Linear RGB [3] of what the texture covers, for attacks with `stealth`.
+            spec: Specification of the texture.
+            surface: Surface that carries it.
+            views: Function that renders the training images.
+            detector: Function that creates the detector under attack.
+            paint: Linear RGB [3] of the covered surface, for attacks with `stealth`.
 
         Returns:
             sRGB [3, H, W] in 0 to 1.
@@ -71,8 +71,8 @@ class TextureFolder:
             ConfigError: It cannot be trained (see `train_texture`).
         """
         if spec.source:
-            trained = spec.file is None
-            colour = self._trained(spec, surface, views, detector, paint) if trained else _read(spec, surface)
+            is_trained = spec.file is None
+            colour = self._trained(spec, surface, views, detector, paint) if is_trained else _read(spec, surface)
             if spec.attack == "shuffled":
                 colour = control("shuffled", surface.size, seed=spec.number, trained=colour)
         else:
@@ -105,10 +105,11 @@ class TextureFolder:
             )
             losses, gradients = np.array(trained.losses), np.array(trained.gradients)
             safeio.save_npz(path, {"colour": trained.colour.numpy(), "losses": losses, "gradients": gradients})
+        # Always read from the file: a texture is the same whether or not it was just trained.
         return torch.from_numpy(safeio.load_npz(path)["colour"].copy())
 
     def history(self, spec: TextureSpec) -> dict[str, Any]:
-        """How a texture was trained, for records; empty for what is not trained."""
+        """Return the training history of a texture for records; empty without training."""
         if not spec.trained:
             return {}
         losses = safeio.load_npz(self.kept(spec))["losses"]
@@ -116,7 +117,11 @@ class TextureFolder:
 
 
 def _read(spec: TextureSpec, surface: Surface) -> Tensor:
-    """A texture from its file. ConfigError: it is of another size than the surface."""
+    """Load a texture from its file.
+
+    Raises:
+        ConfigError: Its size differs from that of the surface.
+    """
     assert spec.file is not None
     colour, _ = load_texture(spec.file)
     if tuple(colour.shape[1:]) != surface.size:

@@ -1,4 +1,4 @@
-"""Colours that print has: measured patches of offset printing on coated paper, for the non-printability score."""
+"""Printable colours: measured patches of offset printing on coated paper, for the non-printability score."""
 
 from __future__ import annotations
 
@@ -92,12 +92,13 @@ D50_TO_SRGB: Final = (
 
 @lru_cache(maxsize=1)
 def printable_colours() -> Tensor:
-    """The 64 colours [64, 3] as textures hold them: sRGB in 0 to 1, of which `albedo_of` makes the measured albedo.
+    """Return the 64 colours [64, 3] in sRGB, 0 to 1, which `albedo_of` maps to the measured albedos.
 
-    What lies outside the gamut of sRGB is moved to its border.
+    Colours outside the gamut of sRGB are moved to its border.
     """
     albedo = np.array(FOGRA39) / 100.0 @ np.array(D50_TO_SRGB).T
-    low, high = PRINTABLE
-    linear = ((albedo - low) / (high - low)).clip(0.0, 1.0)
+    darkest, brightest = PRINTABLE
+    # Inverse of `printable`, which maps textures into the range of ink and paper.
+    linear = ((albedo - darkest) / (brightest - darkest)).clip(0.0, 1.0)
     colour = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055)
     return torch.from_numpy(colour.astype(np.float32))

@@ -1,4 +1,4 @@
-"""Textures that are trained: gradient descent through camera, print and detector, with checkpoints."""
+"""Training of textures: gradient descent through camera, print and detector, with checkpoints."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ TARGET = Aim(objects=(0,))
 
 
 class Shows(Protocol):
-    """A picture that waits for textures (see `ssad.experiments.perception.physical.textured_images.Wearing`)."""
+    """Protocol of an image whose target can wear textures (see `ssad.recording.textured_clips.Wearing`)."""
 
     @classmethod
     def together(
         cls, pictures: Sequence[Any], textures: Mapping[int, Tensor], noise: Sequence[torch.Generator] | None = None
     ) -> Tensor:
-        """Pictures [B, 3, H, W] in 0 to 1, differentiable in the textures [B, 3, h, w] of linear albedo."""
+        """Render images [B, 3, H, W] in 0 to 1, differentiable in the textures [B, 3, h, w] of linear albedo."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A picture to train or test on.
+    """Image to train or test on.
 
     Attributes:
-        picture: The picture; its target wears texture 0.
-        truth: What is in it, the target first.
+        picture: Image whose target wears texture 0.
+        truth: Ground truth, the target first.
     """
 
     picture: Shows
@@ -58,7 +58,7 @@ class View:
 
 
 def _loss(value: Any) -> Any:
-    """A loss, or the name of one, as it is."""
+    """Validate a loss or the name of one."""
     if isinstance(value, str):
         try:
             make_objective(value)
@@ -71,24 +71,25 @@ def _loss(value: Any) -> Any:
 
 @checked_dataclass(frozen=True, slots=True, config=VALUES)
 class TextureAttack:
-    """How a texture is trained.
+    """Settings for training a texture.
 
     Attributes:
-        name: What tables call it.
-        objective: The loss that is ascended, or its name.
-        epochs: Times that each picture is shown.
+        name: Name shown in tables.
+        objective: Loss to ascend, or its name.
+        epochs: Passes over all images.
         rate: Learning rate, in units of colour (0 to 1).
         optimiser: adam, or sgd with momentum 0.9.
         decay: Weight decay towards mid-grey.
-        batch: Pictures a step.
+        batch: Images per step.
         smooth: Weight of the total variation.
         printed: Weight of the non-printability.
-        stealth: Weight of the conspicuousness, of 100: how far the colours are from those that the texture covers.
-        expectation: What differs from print to print.
-        worst: Share of the pictures of an epoch that are drawn by how badly the attack does on them, in place of once
-            each; 0: none.
-        window: Side of the square part around the target that a 2D detector is shown, px; None: the whole picture, as
-            3D detectors are always shown, since their boxes belong to its camera.
+        stealth: Weight of the conspicuousness, of 100: the distance of the colours from those that the texture
+            covers.
+        expectation: Variation between prints.
+        worst: Share of the images of an epoch that are drawn by how badly the attack performs on them, instead of
+            once each; 0: none.
+        window: Side of the square crop around the target for a 2D detector, px; None: the whole image, which 3D
+            detectors always receive, since their boxes belong to its camera.
     """
 
     name: str
@@ -108,12 +109,12 @@ class TextureAttack:
 
 @dataclass(slots=True)
 class Trained:
-    """A trained texture and how it came about.
+    """Trained texture and its training history.
 
     Attributes:
         colour: sRGB [3, H, W] in 0 to 1, on the CPU.
         losses: Mean of the ascended loss in each epoch.
-        gradients: Greatest length of a texel's gradient in each epoch; 0 means that nothing reaches the texture.
+        gradients: Maximum length of a texel's gradient in each epoch; 0 means that no gradient reaches the texture.
     """
 
     colour: Tensor
@@ -175,23 +176,24 @@ def train_texture(
     else:
         optimiser = torch.optim.SGD([colour], lr=attack.rate, momentum=0.9)
     state = _State(colour, optimiser, np.zeros(len(views)), [], [])
-    name = digest("texture", replace(attack, epochs=1), surface.size, surface.place, len(views), key)
+    # Without the number of epochs, so that a training can be resumed with more of them.
+    training_id = digest("texture", replace(attack, epochs=1), surface.size, surface.place, len(views), key)
     if checkpoint is not None and checkpoint.is_file():
-        state.load(checkpoint, name)
+        state.load(checkpoint, training_id)
     mask = torch.as_tensor(surface.mask, device=device)
-    inks = None if printable is None else printable.to(colour)
+    ink_colours = None if printable is None else printable.to(colour)
     with steady(detector):
         for epoch in range(len(state.losses), attack.epochs):
             order = _order(attack, state.hard, generator("texture order", *key, epoch))
-            total, steepest = 0.0, 0.0
-            for step, first in enumerate(range(0, len(order), attack.batch)):
-                chosen = order[first : first + attack.batch]
+            loss_sum, steepest = 0.0, 0.0
+            for step, batch_start in enumerate(range(0, len(order), attack.batch)):
+                batch_indices = order[batch_start : batch_start + attack.batch]
                 losses = _ascended(
-                    attack, objective, detector, views, colour, chosen.tolist(), shown, (*key, epoch, step)
+                    attack, objective, detector, views, colour, batch_indices.tolist(), shown, (*key, epoch, step)
                 )
                 loss = -losses.mean() + attack.smooth * total_variation(colour, mask)
-                if inks is not None and attack.printed > 0.0:
-                    loss = loss + attack.printed * non_printability(colour, inks, mask)
+                if ink_colours is not None and attack.printed > 0.0:
+                    loss = loss + attack.printed * non_printability(colour, ink_colours, mask)
                 if paint is not None and attack.stealth > 0.0:
                     loss = loss + attack.stealth * conspicuousness(albedo_of(colour), paint.to(colour), mask) / 100.0
                 optimiser.zero_grad()
@@ -205,17 +207,17 @@ def train_texture(
                 optimiser.step()
                 with torch.no_grad():
                     colour.clamp_(0.0, 1.0)
-                total += float(losses.detach().sum())
-                state.hard[chosen] = losses.detach().cpu().double().numpy()
-            state.losses.append(total / len(order))
+                loss_sum += float(losses.detach().sum())
+                state.hard[batch_indices] = losses.detach().cpu().double().numpy()
+            state.losses.append(loss_sum / len(order))
             state.gradients.append(steepest)
-            if not any(state.gradients):  # later it means that nothing is left to hide
+            if not any(state.gradients):  # in later epochs a zero gradient means that nothing is left to hide
                 raise ConfigError(
                     f"attack {attack.name}: loss '{objective.name}' has no slope in the texture: the target is never "
                     "in view, or is not found even without it"
                 )
             if checkpoint is not None:
-                state.save(checkpoint, name)
+                state.save(checkpoint, training_id)
             progress(epoch + 1, attack.epochs)
     return Trained(colour.detach().cpu(), state.losses, state.gradients)
 
@@ -231,18 +233,18 @@ def _ascended(  # noqa: PLR0917
     key: tuple[object, ...],
 ) -> Tensor:
     """The loss [B] of some pictures, with texture, print and noise of their own."""
-    draws = [torch.Generator().manual_seed(int(digest("texture draw", *key, k)[:15], 16)) for k in chosen]
-    pictures, truth = [views[k].picture for k in chosen], [views[k].truth for k in chosen]
-    printed = shown(attack.expectation.draw(colour, draws))
-    images = type(pictures[0]).together(pictures, {0: printed}, draws)
-    three = detector.task == "3d"
-    if attack.window is not None and not three:
-        parts = [
-            around_target(image[None], seen, attack.window, own)
-            for image, seen, own in zip(images, truth, draws, strict=True)
+    draws = [torch.Generator().manual_seed(int(digest("texture draw", *key, index)[:15], 16)) for index in chosen]
+    pictures, truth = [views[index].picture for index in chosen], [views[index].truth for index in chosen]
+    textures = shown(attack.expectation.draw(colour, draws))
+    images = type(pictures[0]).together(pictures, {0: textures}, draws)
+    is_3d = detector.task == "3d"
+    if attack.window is not None and not is_3d:
+        crops = [
+            around_target(image[None], image_truth, attack.window, image_generator)
+            for image, image_truth, image_generator in zip(images, truth, draws, strict=True)
         ]
-        images, truth = torch.cat([part for part, _ in parts]), [seen for _, seen in parts]
-    cameras = [one.intrinsic for one in truth if one.intrinsic is not None and three]
+        images, truth = torch.cat([crop for crop, _ in crops]), [image_truth for _, image_truth in crops]
+    cameras = [ground_truth.intrinsic for ground_truth in truth if ground_truth.intrinsic is not None and is_3d]
     dense = detector.dense(images, torch.stack(cameras).to(images) if cameras else None)
     with torch.no_grad():
         assignment = detector.assign(dense, truth)
@@ -252,17 +254,17 @@ def _ascended(  # noqa: PLR0917
 def _order(attack: TextureAttack, hard: Any, draws: np.random.Generator) -> Any:
     """Numbers of the pictures of an epoch: each once, a share of them replaced by those that the attack fails on."""
     order = draws.permutation(len(hard))
-    count = int(attack.worst * len(hard))
-    if count and np.ptp(hard) > 0.0:
-        scaled = -(hard - hard.mean()) / hard.std()  # a low value: still found
-        chance = np.exp(np.clip(scaled, -3.0, 3.0))
-        order[:count] = draws.choice(len(hard), size=count, p=chance / chance.sum())
+    replaced = int(attack.worst * len(hard))
+    if replaced and np.ptp(hard) > 0.0:
+        standard_loss = -(hard - hard.mean()) / hard.std()  # a low loss: the target is still detected
+        probability = np.exp(np.clip(standard_loss, -3.0, 3.0))
+        order[:replaced] = draws.choice(len(hard), size=replaced, p=probability / probability.sum())
     return order
 
 
 @dataclass(slots=True)
 class _State:
-    """All that changes in a training."""
+    """Everything that changes during a training."""
 
     colour: Tensor
     optimiser: torch.optim.Optimizer
@@ -272,10 +274,10 @@ class _State:
 
     def save(self, path: Path, name: str) -> None:
         """Write everything, in one piece."""
-        kept = self.optimiser.state[self.colour]
+        optimiser_state = self.optimiser.state[self.colour]
         arrays = {"colour": self.colour.detach().cpu().numpy(), "hard": self.hard}
         arrays |= {"losses": np.array(self.losses), "gradients": np.array(self.gradients)}
-        for key, value in kept.items():
+        for key, value in optimiser_state.items():
             arrays[f"optimiser.{key}"] = torch.as_tensor(value).cpu().numpy()
         arrays["name"] = np.frombuffer(name.encode(), np.uint8)
         safeio.make_folder(path.parent)
@@ -292,11 +294,13 @@ class _State:
             self.hard = arrays["hard"].copy()
             self.losses = arrays["losses"].tolist()
             self.gradients = arrays["gradients"].tolist()
-            kept = {}
+            optimiser_state = {}
             for key, value in arrays.items():
                 if key.startswith("optimiser."):
                     tensor = torch.from_numpy(value.copy())
-                    kept[key.removeprefix("optimiser.")] = tensor if tensor.ndim == 0 else tensor.to(self.colour.device)
-            self.optimiser.state[self.colour] = kept
+                    optimiser_state[key.removeprefix("optimiser.")] = (
+                        tensor if tensor.ndim == 0 else tensor.to(self.colour.device)
+                    )
+            self.optimiser.state[self.colour] = optimiser_state
         except KeyError as error:
             raise FormatError(f"{path}: no checkpoint of a texture ({error} is missing)") from None

@@ -1,4 +1,4 @@
-"""What can be printed, and how it differs from car to car: regularisers, and the expectation over print and place."""
+"""Printability of textures and its variation between cars: regularisers, and the expectation over prints."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ssad.rendering.camera.torch_sensor import large_draws
 _XYZ = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))  # of linear RGB
 
 
-@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))  # not strict: a suite says it as a mapping
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))  # not strict: a suite gives it as a mapping
 class Expectation:
-    """How a texture differs from print to print and from car to car: uniform draws, one of each for a picture.
+    """Variation of a texture between prints and between cars: uniform draws, one of each for an image.
 
     Attributes:
-        contrast: Least and greatest factor about mid-grey.
-        brightness: Greatest change, of the range of colours.
-        noise: Greatest change of a texel by itself.
-        shift: Greatest shift of the texture, share of its sides; what comes in repeats the edge.
-        turn: Greatest turn, rad.
+        contrast: Minimum and maximum factor about mid-grey.
+        brightness: Maximum change, as a share of the range of colours.
+        noise: Maximum change of a single texel.
+        shift: Maximum shift of the texture, share of its sides; the border repeats the edge.
+        turn: Maximum rotation, rad.
 
     Source: ranges of contrast, brightness and noise as in Thys et al., Fooling automated surveillance cameras (2019).
     """
@@ -38,41 +38,53 @@ class Expectation:
     turn: Least = 0.05
 
     def draw(self, colour: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-        """The texture as it is on several cars.
+        """Return the texture as it is printed on several cars.
 
         Args:
             colour: sRGB [3, H, W] in 0 to 1.
-            generators: One for each car, on the CPU; the noise of texels is drawn where the texture is (see
+            generators: One for each car, on the CPU; the noise of texels is drawn on the texture's device (see
                 `large_draws`).
 
         Returns:
             [B, 3, H, W] in 0 to 1, differentiable in `colour`.
         """
-        found: Tensor = colour.expand(len(generators), *colour.shape)
-        moved = self.shift > 0.0 or self.turn > 0.0
+        textures: Tensor = colour.expand(len(generators), *colour.shape)
+        is_moved = self.shift > 0.0 or self.turn > 0.0
+        # Twice the shift, since the coordinates of `affine_grid` span -1 to 1.
         ranges = [(-self.turn, self.turn), (-2.0 * self.shift, 2.0 * self.shift)]
-        ranges = [ranges[0], ranges[1], ranges[1]] if moved else []
+        ranges = [ranges[0], ranges[1], ranges[1]] if is_moved else []
         ranges += [self.contrast, (-self.brightness, self.brightness)]
-        low, high = torch.tensor(ranges).T
-        drawn = torch.stack([torch.rand(len(ranges), generator=one) for one in generators])
-        values = (low + (high - low) * drawn).to(colour)  # all in one copy
-        if moved:
-            angle, move = values[:, 0], values[:, 1:3]
+        lowest, highest = torch.tensor(ranges).T
+        uniform = torch.stack([torch.rand(len(ranges), generator=random_generator) for random_generator in generators])
+        parameters = (lowest + (highest - lowest) * uniform).to(colour)  # one copy to the device for all parameters
+        if is_moved:
+            angle, offset_uv = parameters[:, 0], parameters[:, 1:3]
             height, width = colour.shape[1:]
             aspect = width / height
             cos, sin = torch.cos(angle), torch.sin(angle)
-            rows = torch.stack(
-                [torch.stack([cos, -sin / aspect, move[:, 0]], -1), torch.stack([sin * aspect, cos, move[:, 1]], -1)], 1
+            transforms = torch.stack(
+                [
+                    torch.stack([cos, -sin / aspect, offset_uv[:, 0]], -1),
+                    torch.stack([sin * aspect, cos, offset_uv[:, 1]], -1),
+                ],
+                1,
             )
-            grid = functional.affine_grid(rows, list(found.shape), align_corners=False)
-            found = functional.grid_sample(found, grid, mode="bilinear", padding_mode="border", align_corners=False)
-        factor, offset = (values[:, k, None, None, None] for k in (-2, -1))
-        found = 0.5 + factor * (found - 0.5) + offset
+            grid = functional.affine_grid(transforms, list(textures.shape), align_corners=False)
+            textures = functional.grid_sample(
+                textures, grid, mode="bilinear", padding_mode="border", align_corners=False
+            )
+        factor, offset = (parameters[:, column, None, None, None] for column in (-2, -1))
+        textures = 0.5 + factor * (textures - 0.5) + offset
         if self.noise > 0.0:
-            large = large_draws(generators, colour.device)
-            texels = torch.stack([torch.rand(colour.shape, generator=one, device=one.device) for one in large])
-            found = found + (2.0 * self.noise * texels - self.noise).to(colour)
-        return found.clamp(0.0, 1.0)
+            device_generators = large_draws(generators, colour.device)
+            texel_noise = torch.stack(
+                [
+                    torch.rand(colour.shape, generator=random_generator, device=random_generator.device)
+                    for random_generator in device_generators
+                ]
+            )
+            textures = textures + (2.0 * self.noise * texel_noise - self.noise).to(colour)
+        return textures.clamp(0.0, 1.0)
 
 
 NOMINAL = Expectation((1.0, 1.0), 0.0, 0.0, 0.0, 0.0)
@@ -80,70 +92,74 @@ NOMINAL = Expectation((1.0, 1.0), 0.0, 0.0, 0.0, 0.0)
 
 
 def total_variation(colour: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean length of the difference from each texel to the next one across and down.
+    """Return the mean length of the difference between each texel and its right and lower neighbour.
 
     Args:
         colour: [3, H, W].
         mask: Texels [H, W] that count; a pair counts if both do. None: all.
 
     Returns:
-        A scalar; 0 for an even texture. Differentiable.
+        A differentiable scalar; 0 for an even texture.
     """
-    inside = torch.ones(colour.shape[1:], dtype=torch.bool, device=colour.device) if mask is None else mask.bool()
-    across = (colour[:, :, 1:] - colour[:, :, :-1]).square().sum(0)
-    down = (colour[:, 1:] - colour[:, :-1]).square().sum(0)
-    pairs = torch.cat([across[inside[:, 1:] & inside[:, :-1]], down[inside[1:] & inside[:-1]]])
-    if not len(pairs):
+    counts = torch.ones(colour.shape[1:], dtype=torch.bool, device=colour.device) if mask is None else mask.bool()
+    squares_right = (colour[:, :, 1:] - colour[:, :, :-1]).square().sum(0)
+    squares_down = (colour[:, 1:] - colour[:, :-1]).square().sum(0)
+    squares = torch.cat([squares_right[counts[:, 1:] & counts[:, :-1]], squares_down[counts[1:] & counts[:-1]]])
+    if not len(squares):
         return colour.sum() * 0.0
-    return (pairs + 1e-8).sqrt().mean() - 1e-4
+    # The offset keeps the slope of the root finite at 0; its root is taken off again.
+    return (squares + 1e-8).sqrt().mean() - 1e-4
 
 
 def non_printability(colour: Tensor, printable: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean distance of the texels' colours to the nearest printable colour.
+    """Return the mean distance of the texels' colours to the nearest printable colour.
 
     Args:
         colour: sRGB [3, H, W].
-        printable: Colours [N, 3] that a printer can make, sRGB.
+        printable: Colours [N, 3] that a printer can produce, sRGB.
         mask: Texels [H, W] that count. None: all.
 
     Returns:
-        A scalar, 0 where all colours are printable. Differentiable.
+        A differentiable scalar, 0 if all colours are printable.
 
-    Source: the non-printability score of Sharif et al., Accessorize to a Crime (2016), with the nearest colour in place
-    of the product over all, which underflows.
+    Source: the non-printability score of Sharif et al., Accessorize to a Crime (2016), with the nearest colour in
+    place of the product over all, which underflows.
     """
-    rows = colour.flatten(1).T if mask is None else colour[:, mask.bool()].T
-    if not len(rows):
+    colours = colour.flatten(1).T if mask is None else colour[:, mask.bool()].T
+    if not len(colours):
         return colour.sum() * 0.0
-    gaps = torch.cdist(rows, printable.to(rows))
-    return gaps.amin(1).mean()
+    distances = torch.cdist(colours, printable.to(colours))
+    return distances.amin(1).mean()
 
 
 def conspicuousness(albedo: Tensor, paint: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean colour difference between a texture and what it covers, CIE 1976 (Delta E*ab): from 2 on one can see it.
+    """Return the mean CIE 1976 colour difference (Delta E*ab) between a texture and its background; 2 is visible.
 
     Args:
-        albedo: Linear RGB [3, H, W] in 0 to 1, as it is printed (see `albedo_of`).
-        paint: Linear RGB [3] of what is covered.
+        albedo: Linear RGB [3, H, W] in 0 to 1, as printed (see `albedo_of`).
+        paint: Linear RGB [3] of the covered surface.
         mask: Texels [H, W] that count. None: all.
 
     Returns:
-        A scalar; 0 for the paint itself, 100 for white on black. Differentiable.
+        A differentiable scalar; 0 for the paint itself, 100 for white on black.
 
     Source: CIE 15, Colorimetry: CIELAB under D65; sRGB primaries of IEC 61966-2-1.
     """
-    rows = albedo.flatten(1).T if mask is None else albedo[:, mask.bool()].T
-    if not len(rows):
+    colours = albedo.flatten(1).T if mask is None else albedo[:, mask.bool()].T
+    if not len(colours):
         return albedo.sum() * 0.0
-    away = _lab(rows) - _lab(paint.to(rows)[None])
-    return ((away.square().sum(1) + 1e-8).sqrt() - 1e-4).mean()
+    lab_difference = _lab(colours) - _lab(paint.to(colours)[None])
+    return ((lab_difference.square().sum(1) + 1e-8).sqrt() - 1e-4).mean()
 
 
 def _lab(rows: Tensor) -> Tensor:
     """CIELAB [N, 3] of linear RGB [N, 3]."""
-    share = rows @ rows.new_tensor(_XYZ).T / rows.new_tensor(_XYZ).sum(1)
-    least = (6.0 / 29.0) ** 3
+    relative_xyz = rows @ rows.new_tensor(_XYZ).T / rows.new_tensor(_XYZ).sum(1)
+    linear_limit = (6.0 / 29.0) ** 3
+    # Clamped, since the unused branch of `where` would give an infinite gradient at 0.
     f = torch.where(
-        share > least, share.clamp_min(least) ** (1.0 / 3.0), share / (3.0 * (6.0 / 29.0) ** 2) + 4.0 / 29.0
+        relative_xyz > linear_limit,
+        relative_xyz.clamp_min(linear_limit) ** (1.0 / 3.0),
+        relative_xyz / (3.0 * (6.0 / 29.0) ** 2) + 4.0 / 29.0,
     )
     return torch.stack([116.0 * f[:, 1] - 16.0, 500.0 * (f[:, 0] - f[:, 1]), 200.0 * (f[:, 1] - f[:, 2])], 1)

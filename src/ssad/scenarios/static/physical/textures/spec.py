@@ -1,4 +1,4 @@
-"""A texture as plain data: which attack or control, on what, against whom; and the carrier that follows."""
+"""Texture specifications as plain data: attack or control, carrier and attacked detector."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ CARRIERS: dict[str, Callable[..., Carrier]] = {"patch": Patch, "camouflage": Cam
 
 @dataclass(frozen=True, slots=True)
 class TextureSpec:
-    """All that decides a texture.
+    """All settings that determine a texture.
 
     Attributes:
         attack: Name of an attack (`ssad list attacks`) or of a control.
-        carrier: Name of what it is printed on.
-        options: Of the carrier.
+        carrier: Name of the carrier.
+        options: Options of the carrier.
         settings: Fields of `TextureAttack` that differ from the attack's own.
-        of: Of the control shuffled: the attack whose texture is shuffled.
-        source: The detector that is attacked; "" for what is not trained.
-        number: Of a control that is drawn at random.
-        pair: What it is trained and tested on, as the suite says it.
-        around: Pictures from all around the target that it is trained on too.
-        file: A texture that is there already (see `load_texture`); None: it is trained.
+        of: Attack whose texture the control `shuffled` permutes.
+        source: Detector under attack; "" for controls without training.
+        number: Index of a control that is drawn at random.
+        pair: Training and test data, as given in the suite.
+        around: Number of additional training images from all around the target.
+        file: Existing texture (see `load_texture`); None: it is trained.
     """
 
     attack: str
@@ -47,40 +47,45 @@ class TextureSpec:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Self:
-        """From plain data with these keys, among others."""
-        return cls(**{one.name: row[one.name] for one in fields(cls)})
+        """Create a specification from plain data with these keys, among others."""
+        return cls(**{field_info.name: row[field_info.name] for field_info in fields(cls)})
 
     @property
     def trained(self) -> str:
-        """The attack that is trained, also for what is shuffled afterwards; "" for a control that learns nothing."""
+        """Attack to train, also for a texture that is shuffled afterwards; "" without training."""
         return (self.of or self.attack) if self.source and self.file is None else ""
 
     @property
     def name(self) -> str:
-        """What the training of the texture depends on, in short; of a file its name."""
+        """Short name of everything that the training depends on; for a file, of the file."""
         attack = self.of or self.attack
         if self.file is not None:
             return f"{attack}-{Path(self.file).stem}"
-        about = attack, self.source, self.carrier, safeio.dump_json(self.options)
-        rest = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
-        more = (self.around,) if self.around else ()
-        return f"{attack}-{digest('texture', *about, *rest, *more)[:12]}"
+        data_key = attack, self.source, self.carrier, safeio.dump_json(self.options)
+        training_key = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
+        # Added only if used, so that the names of textures without it stay the same.
+        optional_key = (self.around,) if self.around else ()
+        return f"{attack}-{digest('texture', *data_key, *training_key, *optional_key)[:12]}"
 
     @property
     def picture(self) -> str:
-        """File name of the texture as a picture."""
+        """File name of the texture as an image."""
         if self.attack in CONTROLS and not self.source:
             return f"{self.attack}-{self.carrier}-{digest('carrier', self.surface)[:8]}-{self.number}.png"
         return f"{self.name}{f'-shuffled-{self.number}' if self.attack == 'shuffled' else ''}.png"
 
     @property
     def surface(self) -> str:
-        """What decides the surface, as JSON."""
+        """Settings that determine the surface, as JSON."""
         return safeio.dump_json({"carrier": self.carrier, "options": self.options})
 
 
 def make_carrier(name: str, options: Mapping[str, Any]) -> Carrier:
-    """A carrier by name. ConfigError: there is none, an option that it does not have, or a value that it refuses."""
+    """Create a carrier by name.
+
+    Raises:
+        ConfigError: There is no such carrier, or an option is unknown or has an invalid value.
+    """
     if name not in CARRIERS:
         raise unknown_name("carrier", name, CARRIERS)
     return checked(CARRIERS[name], options, what=name)

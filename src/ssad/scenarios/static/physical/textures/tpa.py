@@ -1,4 +1,4 @@
-"""TPA: a camouflage that moves a detector's attention from the target to what is around it (paper V.B.2)."""
+"""TPA: a camouflage that moves a detector's attention from the target to its surroundings (paper V.B.2)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ssad.scenarios.static.physical.textures.optimise import TextureAttack
 
 
 def tpa(**settings: Any) -> TextureAttack:
-    """The separable attention attack, in our reading (no code is public); optimised as `das`.
+    """Return the separable attention attack, in our reading (no code is public); optimised as `das`.
 
     Source: Zhang et al., Boosting Transferability of Physical Attack against Detectors by Redistributing Separable
     Attention (Pattern Recognition 138, 2023).

@@ -1,4 +1,4 @@
-"""A strong modern camouflage: no box of any score on the target, over views, light and print."""
+"""Vanishing camouflage: suppresses every box on the target over views, light and print."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from ssad.scenarios.static.physical.textures.optimise import TextureAttack
 
 
 def vanishing(**settings: Any) -> TextureAttack:
-    """The loss of ACTIVE and RAUCA on a texture of the whole paint, with the scores of all classes.
+    """Return the loss of ACTIVE and RAUCA on a texture of the whole paint, with the scores of all classes.
 
-    The source lowers the score of the target's own class (`objective="hide"`), and the target is then taken for
-    something else in most pictures. Half of each epoch's pictures are those on which the attack does worst, as in
+    The source lowers the score of the target's own class (`objective="hide"`), which leaves the target detected as
+    another class in most images. Half of each epoch's images are those on which the attack performs worst, as in
     R-PGA.
 
     Source: Suryanto et al., ACTIVE (2023); Zhou et al., RAUCA (2024); the mining of views: R-PGA (2026).

@@ -1,4 +1,4 @@
-"""A code for each code: what changes every value alike."""
+"""Lookup of a new code for each code: for shifts that change every value in the same way."""
 
 import warp as wp
 
@@ -11,11 +11,11 @@ def recode(
     chunk: int,
     out: wp.array(dtype=wp.uint32),
 ):
-    """Every byte looked up in table[b], four at a time."""
-    b, part = wp.tid()
-    first = part * chunk
-    last = wp.min(first + chunk, words)
-    for i in range(b * words + first, b * words + last):
+    """Look up every byte in table[b], four at a time."""
+    b, chunk_index = wp.tid()
+    begin = chunk_index * chunk
+    end = wp.min(begin + chunk, words)
+    for i in range(b * words + begin, b * words + end):
         word = image[i]
         low = wp.uint32(table[b, int(word & wp.uint32(255))])
         second = wp.uint32(table[b, int((word >> wp.uint32(8)) & wp.uint32(255))])

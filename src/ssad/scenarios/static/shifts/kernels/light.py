@@ -1,10 +1,10 @@
-"""Arithmetic in linear light, in whole numbers: `FULL` is white; what is mixed has 1024 parts."""
+"""Integer arithmetic in linear light: `FULL` is white; a mix has 1024 parts."""
 
 import warp as wp
 
 FULL = 65535
 CODES = 4096
-# of a mix in 1024 parts, to a part of CODES
+# right shift from a mix in 1024 parts to one of CODES intervals
 DOWN = wp.constant(14)
 PARTS = wp.constant(1024)
 WHITE = wp.constant(float(FULL))
@@ -12,7 +12,7 @@ WHITE = wp.constant(float(FULL))
 
 @wp.func
 def light_of(colour: wp.vec3) -> wp.vec3i:
-    """A colour in linear light, 1 for white, rounded and clipped."""
+    """Convert a colour in linear light, 1 for white, to integers, rounded and clipped."""
     return wp.vec3i(
         int(wp.clamp(colour[0], 0.0, 1.0) * WHITE + 0.5),
         int(wp.clamp(colour[1], 0.0, 1.0) * WHITE + 0.5),
@@ -22,7 +22,7 @@ def light_of(colour: wp.vec3) -> wp.vec3i:
 
 @wp.func
 def linear_pixel(linear: wp.array(dtype=int), pixel: wp.uint32) -> wp.vec3i:
-    """Light of a pixel, three codes in the lower 24 bits of a word."""
+    """Return the light of a pixel, three codes in the lower 24 bits of a word."""
     return wp.vec3i(
         linear[int(pixel & wp.uint32(255))],
         linear[int((pixel >> wp.uint32(8)) & wp.uint32(255))],
@@ -32,8 +32,8 @@ def linear_pixel(linear: wp.array(dtype=int), pixel: wp.uint32) -> wp.vec3i:
 
 @wp.func
 def coded_pixel(codes: wp.array(dtype=wp.uint8), mixed: wp.vec3i) -> wp.uint32:
-    """The pixel of light in 1024 parts of `FULL`."""
-    r = wp.uint32(codes[mixed[0] >> DOWN])
-    g = wp.uint32(codes[mixed[1] >> DOWN])
-    b = wp.uint32(codes[mixed[2] >> DOWN])
-    return r | (g << wp.uint32(8)) | (b << wp.uint32(16))
+    """Return the pixel of light in 1024 parts of `FULL`."""
+    red = wp.uint32(codes[mixed[0] >> DOWN])
+    green = wp.uint32(codes[mixed[1] >> DOWN])
+    blue = wp.uint32(codes[mixed[2] >> DOWN])
+    return red | (green << wp.uint32(8)) | (blue << wp.uint32(16))

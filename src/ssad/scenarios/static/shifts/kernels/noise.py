@@ -7,13 +7,13 @@ from ssad.scenarios.static.shifts.kernels.shared import draw
 
 @wp.func
 def shifted(value: wp.uint32, noise: wp.int16) -> wp.uint32:
-    """A byte plus noise, clipped."""
+    """Return a byte plus noise, clipped."""
     return wp.uint32(wp.clamp(int(value) + int(noise), 0, 255))
 
 
 @wp.func
 def quarter(bits: wp.uint64, shift: int) -> int:
-    """16 of 64 bits as an index."""
+    """Return 16 of 64 bits as an index."""
     return int((bits >> wp.uint64(shift)) & wp.uint64(65535))
 
 
@@ -26,25 +26,25 @@ def add_noise(
     chunk: int,
     out: wp.array(dtype=wp.uint32),
 ):
-    """Adds table[b, u] for a uniform 16-bit u to every byte; the table is the inverse distribution function."""
-    b, part = wp.tid()
+    """Add table[b, u] for a uniform 16-bit u to every byte; the table is the inverse distribution function."""
+    b, chunk_index = wp.tid()
     key = keys[b]
-    first = part * chunk
-    last = wp.min(first + chunk, words)
-    start = b * words
-    for i in range(first, last):
+    begin = chunk_index * chunk
+    end = wp.min(begin + chunk, words)
+    image_start = b * words
+    for i in range(begin, end):
         bits = draw(key, i)
-        word = image[start + i]
+        word = image[image_start + i]
         low = shifted(word & wp.uint32(255), table[b, quarter(bits, 0)])
         second = shifted((word >> wp.uint32(8)) & wp.uint32(255), table[b, quarter(bits, 16)])
         third = shifted((word >> wp.uint32(16)) & wp.uint32(255), table[b, quarter(bits, 32)])
         high = shifted(word >> wp.uint32(24), table[b, quarter(bits, 48)])
-        out[start + i] = low | (second << wp.uint32(8)) | (third << wp.uint32(16)) | (high << wp.uint32(24))
+        out[image_start + i] = low | (second << wp.uint32(8)) | (third << wp.uint32(16)) | (high << wp.uint32(24))
 
 
 @wp.func
 def struck(value: wp.uint32, mine: int, fixed: int, rate: int, fixed_rate: int) -> wp.uint32:
-    """A byte, or 0 or 255 where one of two draws falls under its rate (of 65536)."""
+    """Return a byte, or 0 or 255 where one of two draws is below its rate (of 65536)."""
     result = value
     if fixed < fixed_rate:
         result = wp.uint32((fixed & 1) * 255)
@@ -64,20 +64,22 @@ def add_impulses(
     chunk: int,
     out: wp.array(dtype=wp.uint32),
 ):
-    """Salt and pepper: some sites anew in every image, some always the same for a camera (stuck pixels)."""
-    b, part = wp.tid()
-    first = part * chunk
-    last = wp.min(first + chunk, words)
-    start = b * words
+    """Add salt and pepper: at new sites in every image, and at fixed sites of a camera (stuck pixels)."""
+    b, chunk_index = wp.tid()
+    begin = chunk_index * chunk
+    end = wp.min(begin + chunk, words)
+    image_start = b * words
     rate = rates[b]
-    stuck = fixed_rates[b]
-    for i in range(first, last):
-        mine = draw(keys[b], i)
-        fixed = draw(fixed_keys[b], i)
-        word = image[start + i]
+    fixed_rate = fixed_rates[b]
+    for i in range(begin, end):
+        fresh_bits = draw(keys[b], i)
+        fixed_bits = draw(fixed_keys[b], i)
+        word = image[image_start + i]
         result = wp.uint32(0)
-        for k in range(4):
-            value = (word >> wp.uint32(8 * k)) & wp.uint32(255)
-            value = struck(value, quarter(mine, 16 * k), quarter(fixed, 16 * k), rate, stuck)
-            result = result | (value << wp.uint32(8 * k))
-        out[start + i] = result
+        for byte_index in range(4):
+            value = (word >> wp.uint32(8 * byte_index)) & wp.uint32(255)
+            value = struck(
+                value, quarter(fresh_bits, 16 * byte_index), quarter(fixed_bits, 16 * byte_index), rate, fixed_rate
+            )
+            result = result | (value << wp.uint32(8 * byte_index))
+        out[image_start + i] = result

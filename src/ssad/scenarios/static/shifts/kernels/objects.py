@@ -1,4 +1,4 @@
-"""Objects moved, resized, sheared or blurred inside their projected 3D boxes."""
+"""Objects that are moved, resized, sheared or blurred inside their projected 3D boxes."""
 
 import warp as wp
 
@@ -60,38 +60,38 @@ DONE = wp.constant(16384)  # bit of `owner`: the pixel is painted
 
 @wp.func
 def outline_reach(points: wp.array(dtype=wp.vec2), first: int, count: int, origin: wp.vec2, u: wp.vec2) -> float:
-    """How far a convex outline reaches from a point inside it in the direction `u` (unit)."""
-    best = float(1.0e6)
-    for k in range(count):
-        a = points[first + k] - origin
-        b = points[first + (k + 1) % count] - origin
-        e = b - a
-        normal = wp.vec2(e[1], -e[0])
-        above = wp.dot(normal, a)
-        if above < 0.0:
+    """Return the distance from a point inside a convex outline to its border in the direction `u` (unit)."""
+    distance = float(1.0e6)
+    for edge_index in range(count):
+        edge_start = points[first + edge_index] - origin
+        edge_end = points[first + (edge_index + 1) % count] - origin
+        edge = edge_end - edge_start
+        normal = wp.vec2(edge[1], -edge[0])
+        height = wp.dot(normal, edge_start)
+        if height < 0.0:
             normal = -normal
-            above = -above
+            height = -height
         slope = wp.dot(normal, u)
         if slope > 1.0e-6:
-            best = wp.min(best, above / slope)
-    return best
+            distance = wp.min(distance, height / slope)
+    return distance
 
 
 @wp.func
 def row_span(points: wp.array(dtype=wp.vec2), first: int, count: int, y: float) -> wp.vec2:
-    """Least and largest x of a convex outline on a row; (1, 0) where it has none."""
+    """Return the minimum and maximum x of a convex outline on a row; (1, 0) where it has none."""
     low = float(1.0e9)
     high = float(-1.0e9)
-    for k in range(count):
-        a = points[first + k]
-        b = points[first + (k + 1) % count]
-        if (a[1] <= y and b[1] >= y) or (b[1] <= y and a[1] >= y):
-            d = b[1] - a[1]
-            if wp.abs(d) < 1.0e-6:
-                low = wp.min(low, wp.min(a[0], b[0]))
-                high = wp.max(high, wp.max(a[0], b[0]))
+    for edge_index in range(count):
+        edge_start = points[first + edge_index]
+        edge_end = points[first + (edge_index + 1) % count]
+        if (edge_start[1] <= y and edge_end[1] >= y) or (edge_end[1] <= y and edge_start[1] >= y):
+            edge_height = edge_end[1] - edge_start[1]
+            if wp.abs(edge_height) < 1.0e-6:
+                low = wp.min(low, wp.min(edge_start[0], edge_end[0]))
+                high = wp.max(high, wp.max(edge_start[0], edge_end[0]))
             else:
-                x = a[0] + (b[0] - a[0]) * (y - a[1]) / d
+                x = edge_start[0] + (edge_end[0] - edge_start[0]) * (y - edge_start[1]) / edge_height
                 low = wp.min(low, x)
                 high = wp.max(high, x)
     if low > high:
@@ -106,16 +106,20 @@ def stamp(
     points: wp.array(dtype=wp.vec2),
     owner: wp.array3d(dtype=wp.int16),
 ):
-    """owner[b, y, x]: rank of the nearest box whose old outline covers the pixel's middle; 0, as it came, for none."""
+    """Set owner[b, y, x] to the rank of the nearest box whose old outline covers the pixel centre.
+
+    Pixels without a box keep their value, 0.
+    """
     b, y = wp.tid()
     width = owner.shape[2]
-    for k in range(item_first[b], item_first[b + 1]):
-        span = row_span(points, items[k].old_first, items[k].old_count, float(y) + 0.5)
+    # Items come far to near, so that the nearest one is written last.
+    for item_index in range(item_first[b], item_first[b + 1]):
+        span = row_span(points, items[item_index].old_first, items[item_index].old_count, float(y) + 0.5)
         if span[0] <= span[1]:
             low = wp.clamp(int(wp.ceil(span[0] - 0.5)), 0, width)
             high = wp.clamp(int(wp.floor(span[1] - 0.5)) + 1, 0, width)
             for x in range(low, high):
-                owner[b, y, x] = wp.int16(items[k].rank)
+                owner[b, y, x] = wp.int16(items[item_index].rank)
 
 
 @wp.kernel
@@ -125,58 +129,67 @@ def displace(
     lens: wp.array(dtype=wp.vec4),
     nodes: wp.array(dtype=wp.vec4),
 ):
-    """Where each node of an item's grid, the middle of a pixel, takes its colour from.
+    """Compute the source of the colour at each node of an item's grid, the centre of a pixel.
 
     (dx, dy, pixels inside the new outline, 1 where the surroundings must stretch). Inside, the viewing ray meets the
     surface of the new box, and the same point of the old box is looked up. Where the new outline lies inside the old
     one, the surroundings stretch radially to fill the gap; elsewhere they stay.
     """
-    k, row = wp.tid()
-    item = items[k]
+    item_index, row = wp.tid()
+    item = items[item_index]
     if item.skip == 1 or row >= item.node_high:
         return
     focal = lens[item.image]
     for column in range(item.node_wide):
-        p = wp.vec2(float(item.low_x + column * STEP) + 0.5, float(item.low_y + row * STEP) + 0.5)
-        ray = wp.vec3((p[0] - focal[2]) / focal[0], (p[1] - focal[3]) / focal[1], 1.0)
-        d = item.into * ray
-        o = item.into_origin
-        enter = float(-1.0e9)
-        leave = float(1.0e9)
+        pixel = wp.vec2(float(item.low_x + column * STEP) + 0.5, float(item.low_y + row * STEP) + 0.5)
+        ray = wp.vec3((pixel[0] - focal[2]) / focal[0], (pixel[1] - focal[3]) / focal[1], 1.0)
+        direction = item.into * ray
+        origin = item.into_origin
+        entry = float(-1.0e9)
+        departure = float(1.0e9)
         for axis in range(3):
-            speed = d[axis]
+            speed = direction[axis]
             if wp.abs(speed) < 1.0e-9:
                 speed = 1.0e-9
-            t0 = (-0.5 - o[axis]) / speed
-            t1 = (0.5 - o[axis]) / speed
-            enter = wp.max(enter, wp.min(t0, t1))
-            leave = wp.min(leave, wp.max(t0, t1))
+            t0 = (-0.5 - origin[axis]) / speed
+            t1 = (0.5 - origin[axis]) / speed
+            entry = wp.max(entry, wp.min(t0, t1))
+            departure = wp.min(departure, wp.max(t0, t1))
         result = wp.vec4(0.0, 0.0, -1.0e3, 0.0)
-        away = p - item.middle
-        r = wp.length(away)
-        u = wp.vec2(1.0, 0.0)
-        if r > 1.0e-3:
-            u = away / r
-        new = outline_reach(points, item.new_first, item.new_count, item.middle, u)
-        if enter <= leave and enter > 0.0:
-            q = item.back * (o + d * enter) + item.back_origin
-            z = wp.max(q[2], 0.2)
-            dx = focal[0] * q[0] / z + focal[2] - p[0]
-            dy = focal[1] * q[1] / z + focal[3] - p[1]
-            result = wp.vec4(dx, dy, wp.max(new - r, 0.0), 0.0)
+        offset = pixel - item.middle
+        radius = wp.length(offset)
+        radial = wp.vec2(1.0, 0.0)
+        if radius > 1.0e-3:
+            radial = offset / radius
+        new_reach = outline_reach(points, item.new_first, item.new_count, item.middle, radial)
+        if entry <= departure and entry > 0.0:
+            old_point = item.back * (origin + direction * entry) + item.back_origin
+            old_depth = wp.max(old_point[2], 0.2)
+            dx = focal[0] * old_point[0] / old_depth + focal[2] - pixel[0]
+            dy = focal[1] * old_point[1] / old_depth + focal[3] - pixel[1]
+            result = wp.vec4(dx, dy, wp.max(new_reach - radius, 0.0), 0.0)
         else:
-            old = outline_reach(points, item.old_first, item.old_count, item.middle, u)
-            if old > new + 0.5:
-                edge = old * 1.25 + 8.0
-                if r < edge:
-                    # from a little outside the old outline: boxes are not drawn to the pixel
-                    rim = old * 1.02 + 1.5
-                    source = rim + (wp.max(r, new) - new) * (edge - rim) / (edge - new)
-                    result = wp.vec4(u[0] * (source - r), u[1] * (source - r), new - r, 1.0)
-            elif r < new + 8.0:
-                # goes on smoothly past the outline, for the pixels just inside
-                source = r * old / new
-                result = wp.vec4(u[0] * (source - r), u[1] * (source - r), new - r, 0.0)
+            old_reach = outline_reach(points, item.old_first, item.old_count, item.middle, radial)
+            if old_reach > new_reach + 0.5:
+                outer_edge = old_reach * 1.25 + 8.0
+                if radius < outer_edge:
+                    # start slightly outside the old outline, since boxes are not pixel-accurate
+                    inner_edge = old_reach * 1.02 + 1.5
+                    source_radius = inner_edge + (wp.max(radius, new_reach) - new_reach) * (outer_edge - inner_edge) / (
+                        outer_edge - new_reach
+                    )
+                    result = wp.vec4(
+                        radial[0] * (source_radius - radius),
+                        radial[1] * (source_radius - radius),
+                        new_reach - radius,
+                        1.0,
+                    )
+            elif radius < new_reach + 8.0:
+                # continue smoothly past the outline, for interpolation just inside it
+                source_radius = radius * old_reach / new_reach
+                result = wp.vec4(
+                    radial[0] * (source_radius - radius), radial[1] * (source_radius - radius), new_reach - radius, 0.0
+                )
         nodes[item.node_first + row * item.node_wide + column] = result
 
 
@@ -186,13 +199,13 @@ MIDDLE = wp.constant(wp.uint64(2048 + (2048 << 21) + (2048 << 42)))
 
 @wp.func
 def between(words: wp.array(dtype=wp.uint32), i: int, right: wp.uint64, left: wp.uint64) -> wp.uint64:
-    """The pixel at byte i and its right neighbour, weighted, as fields: two or three words hold both."""
-    w = i >> 2
+    """Return the weighted pixel at byte i and its right neighbour as fields: two or three words hold both."""
+    word_index = i >> 2
     shift = wp.uint64((i & 3) * 8)
-    both = (wp.uint64(words[w]) | (wp.uint64(words[w + 1]) << wp.uint64(32))) >> shift
+    packed = (wp.uint64(words[word_index]) | (wp.uint64(words[word_index + 1]) << wp.uint64(32))) >> shift
     if shift > wp.uint64(16):
-        both = both | (wp.uint64(words[w + 2]) << wp.uint64(40))
-    return spread(wp.uint32(both)) * left + spread(wp.uint32(both >> wp.uint64(24))) * right
+        packed = packed | (wp.uint64(words[word_index + 2]) << wp.uint64(40))
+    return spread(wp.uint32(packed)) * left + spread(wp.uint32(packed >> wp.uint64(24))) * right
 
 
 @wp.kernel
@@ -206,71 +219,77 @@ def paint(
     stride: int,
     out: wp.array(dtype=wp.uint8),
 ):
-    """Draws the items of an image row by row, the nearest first, always from the unchanged image.
+    """Draw the items of an image row by row, the nearest first, always from the unchanged image.
 
-    A pixel is drawn once: then it is marked as done in `owner`. respect = 1: an item is not drawn over a nearer box nor
-    with a nearer box's pixels.
+    A pixel is drawn once: then it is marked as done in `owner`. respect = 1: an item is not drawn over a nearer box
+    nor with a nearer box's pixels.
     """
     b, y = wp.tid()
     height = owner.shape[1]
     width = owner.shape[2]
-    start = b * stride
+    image_start = b * stride
     last = item_first[b + 1] - 1
-    for back in range(last - item_first[b] + 1):
-        k = last - back
-        if items[k].skip == 0 and y >= items[k].low_y and y < items[k].high_y:
-            rank = items[k].rank
-            low = items[k].low_x
-            wide = items[k].node_wide
-            ny = (y - items[k].low_y) / STEP
-            ty = float(y - items[k].low_y - ny * STEP) / float(STEP)
-            first = items[k].node_first + ny * wide
-            end = items[k].high_x
-            left = nodes[first] * (1.0 - ty) + nodes[first + wide] * ty
-            for nx in range(wide - 1):
-                j = first + nx + 1
-                right = nodes[j] * (1.0 - ty) + nodes[j + wide] * ty
+    for item_offset in range(last - item_first[b] + 1):
+        item_index = last - item_offset
+        if items[item_index].skip == 0 and y >= items[item_index].low_y and y < items[item_index].high_y:
+            rank = items[item_index].rank
+            low_column = items[item_index].low_x
+            node_columns = items[item_index].node_wide
+            node_row = (y - items[item_index].low_y) / STEP
+            row_fraction = float(y - items[item_index].low_y - node_row * STEP) / float(STEP)
+            first = items[item_index].node_first + node_row * node_columns
+            end_column = items[item_index].high_x
+            left = nodes[first] * (1.0 - row_fraction) + nodes[first + node_columns] * row_fraction
+            for node_column in range(node_columns - 1):
+                node = first + node_column + 1
+                right = nodes[node] * (1.0 - row_fraction) + nodes[node + node_columns] * row_fraction
                 if left[2] > 0.0 or right[2] > 0.0 or left[3] + right[3] > 0.0:
-                    for m in range(STEP):
-                        x = low + nx * STEP + m
-                        if x < end:
-                            hidden = int(owner[b, y, x])
-                            if hidden < DONE and (respect == 0 or hidden <= rank):
-                                n = left + (right - left) * (float(m) / float(STEP))
-                                inside = n[2] > 0.0
-                                if inside or (n[3] > 0.5 and wp.abs(n[0]) + wp.abs(n[1]) > 0.2):
-                                    sx = wp.clamp(float(x) + n[0], 0.0, float(width) - 2.0)
-                                    sy = wp.clamp(float(y) + n[1], 0.0, float(height) - 2.0)
-                                    x0 = int(sx)
-                                    y0 = int(sy)
-                                    fine = respect == 0
+                    for lane in range(STEP):
+                        x = low_column + node_column * STEP + lane
+                        if x < end_column:
+                            owner_rank = int(owner[b, y, x])
+                            if owner_rank < DONE and (respect == 0 or owner_rank <= rank):
+                                displacement = left + (right - left) * (float(lane) / float(STEP))
+                                inside = displacement[2] > 0.0
+                                if inside or (
+                                    displacement[3] > 0.5 and wp.abs(displacement[0]) + wp.abs(displacement[1]) > 0.2
+                                ):
+                                    source_x = wp.clamp(float(x) + displacement[0], 0.0, float(width) - 2.0)
+                                    source_y = wp.clamp(float(y) + displacement[1], 0.0, float(height) - 2.0)
+                                    x0 = int(source_x)
+                                    y0 = int(source_y)
+                                    is_allowed = respect == 0
                                     if respect == 1:
-                                        seen = int(owner[b, y0, x0]) & (DONE - 1)
-                                        fine = seen <= rank
+                                        source_rank = int(owner[b, y0, x0]) & (DONE - 1)
+                                        is_allowed = source_rank <= rank
                                         if not inside:
-                                            fine = (seen == 0 or seen == rank) and (hidden == 0 or hidden == rank)
-                                    if fine:
-                                        ax = int((sx - float(x0)) * 64.0)
-                                        ay = int((sy - float(y0)) * 64.0)
-                                        i = start + (y0 * width + x0) * 3
-                                        d = i + width * 3
-                                        w01 = wp.uint64(ax * (64 - ay))
-                                        w10 = wp.uint64((64 - ax) * ay)
-                                        w11 = wp.uint64(ax * ay)
+                                            is_allowed = (source_rank == 0 or source_rank == rank) and (
+                                                owner_rank == 0 or owner_rank == rank
+                                            )
+                                    if is_allowed:
+                                        x_weight = int((source_x - float(x0)) * 64.0)
+                                        y_weight = int((source_y - float(y0)) * 64.0)
+                                        source_byte = image_start + (y0 * width + x0) * 3
+                                        lower_byte = source_byte + width * 3
+                                        w01 = wp.uint64(x_weight * (64 - y_weight))
+                                        w10 = wp.uint64((64 - x_weight) * y_weight)
+                                        w11 = wp.uint64(x_weight * y_weight)
                                         w00 = wp.uint64(4096) - w01 - w10 - w11
-                                        total = between(image, i, w01, w00) + between(image, d, w11, w10)
+                                        total = between(image, source_byte, w01, w00) + between(
+                                            image, lower_byte, w11, w10
+                                        )
                                         total += MIDDLE
-                                        owner[b, y, x] = wp.int16(hidden | DONE)
-                                        o = start + (y * width + x) * 3
-                                        out[o] = wp.uint8(total >> wp.uint64(12))
-                                        out[o + 1] = wp.uint8((total >> wp.uint64(33)) & wp.uint64(255))
-                                        out[o + 2] = wp.uint8((total >> wp.uint64(54)) & wp.uint64(255))
+                                        owner[b, y, x] = wp.int16(owner_rank | DONE)
+                                        target_byte = image_start + (y * width + x) * 3
+                                        out[target_byte] = wp.uint8(total >> wp.uint64(12))
+                                        out[target_byte + 1] = wp.uint8((total >> wp.uint64(33)) & wp.uint64(255))
+                                        out[target_byte + 2] = wp.uint8((total >> wp.uint64(54)) & wp.uint64(255))
                 left = right
 
 
 @wp.func
 def on_line(first: int, slope: float, low: int, step: int, flat: wp.bool) -> wp.vec2i:
-    """Pixel (x, y) of a step on a line that begins at `first` across and `low` along the longer side of a streak."""
+    """Return pixel (x, y) of a step on a line from `first` across and `low` along the longer side of a streak."""
     side = first + int(wp.floor(slope * float(step) + 0.5))
     if flat:
         return wp.vec2i(low + step, side)
@@ -279,7 +298,7 @@ def on_line(first: int, slope: float, low: int, step: int, flat: wp.bool) -> wp.
 
 @wp.func
 def inside(pixel: wp.vec2i, width: int, height: int) -> wp.bool:
-    """Whether a pixel lies in the picture."""
+    """Check that a pixel lies in the image."""
     return pixel[0] >= 0 and pixel[0] < width and pixel[1] >= 0 and pixel[1] < height
 
 
@@ -292,90 +311,102 @@ def smear(
     stride: int,
     out: wp.array(dtype=wp.uint8),
 ):
-    """Blurs items along their streak: a box filter, one thread a line of pixels.
+    """Blur items along their streak with a box filter, one thread per line of pixels.
 
     Within the item all pixels of the window count, as the background shows through at its ends; beside it, the item's
-    own pixels are laid over the sharp background.
-    A line steps one pixel along the longer side of the streak; lines of one slope cover every pixel once. The sum
-    over the window is carried along, so that the cost does not depend on the length of the streak.
+    own pixels are laid over the sharp background. A line steps one pixel along the longer side of the streak; lines
+    of one slope cover every pixel once. The sum over the window is updated incrementally, so that the cost does not
+    depend on the length of the streak.
     """
-    n, line = wp.tid()
-    k = chosen[n]
-    item = items[k]
+    item_number, line = wp.tid()
+    item_index = chosen[item_number]
+    item = items[item_index]
     b = item.image
     width = owner.shape[2]
     height = owner.shape[1]
     dx = item.streak[0]
     dy = item.streak[1]
-    flat = wp.abs(dx) >= wp.abs(dy)
+    is_horizontal = wp.abs(dx) >= wp.abs(dy)
     slope = float(0.0)
-    low = item.low_y
-    steps = item.high_y - item.low_y
-    lanes = item.high_x - item.low_x
-    across = item.low_x
-    reach = wp.abs(dy)
-    if flat:
+    line_start = item.low_y
+    line_length = item.high_y - item.low_y
+    line_count = item.high_x - item.low_x
+    first_lane = item.low_x
+    streak_length = wp.abs(dy)
+    if is_horizontal:
         slope = dy / dx
-        low = item.low_x
-        steps = item.high_x - item.low_x
-        lanes = item.high_y - item.low_y
-        across = item.low_y
-        reach = wp.abs(dx)
+        line_start = item.low_x
+        line_length = item.high_x - item.low_x
+        line_count = item.high_y - item.low_y
+        first_lane = item.low_y
+        streak_length = wp.abs(dx)
     else:
         slope = dx / dy
-    extra = int(wp.ceil(wp.abs(slope) * float(steps))) + 1
-    if line >= lanes + extra:
+    extra_lines = int(wp.ceil(wp.abs(slope) * float(line_length))) + 1
+    if line >= line_count + extra_lines:
         return
-    first = across + line
+    first = first_lane + line
     if slope > 0.0:
-        first = across + line - extra
-    half = int(reach * 0.5 + 0.5)
+        first = first_lane + line - extra_lines
+    half_length = int(streak_length * 0.5 + 0.5)
     total = wp.vec3i(0, 0, 0)
-    beside = wp.vec3i(0, 0, 0)
-    weight = int(0)
-    count = int(0)
-    start = b * stride
-    window = float(2 * half + 1)
-    for s in range(-half, steps + half):
+    background = wp.vec3i(0, 0, 0)
+    item_count = int(0)
+    background_count = int(0)
+    image_start = b * stride
+    window_size = float(2 * half_length + 1)
+    for step in range(-half_length, line_length + half_length):
         # the pixel that enters the window, half a streak ahead
-        ahead = s + half
-        if ahead < steps:
-            pixel = on_line(first, slope, low, ahead, flat)
+        entering = step + half_length
+        if entering < line_length:
+            pixel = on_line(first, slope, line_start, entering, is_horizontal)
             if inside(pixel, width, height):
-                i = start + (pixel[1] * width + pixel[0]) * 3
+                pixel_byte = image_start + (pixel[1] * width + pixel[0]) * 3
                 rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
-                    total = total + wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
-                    weight += 1
+                    total = total + wp.vec3i(
+                        int(image[pixel_byte]), int(image[pixel_byte + 1]), int(image[pixel_byte + 2])
+                    )
+                    item_count += 1
                 elif rank < item.rank:
-                    beside = beside + wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
-                    count += 1
-        if s >= 0 and s < steps and weight > 0:
-            pixel = on_line(first, slope, low, s, flat)
+                    background = background + wp.vec3i(
+                        int(image[pixel_byte]), int(image[pixel_byte + 1]), int(image[pixel_byte + 2])
+                    )
+                    background_count += 1
+        if step >= 0 and step < line_length and item_count > 0:
+            pixel = on_line(first, slope, line_start, step, is_horizontal)
             if inside(pixel, width, height):
                 rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
-                    i = start + (pixel[1] * width + pixel[0]) * 3
-                    scale = 1.0 / float(weight + count)
-                    out[i] = wp.uint8(float(total[0] + beside[0]) * scale + 0.5)
-                    out[i + 1] = wp.uint8(float(total[1] + beside[1]) * scale + 0.5)
-                    out[i + 2] = wp.uint8(float(total[2] + beside[2]) * scale + 0.5)
+                    pixel_byte = image_start + (pixel[1] * width + pixel[0]) * 3
+                    scale = 1.0 / float(item_count + background_count)
+                    out[pixel_byte] = wp.uint8(float(total[0] + background[0]) * scale + 0.5)
+                    out[pixel_byte + 1] = wp.uint8(float(total[1] + background[1]) * scale + 0.5)
+                    out[pixel_byte + 2] = wp.uint8(float(total[2] + background[2]) * scale + 0.5)
                 elif rank < item.rank:
-                    i = start + (pixel[1] * width + pixel[0]) * 3
-                    alpha = float(weight) / window
-                    scale = alpha / float(weight)
-                    out[i] = wp.uint8(float(out[i]) * (1.0 - alpha) + float(total[0]) * scale + 0.5)
-                    out[i + 1] = wp.uint8(float(out[i + 1]) * (1.0 - alpha) + float(total[1]) * scale + 0.5)
-                    out[i + 2] = wp.uint8(float(out[i + 2]) * (1.0 - alpha) + float(total[2]) * scale + 0.5)
-        behind = s - half
-        if behind >= 0 and behind < steps:
-            pixel = on_line(first, slope, low, behind, flat)
+                    pixel_byte = image_start + (pixel[1] * width + pixel[0]) * 3
+                    alpha = float(item_count) / window_size
+                    scale = alpha / float(item_count)
+                    out[pixel_byte] = wp.uint8(float(out[pixel_byte]) * (1.0 - alpha) + float(total[0]) * scale + 0.5)
+                    out[pixel_byte + 1] = wp.uint8(
+                        float(out[pixel_byte + 1]) * (1.0 - alpha) + float(total[1]) * scale + 0.5
+                    )
+                    out[pixel_byte + 2] = wp.uint8(
+                        float(out[pixel_byte + 2]) * (1.0 - alpha) + float(total[2]) * scale + 0.5
+                    )
+        leaving = step - half_length
+        if leaving >= 0 and leaving < line_length:
+            pixel = on_line(first, slope, line_start, leaving, is_horizontal)
             if inside(pixel, width, height):
-                i = start + (pixel[1] * width + pixel[0]) * 3
+                pixel_byte = image_start + (pixel[1] * width + pixel[0]) * 3
                 rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
-                    total = total - wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
-                    weight -= 1
+                    total = total - wp.vec3i(
+                        int(image[pixel_byte]), int(image[pixel_byte + 1]), int(image[pixel_byte + 2])
+                    )
+                    item_count -= 1
                 elif rank < item.rank:
-                    beside = beside - wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
-                    count -= 1
+                    background = background - wp.vec3i(
+                        int(image[pixel_byte]), int(image[pixel_byte + 1]), int(image[pixel_byte + 2])
+                    )
+                    background_count -= 1
