@@ -14,12 +14,12 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.engine.kind import Resources
 from ssad.engine.run import run
-from ssad.experiments.runs import write_report
+from ssad.experiments.runs import kind_of_run, write_report
 from ssad.experiments.suites import load_suite
 from ssad.experiments.tour.kind import Tour, TourSuite
 from ssad.report import check_artefacts
 from ssad.report.load import load_run
-from ssad.report.verdict import verdict
+from ssad.report.verdict import complete_verdict
 
 SHORT = """
 name: short
@@ -116,3 +116,7 @@ def test_the_shipped_tour_can_be_planned() -> None:
         "adversarial",
         "gap",
     }
+
+
+def verdict(run):
+    return complete_verdict(run, kind_of_run(run).verdict(run))

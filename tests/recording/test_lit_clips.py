@@ -12,10 +12,11 @@ from helpers.bodies import plain_bodies
 
 from ssad.core.errors import UnknownNameError
 from ssad.core.images import read_image
-from ssad.experiments.perception.physical.lit_images import HOURS, LitClip, at_hour, lit_clips
+from ssad.experiments.perception.physical.lit_images import LitClip, at_hour, lit_clips
 from ssad.recorders.target_images import record_clips
 from ssad.recorders.target_recording import Clips
 from ssad.rendering.camera.render import Weather
+from ssad.rendering.hours import HOURS
 from ssad.scenarios.static.physical.lights import Flashlight, Projector, Shadow
 from ssad.scenarios.static.physical.lights.light import at_values
 

@@ -30,14 +30,14 @@ from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.recorders.drives import CARS, MIX, drive_street, make_drive, thinned
+from ssad.recorders.drives import MIX, drive_street, make_drive, thinned
 from ssad.recorders.nuscenes import AHEAD, Recording, drive, record_nuscenes
 from ssad.recorders.target_images import record_clips
 from ssad.recorders.target_recording import Clips
 from ssad.rendering.bodies import make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
 from ssad.rendering.meshes.mesh import Mesh
-from ssad.rendering.scene_objects import RACK, SceneObjects, place_objects
+from ssad.rendering.scene_objects import CARS, RACK, SceneObjects, place_objects
 from ssad.rendering.street import cached_street
 from ssad.rendering.street.model import Street
 from ssad.scenarios.static.shifts import ShiftSpec

@@ -21,7 +21,6 @@ from ssad.core.errors import StoreError
 from ssad.core.traces import save_trace, trace_hash
 from ssad.experiments.runs import write_report
 from ssad.report import check_artefacts
-from ssad.report.pages import kind_module
 
 
 class _Text(html.parser.HTMLParser):

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from helpers.run_folder import write_run
 
-from ssad.experiments.runs import write_report
+from ssad.experiments.runs import kind_of_run, write_report
 from ssad.report.load import load_run
-from ssad.report.verdict import verdict
+from ssad.report.verdict import complete_verdict
 
 
 def estimate(
@@ -237,3 +237,7 @@ def test_what_failed_counts_as_in_the_tables(tmp_path: Path) -> None:
     said = told(tmp_path / "searches", "adversarial", [alive, alive, {"system": "s", "generator": "king"} | failed])
     assert said == "No generator makes s collide in scenarios that it survives unchanged: king in 0 of 3 (1 failed)."
     assert told(tmp_path / "dead", "adversarial", [{"system": "s", "generator": "king"} | failed]) == "See the table."
+
+
+def verdict(run):
+    return complete_verdict(run, kind_of_run(run).verdict(run))

@@ -201,8 +201,8 @@ def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
             for column in fields(Solids)
         }
         solids = [
-            Solids(**{name: values[index] for name, values in solid_columns.items()})
-            for index in range(len(truths))  # type: ignore[arg-type]
+            Solids(**{name: values[index] for name, values in solid_columns.items()})  # type: ignore[arg-type]
+            for index in range(len(truths))
         ]
     return [
         Truth(solid=solids[index], **{name: values[index] for name, values in columns.items()})  # type: ignore[arg-type]
