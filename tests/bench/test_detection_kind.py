@@ -15,9 +15,9 @@ from rich.console import Console
 
 from ssad.core.errors import ConfigError, FormatError
 from ssad.engine.kind import Job, Plan, Resources
+from ssad.experiments.perception import detector_kind as detection
 from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, boxes_path
 from ssad.experiments.perception.scored_data import Recorded, recording_of
-from ssad.experiments.perception.shifts import kind as detection
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
