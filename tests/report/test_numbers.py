@@ -267,13 +267,6 @@ def test_a_kind_without_columns_or_factors_gets_those_of_its_lines(tmp_path: Pat
     assert found == [("x", "speed", "2.0"), ("y", "speed", "")]
 
 
-@pytest.mark.parametrize("kind", ["driving", "detection"])
-def test_kinds_have_their_sections(kind: str) -> None:
-    assert kind_module(kind).section.__module__ == f"ssad.report.kinds.{kind}"
-    assert kind_module("tables").section.__module__ == "ssad.report.default"
-    assert kind_module("../driving").section.__module__ == "ssad.report.default"
-
-
 def detection_line(shift: str | None, severity: Any, scenes: int) -> dict[str, Any]:
     score = 0.4 if shift is None else 0.2
     # the replicates of both lines go up and down together, those under a shift with a little of their own
