@@ -15,11 +15,21 @@ from rich.console import Console
 
 from ssad.core.errors import ConfigError, FormatError
 from ssad.engine.kind import Job, Plan, Resources
-from ssad.experiments.perception import detector_kind as detection
+from ssad.experiments.perception import detector_kind
 from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, boxes_path
 from ssad.experiments.perception.scored_data import Recorded, recording_of
+from ssad.experiments.perception.shifts import kind as shifts_kind
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
+
+
+def replace_name(monkeypatch: pytest.MonkeyPatch, name: str, value: Any) -> None:
+    """Replace a name in the kind and in its base, wherever it is used."""
+    modules = [module for module in (detector_kind, shifts_kind) if hasattr(module, name)]
+    assert modules, name
+    for module in modules:
+        monkeypatch.setattr(module, name, value)
+
 
 GOOD: dict[str, Any] = {
     "kind": "detection",
@@ -43,7 +53,7 @@ def no_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
         hashes = {name: f"hash of {name}" for name in suite.detectors}
         return hashes, {name: f"{name}.pth" for name in suite.detectors}, dict.fromkeys(suite.detectors, "3d")
 
-    monkeypatch.setattr(detection, "detectors_of", detectors)
+    replace_name(monkeypatch, "detectors_of", detectors)
 
 
 def plan_of(device: str = "cpu", **changes: Any) -> Plan:
@@ -185,13 +195,13 @@ def test_scenes_of_a_cell(tmp_path: Path) -> None:
 
 def test_boxes_are_found_and_scored_with_what_the_job_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
-    monkeypatch.setattr(detection, "find_boxes", lambda *given: found.append(given))
+    replace_name(monkeypatch, "find_boxes", lambda *given: found.append(given))
 
     def score(examination: Any, system: str, scenes: Any, *, replicates: int) -> dict[str, Any]:
         assert len(found) == len(SCENES) + 1
         return {"metrics": {"scenes": len(scenes)}, "replicates": replicates, "system": system}
 
-    monkeypatch.setattr(detection, "score_scenes", score)
+    replace_name(monkeypatch, "score_scenes", score)
     kind, cell = Detection(), plan_of(detectors=["one"]).cells[2]
     expected = Examination(tmp_path, Path("/data"), "v1.0-mini", (("one", "one.pth"),), 7, "cuda", 3, "physical")
     kind.make("name", ["fog", 3, "scene-1"], ["one", "two"], job(tmp_path))
@@ -232,9 +242,9 @@ def data(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, str | None]]:
     """The data sets that were opened."""
     opened: list[tuple[Path, str | None]] = []
     monkeypatch.setattr(Data, "opened", opened, raising=False)
-    monkeypatch.setattr(detection, "NuScenes", Data)
-    monkeypatch.setattr(detection, "scenes_of", lambda data, split: {"val": tuple(SCENES)}[split])
-    monkeypatch.setattr(detection, "default_workers", lambda: 8)
+    replace_name(monkeypatch, "NuScenes", Data)
+    replace_name(monkeypatch, "scenes_of", lambda data, split: {"val": tuple(SCENES)}[split])
+    replace_name(monkeypatch, "default_workers", lambda: 8)
     return opened
 
 
@@ -252,7 +262,7 @@ def test_where_none_is_given_a_data_set_is_recorded(
         recorded.append((recording, workers, ray))
         return tmp_path / "data"
 
-    monkeypatch.setattr(detection, "record_nuscenes", record)
+    replace_name(monkeypatch, "record_nuscenes", record)
     resources = quiet(3)
     settings = Detection().prepare(plan_of(seed=4), tmp_path, resources)
     assert recorded == [(recording_of(suite(), tmp_path / "data"), 3, "some cluster")]
@@ -281,7 +291,7 @@ def test_where_none_is_given_a_data_set_is_recorded(
         def __exit__(self, *error: object) -> None:
             pass
 
-    monkeypatch.setattr(detection, "Live", Bar)
+    replace_name(monkeypatch, "Live", Bar)
     Detection().prepare(plan_of(recorded={"scenes": 5}), tmp_path, resources)
     assert bars == [(("recording", 10, 0), "scenes")]
 
@@ -310,7 +320,7 @@ def test_boxes_that_could_not_be_found_are_forgotten_when_they_are_tried_again(
     tmp_path: Path, data: list[tuple[Path, str | None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     forgotten: list[Path] = []
-    monkeypatch.setattr(detection, "forget_failures", forgotten.extend)
+    replace_name(monkeypatch, "forget_failures", forgotten.extend)
     plan = plan_of()
     given = Plan(plan.kind, suite(data=str(tmp_path)), "cpu", plan.cells, plan.inputs, {}, plan.details)
     Detection().prepare(given, tmp_path / "out", quiet(), retry=[plan.cells[2]])
@@ -337,8 +347,8 @@ def test_the_picture_shows_the_middle_severity(
         path.parent.mkdir()
         path.write_text(picture)
 
-    monkeypatch.setattr(detection, "detection_sheet", sheet)
-    monkeypatch.setattr(detection, "save_picture", save)
+    replace_name(monkeypatch, "detection_sheet", sheet)
+    replace_name(monkeypatch, "save_picture", save)
     plan = plan_of("cuda", severities=severities, seed=4)
     for _ in range(2):
         Detection().finish(plan, tmp_path)
@@ -356,7 +366,7 @@ def test_a_picture_of_data_that_cannot_be_read_is_left_out(
     def broken(*given: Any) -> None:
         raise FormatError("a picture is broken")
 
-    monkeypatch.setattr(detection, "detection_sheet", broken)
+    replace_name(monkeypatch, "detection_sheet", broken)
     plan = plan_of()
     given = Plan(plan.kind, suite(data=str(tmp_path / "set")), "cpu", plan.cells, plan.inputs, {}, plan.details)
     Detection().finish(given, tmp_path)

@@ -16,9 +16,19 @@ from ssad.core.errors import ConfigError, RouteError, UnknownNameError
 from ssad.core.lane_graph import town_file
 from ssad.core.types import Actor, Pose, Scenario
 from ssad.engine.kind import Cell, Job, Plan, Resources
-from ssad.experiments.driving import kind as driving
+from ssad.experiments import scenario_kind
+from ssad.experiments.driving import kind as driving_kind
 from ssad.experiments.driving.kind import Driving, DrivingSuite
 from ssad.experiments.scenario_kind import suite_scenarios
+
+
+def replace_name(monkeypatch: pytest.MonkeyPatch, name: str, value: Any) -> None:
+    """Replace a name in the kind and in its base, wherever it is used."""
+    modules = [module for module in (scenario_kind, driving_kind) if hasattr(module, name)]
+    assert modules, name
+    for module in modules:
+        monkeypatch.setattr(module, name, value)
+
 
 GOOD: dict[str, Any] = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"]}
 
@@ -35,11 +45,11 @@ def scenario(name: str, **changes: Any) -> Scenario:
 @pytest.fixture(autouse=True)
 def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Towns of that name, and scenarios that the suite seems to name."""
-    monkeypatch.setattr(driving, "town", lambda name: SimpleNamespace(name=name, xy=np.zeros(3), sign_kind=np.zeros(0)))
+    replace_name(monkeypatch, "town", lambda name: SimpleNamespace(name=name, xy=np.zeros(3), sign_kind=np.zeros(0)))
 
 
 def plan_of(monkeypatch: pytest.MonkeyPatch, *scenarios: Scenario, check: bool = False, **changes: Any) -> Plan:
-    monkeypatch.setattr(driving, "suite_scenarios", lambda suite: scenarios)
+    replace_name(monkeypatch, "suite_scenarios", lambda suite: scenarios)
     return Driving().plan(suite(**changes), check=check)
 
 
@@ -113,7 +123,7 @@ def test_each_scenario_is_built_once_to_check_it(monkeypatch: pytest.MonkeyPatch
         if cell.name.endswith("worse"):
             raise RouteError("scenario worse: no way")
 
-    monkeypatch.setattr(driving, "episode_of", build)
+    replace_name(monkeypatch, "episode_of", build)
     plan_of(monkeypatch, scenario("a"), scenario("b"), repetitions=3, check=True)
     assert built == ["autopilot/a", "autopilot/b"]
     for name in ("bad", "worse"):
@@ -134,7 +144,7 @@ def test_copies_of_towns_lie_beside_the_results(monkeypatch: pytest.MonkeyPatch,
         path.parent.mkdir(exist_ok=True)
         path.write_text("")
 
-    monkeypatch.setattr(driving, "save_graph", save)
+    replace_name(monkeypatch, "save_graph", save)
     plan = plan_of(monkeypatch, scenario("a"), scenario("b", town="dir/own.npz"), scenario("c", town="Old"))
     (tmp_path / "towns").mkdir()
     (tmp_path / "towns" / "Old.npz").write_text("")
@@ -153,7 +163,7 @@ def test_the_drivers_of_actors_count_in_the_key(monkeypatch: pytest.MonkeyPatch)
     keys = []
     for version in ("1", "1", "2"):
         versions = {"mine": version, "autopilot": "0", "blind": "0"}
-        monkeypatch.setattr(driving, "system_version", versions.__getitem__)
+        replace_name(monkeypatch, "system_version", versions.__getitem__)
         plan = plan_of(monkeypatch, told, scenario("b"))
         keys.append([cell.key for cell in plan.cells if cell.system == "blind"])
     assert keys[0] == keys[1]
@@ -205,21 +215,21 @@ def test_a_record_has_what_was_driven(monkeypatch: pytest.MonkeyPatch, tmp_path:
     cells = plan_of(monkeypatch, scenario("a"), scenario("b"), systems=["autopilot"]).cells
     episodes = [SimpleNamespace(scenario=SimpleNamespace(name=name)) for name in "ab"]
     asked, clock = [], iter([0.0, 8.0, 10.0, 11.0, 20.0, 22.0] * 2)
-    monkeypatch.setattr(driving, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    monkeypatch.setattr(
-        driving, "drive", lambda cells, *, device: (episodes, [trace_of("collision"), trace_of("route")], {})
+    replace_name(monkeypatch, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    replace_name(
+        monkeypatch, "drive", lambda cells, *, device: (episodes, [trace_of("collision"), trace_of("route")], {})
     )
-    monkeypatch.setattr(driving, "save_trace", lambda path, trace: path.write_text(trace.end))
-    monkeypatch.setattr(driving, "trace_hash", lambda trace: f"hash {trace.end}")
-    monkeypatch.setattr(driving, "motion_hash", lambda trace: f"motion {trace.end}")
+    replace_name(monkeypatch, "save_trace", lambda path, trace: path.write_text(trace.end))
+    replace_name(monkeypatch, "trace_hash", lambda trace: f"hash {trace.end}")
+    replace_name(monkeypatch, "motion_hash", lambda trace: f"motion {trace.end}")
     measured = SimpleNamespace(as_dict=lambda: {"speed": math.inf})
-    monkeypatch.setattr(driving, "episode_metrics", lambda trace, stop_signs: measured)
+    replace_name(monkeypatch, "episode_metrics", lambda trace, stop_signs: measured)
 
     def grade_of(*given: Any) -> Any:
         asked.append(given)
         return SimpleNamespace(as_dict=lambda: {"danger": math.nan}, metrics=lambda: {"avoided_by_cc": 1.0})
 
-    monkeypatch.setattr(driving, "grade_of", grade_of)
+    replace_name(monkeypatch, "grade_of", grade_of)
     (tmp_path / "traces").mkdir()
     found = Driving().execute(cells, Job(tmp_path, "cpu", {"witness": True}))
     one, two = (found[cell.key] for cell in cells)
