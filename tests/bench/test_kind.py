@@ -145,7 +145,7 @@ def test_what_a_suite_may_say(tmp_path: Path) -> None:
 def test_only_what_has_run_well_is_replayed(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = plan.cells
     records = [{"key": two.key, "status": "timeout", "reason": "too long"}]
-    monkeypatch.setattr(replays, "read_plan", lambda folder: plan)
+    monkeypatch.setattr("ssad.experiments.runs.read_plan", lambda folder: plan)
     monkeypatch.setattr(replays, "read_lines", lambda path: records if path == tmp_path / "results.jsonl" else [])
     with pytest.raises(StoreError, match=rf"cell {one.key} \(a/x\) has not run yet"):
         replay(tmp_path, "a/x")

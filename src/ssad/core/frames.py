@@ -86,7 +86,7 @@ class StandingObject:
     """An object that stands still in the world over a whole scene.
 
     Attributes:
-        kind: A kind of `ssad.assets.bodies`.
+        kind: A kind of `ssad.rendering.bodies`.
         style: A style of that kind.
         seed: Seed of its appearance.
         size: Length, width, height, m.

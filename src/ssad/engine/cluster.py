@@ -1,6 +1,6 @@
 """Tasks on a Ray cluster: Ray schedules them, and a worker process runs each one as on a single machine.
 
-A Ray worker keeps one child process (`ssad.jobs.local`) and hands it one task after another. A task that raises,
+A Ray worker keeps one child process (`ssad.engine.local`) and hands it one task after another. A task that raises,
 hangs, dies or exhausts the memory is thereby distinct from a lost node: the former is an outcome, the latter is
 repeated on another node. All nodes must see the same folders.
 """
@@ -49,7 +49,7 @@ def _check_address(address: str) -> None:
 
 
 class RayCluster:
-    """Backend of a Ray cluster; see `ssad.jobs.task.Backend`.
+    """Backend of a Ray cluster; see `ssad.engine.task.Backend`.
 
     Args:
         address: Address of a running cluster, "auto", or "local" to start one for the lifetime of this object.

@@ -1,4 +1,4 @@
-"""Child process that runs tasks: `python -m ssad.jobs.worker IN OUT`, two file descriptors of pipes.
+"""Child process that runs tasks: `python -m ssad.engine.worker IN OUT`, two file descriptors of pipes.
 
 Input: (import path, whether a start follows) once, then (function, argument) pairs, the start first. Output: (kind,
 value) pairs: "ready"; "value"; "error" with the exception of a user's mistake or a line of text; "fatal" if the start

@@ -40,7 +40,7 @@ class Viewpoint:
         camera: Pose [4, 4], x right, y down, z forward.
         target: Pose [4, 4].
         weather: Weather and hour.
-        annotation: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation,
+        about: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation,
             degrees.
     """
 

@@ -21,7 +21,7 @@ FIRST_SIGN: Final = 1 << 16  # tag of a town's sign 0: no scene has so many agen
 
 @dataclass(frozen=True)
 class LiveAttack:
-    """Edit of an agent or of all stop signs, for `ssad.recording.loop_sensors.Onboard`.
+    """Edit of an agent or of all stop signs, for `ssad.rendering.onboard.Onboard`.
 
     Attributes:
         edit: Returns the edit of a scene around a target, given its body.

@@ -71,7 +71,7 @@ class Sight:
     Attributes:
         row: Row of the reading that it belongs to.
         town: Scene of its town.
-        appearance: Appearance of the episode.
+        looks: Appearance of the episode.
         moment: Poses of the agents.
         agent: Number of the viewing agent.
     """

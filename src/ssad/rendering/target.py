@@ -15,8 +15,8 @@ class TargetCar:
     """Car with the same mesh in every recording.
 
     Attributes:
-        style: Body style, see `ssad.assets.bodies.BODIES`.
-        paint: Name of its paint, see `ssad.assets.bodies.PAINTS`.
+        style: Body style, see `ssad.rendering.bodies.BODIES`.
+        paint: Name of its paint, see `ssad.rendering.bodies.PAINTS`.
         size: Length, width, height, m; the mean of the style if None.
         seed: Seed of all other differences between cars of a style.
     """
@@ -54,7 +54,7 @@ class _Standing:
     """Target other than a car, with the same mesh in every recording.
 
     Attributes:
-        style: Body style, see `ssad.assets.bodies.BODIES`.
+        style: Body style, see `ssad.rendering.bodies.BODIES`.
         size: Length, width, height, m; the mean of the style if None.
         seed: Seed of all other differences between bodies of a style.
         kind: Kind of its body.

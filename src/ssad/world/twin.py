@@ -176,7 +176,7 @@ class RoadField:
 
     The value is the distance from the nearest lane's centre line, less half its width: positive off the road, minus
     half a width on a centre line, and 0 on the border between two lanes side by side. It is at most 0 where
-    `ssad.roads.query.LaneQuery` finds the road.
+    `ssad.world.roads.query.LaneQuery` finds the road.
 
     Args:
         graph: The town.

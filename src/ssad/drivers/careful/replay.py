@@ -37,7 +37,7 @@ class Takeover:
     """Driver that takes over a scene, and the time of the takeover.
 
     Attributes:
-        driver: The driver; one driver may take many scenes.
+        hand: The driver; one driver may take many scenes.
         start: Time of the takeover, s.
     """
 

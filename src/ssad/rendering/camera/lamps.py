@@ -50,7 +50,7 @@ class Lamp:
         reach: m; light fades in the last third and ends here.
         shadows: Whether bodies and street block its light.
         texture: Index of the texture that it projects, -1 for none. The image is then a linear function of that
-            texture (see `ssad.camera.texture`): u across, v down its spread. A projector lights a rectangle.
+            texture (see `ssad.rendering.camera.texture`): u across, v down its spread. A projector lights a rectangle.
     """
 
     pose: F64

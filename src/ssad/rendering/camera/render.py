@@ -58,7 +58,7 @@ class View:
     Attributes:
         camera: Size and intrinsics.
         pose: Camera to world [4, 4].
-        objects: Objects in the scene besides the street.
+        things: Objects in the scene besides the street.
         weather: Time of day and weather.
         sensor: Lens, mosaic, noise and full photosites.
         seed: Seed of the noise; equal seeds give equal noise.
@@ -128,7 +128,7 @@ class Picture:
         depth: Depth along the optical axis [B, H, W], m; inf for sky.
         exposure: [B]; `image` is the camera's curve of radiance times exposure.
         fragments: Pieces of textured surfaces, which are black in `image`, by pixel and triangle (see
-            `ssad.camera.texture`).
+            `ssad.rendering.camera.texture`).
         surface: Surfaces that the pixels show; None unless requested.
     """
 

@@ -157,7 +157,7 @@ class Bodies:
     """The N objects of B views as arrays, view by view.
 
     Attributes:
-        objects: The objects themselves.
+        things: The objects themselves.
         view: View of each [N].
         mesh: Index of its mesh in the scene [N].
         pose: Object to world [N, 4, 4].

@@ -1,7 +1,7 @@
 """Sensor model from light to codes: lens, colour mosaic, noise, full photosites.
 
-Constants shared by both engines: `ssad.camera.kernels.sensor` (Warp, for `render`) and `ssad.camera.torch_sensor`
-(torch, with gradients). The chain is
+Constants shared by both engines: `ssad.rendering.camera.kernels.sensor` (Warp, for `render`) and
+`ssad.rendering.camera.torch_sensor` (torch, with gradients). The chain is
 
 1. light = radiance * exposure, spread by the lens over 3 x 3 pixels;
 2. one colour for each photosite (Bayer's RGGB, red at row 0 and column 0), or all three without a mosaic;

@@ -40,7 +40,7 @@ def lamp_light(
         rectangle.
 
     Raises:
-        ConfigError: The lamp projects a texture (see `ssad.camera.texture`).
+        ConfigError: The lamp projects a texture (see `ssad.rendering.camera.texture`).
     """
     if lamp.texture >= 0:
         raise ConfigError(

@@ -1,8 +1,8 @@
-"""Sensor of the camera in torch: the chain of `ssad.camera.render` from light to JPEG, with gradients.
+"""Sensor of the camera in torch: the chain of `ssad.rendering.camera.render` from light to JPEG, with gradients.
 
-`develop` is the chain of `ssad.camera.sensor` and equals the renderer's images up to the rounding to 8 bits;
-`ssad.camera.torch_jpeg.jpeg` follows it. An attack changes few pixels: `Window` develops only those and the pixels
-that depend on them. Light above a full photosite or outside the curve has slope zero, as in the camera.
+`develop` is the chain of `ssad.rendering.camera.sensor` and equals the renderer's images up to the rounding to 8 bits;
+`ssad.rendering.camera.torch_jpeg.jpeg` follows it. An attack changes few pixels: `Window` develops only those and
+the pixels that depend on them. Light above a full photosite or outside the curve has slope zero, as in the camera.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ def develop(
     sensor: Sensor = DEFAULT_SENSOR,
     noise: Tensor | torch.Generator | None = None,
 ) -> Tensor:
-    """Develop radiance into the camera's image, as `ssad.camera.render` does before it rounds to 8 bits.
+    """Develop radiance into the camera's image, as `ssad.rendering.camera.render` does before it rounds to 8 bits.
 
     Args:
         radiance: Linear, [B, H, W, 3].

@@ -1,4 +1,4 @@
-"""Loader of users' meshes: Wavefront OBJ with MTL colours (`ssad.assets.obj`) and glTF 2.0 (`ssad.assets.gltf`).
+"""Loader of users' meshes: Wavefront OBJ with MTL colours (`meshes.obj`) and glTF 2.0 (`meshes.gltf`).
 
 Files are untrusted: sizes are limited, references must not leave the folder, and every error is one line with
 file and line (OBJ) or object (glTF). Texture images are not read: users supply or attack the texture themselves.

@@ -113,7 +113,7 @@ def lidar_eye(lidar: Lidar, dt: float) -> Eye:
 
 
 def radar_eye(radar: Lidar, dt: float) -> Eye:
-    """Describe a radar with the rays of `ssad.recording.loop_radar`."""
+    """Describe a radar with the rays of `ssad.rendering.radar`."""
     point_count = len(radar.beams) * radar.azimuths
     vertical_angle = float(np.ptp(radar.beams)) * (1.0 + 1.0 / max(len(radar.beams) - 1, 1))
     empty = np.zeros((point_count, 4), np.float32)

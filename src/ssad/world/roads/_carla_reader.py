@@ -1,6 +1,6 @@
 """Sampling of lanes with carla.Map; `bake` runs it in a process of its own, because carla's C++ may abort.
 
-`python -m ssad.roads._carla_reader MAP.xodr REQUEST.npz ANSWER.npz`. Request: road, lane [L] ids, s0, s1 [L]
+`python -m ssad.world.roads._carla_reader MAP.xodr REQUEST.npz ANSWER.npz`. Request: road, lane [L] ids, s0, s1 [L]
 m. Answer in OpenDRIVE's right-handed frame: count [L]; table [P, 6]: s, x, y, z, yaw (along the traffic), width;
 crosswalk [., 3]: number, x, y; light_id [S], light [S, 3]: x, y, yaw.
 """

@@ -65,7 +65,7 @@ class AttackSpec:
         becomes: (class, target class of its objects); empty: any other.
         draws: draws of a random defence that the attack knows, over which it ascends the mean loss; 0: it knows
             none.
-        object: attacked object of each moment (see `ssad.evaluation.chosen_object`); "": all.
+        object: attacked object of each moment (see `ssad.experiments.perception.digital.chosen_object`); "": all.
         precision: of the gradients.
     """
 
@@ -171,7 +171,7 @@ def takes(attack: str, option: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class AttackedScene:
-    """One scene under one attack on one system; see `ssad.evaluation.scene_boxes.Condition`.
+    """One scene under one attack on one system; see `ssad.experiments.perception.scene_boxes.Condition`.
 
     Attributes:
         spec: the attack.

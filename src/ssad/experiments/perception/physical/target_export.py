@@ -27,7 +27,7 @@ def export_shown_texture(
         dots: Dots of the print per metre.
 
     Returns:
-        The written files (see `ssad.recording.texture_export.export_texture`).
+        The written files (see `ssad.scenarios.static.physical.textures.export.export_texture`).
 
     Raises:
         ConfigError: The row shows no texture.
@@ -59,7 +59,7 @@ def export_shown_light(attacks: TargetAttacks, row: Mapping[str, Any], out: Path
         name: Name of the light.
 
     Returns:
-        The written files (see `ssad.recording.light_export.export_light`).
+        The written files (see `ssad.scenarios.static.physical.lights.export.export_light`).
 
     Raises:
         ConfigError: The row shows no light.

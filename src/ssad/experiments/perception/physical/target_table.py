@@ -52,7 +52,7 @@ class Grid(Schema):
         distances: m.
         azimuths: degrees from the front to the left of the target.
         elevations: degrees.
-        weathers: kinds (`ssad.recording.nuscenes_recorder.WEATHERS`).
+        weathers: kinds (`ssad.recorders.nuscenes.WEATHERS`).
         towns: towns of the tests with a grid; None: all.
     """
 
@@ -98,7 +98,7 @@ class LightEntry(Schema):
     """Rows of the table for one light: searched, and with settings drawn at random.
 
     Attributes:
-        name: an attack (`ssad.scenarios.static.physical.noninvasive`).
+        name: an attack (`ssad.scenarios.static.physical.lights`).
         hour: noon, low_sun, night, or recorded: as the images were.
         options: fields of the attack that differ.
         settings: of its search (`Budget`); of a projector, of `TextureAttack`.

@@ -1,4 +1,4 @@
-"""Sensor: linear light to photosites, and photosites to 8 bits. See `ssad.camera.sensor` for the chain."""
+"""Sensor: linear light to photosites, and photosites to 8 bits. See `ssad.rendering.camera.sensor` for the chain."""
 
 import warp as wp
 

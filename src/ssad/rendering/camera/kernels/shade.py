@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Geometry:
-    """Arrays of a scene, as in `ssad.camera.scene.Scene`."""
+    """Arrays of a scene, as in `ssad.rendering.camera.scene.Scene`."""
 
     vertices: wp.array(dtype=wp.vec3)
     faces: wp.array2d(dtype=int)

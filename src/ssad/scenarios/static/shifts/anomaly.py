@@ -1,8 +1,8 @@
 """Anomaly: objects of no class on the road of a scene, drawn into its images.
 
 They stand still in the world beside the path of the ego and its continuation, clear of every annotated box, so that
-all cameras show the same objects over the whole scene. Each is rendered by `ssad.camera`, exposed by the brightness
-of the ground around it, and blended into the image in linear light behind nearer surfaces. LiDAR rays that hit one
+all cameras show the same objects over the whole scene. Each is rendered by `ssad.rendering.camera`, exposed by the
+brightness of the ground around it, and blended into the image in linear light behind nearer surfaces. LiDAR rays that hit one
 return from it.
 """
 

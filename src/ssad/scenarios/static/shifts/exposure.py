@@ -22,8 +22,8 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 def exposure_table(stops: float) -> U8:
     """Return the code [256] of each code in an image exposed by `stops` EV more.
 
-    The curve of `ssad.camera`: linear up to `KNEE`, a soft shoulder above, saturated at `BRIGHTEST`. White in the
-    given image is assumed to be exactly saturated.
+    The curve of `ssad.rendering.camera`: linear up to `KNEE`, a soft shoulder above, saturated at `BRIGHTEST`. White in
+    the given image is assumed to be exactly saturated.
     """
     displayed = to_linear(np.arange(256))
     max_displayed = KNEE + (1 - KNEE) * (1 - np.exp(-(BRIGHTEST - KNEE) / SHOULDER))

@@ -1,1 +1,1 @@
-"""Baked towns that ship with SSAD (*.npz); `ssad.roads.designs` gives their OpenDRIVE."""
+"""Baked towns that ship with SSAD (*.npz); `ssad.world.roads.designs` gives their OpenDRIVE."""

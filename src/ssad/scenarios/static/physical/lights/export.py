@@ -31,9 +31,9 @@ class Shining:
     """Light attack with all settings that are needed to show it again.
 
     Attributes:
-        attack: Its name (`ssad.scenarios.static.physical.noninvasive.LIGHTS`).
+        attack: Its name (`ssad.scenarios.static.physical.lights.LIGHTS`).
         options: Options of the attack.
-        hour: Hour at which it shines (see `ssad.recording.lit_clips.HOURS`).
+        hour: Hour at which it shines (see `ssad.experiments.perception.physical.lit_images.HOURS`).
         target: Target that it was searched for, as for `ssad record --target`.
         values: Its settings, in the units of their names; empty for a projector.
         colour: Image of a projector, sRGB [3, H, W] in 0 to 1; else None.

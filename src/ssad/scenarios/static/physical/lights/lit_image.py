@@ -40,7 +40,7 @@ class LitPicture:
         normal: Surface normal of each pixel [h, w, 3].
         sun_direction: Direction to the sun, in the target's frame [3]; None by night.
         exposure: Factor from radiance to exposure.
-        per_lux: Irradiance over pi of one lux (see `ssad.camera.photometry`).
+        per_lux: Irradiance over pi of one lux (see `ssad.rendering.camera.photometry`).
         fog: Extinction, 1/m.
         sensor: Sensor of the camera.
     """

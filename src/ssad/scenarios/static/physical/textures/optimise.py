@@ -35,7 +35,7 @@ TARGET = Aim(objects=(0,))
 
 
 class Shows(Protocol):
-    """Protocol of an image whose target can wear textures (see `ssad.recording.textured_clips.Wearing`)."""
+    """Protocol of an image whose target can wear textures."""
 
     @classmethod
     def together(
