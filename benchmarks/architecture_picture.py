@@ -13,30 +13,30 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "architecture.svg"
-WIDTH, TOP, PITCH, HEIGHT = 1200, 78, 50, 34  # pixels: picture, first row, from row to row, a box
+WIDTH, TOP, PITCH, HEIGHT = 1200, 78, 40, 34  # pixels: picture, first row, from row to row, a box
 GREY = "#7d8590"
 COLOURS = {  # fill and border, by what a package is for
-    "#d7e7fb": ("#3b76c4", ("cli", "doctor", "listing", "results", "bench", "report")),
-    "#ddf0dc": ("#4a9150", ("recording", "toolbox", "training", "interchange", "envs", "evaluation")),
+    "#d7e7fb": ("#3b76c4", ("cli", "results", "experiments", "engine", "report")),
+    "#ddf0dc": ("#4a9150", ("training", "envs", "interchange", "recorders", "simulators")),
     "#fdebd0": ("#c98a2b", ("scenarios", "drivers", "detectors", "datasets")),
-    "#e6def5": ("#7d5fb5", ("world", "camera", "assets", "roads")),
-    "#e3e7eb": ("#768390", ("metrics", "jobs", "core")),
+    "#e6def5": ("#7d5fb5", ("world", "rendering")),
+    "#e3e7eb": ("#768390", ("metrics", "core")),
 }
 SCENARIO = (  # step, what it is, package
-    ("suite", "YAML file and --set options", "bench"),
-    ("plan", "the kind makes cells with keys", "bench"),
-    ("pool", "local processes or Ray, time-outs", "jobs"),
+    ("suite", "YAML file and --set options", "experiments"),
+    ("plan", "the kind makes cells with keys", "experiments"),
+    ("pool", "local processes or Ray, time-outs", "engine"),
     ("episode", "a scenario built on a town", "scenarios"),
-    ("drive", "world and driver, step by step", "world"),
+    ("drive", "world and driver, step by step", "simulators"),
     ("record", "metrics, trace, results.jsonl", "metrics"),
     ("report", "tables, figures, replays", "report"),
 )
 IMAGE = (
-    ("scene", "street and bodies", "assets"),
-    ("image", "rendered, or from a dataset", "camera"),
+    ("scene", "street and bodies", "rendering"),
+    ("image", "rendered, or from a dataset", "rendering"),
     ("shift", "snow, fog, noise, ...", "scenarios"),
     ("detect", "2D or 3D boxes for each camera", "detectors"),
-    ("merge", "boxes of all cameras in the world", "evaluation"),
+    ("merge", "boxes of all cameras in the world", "detectors"),
     ("score", "mAP, NDS, mCE, uncertainty", "metrics"),
     ("report", "tables, curves, images", "report"),
 )

@@ -2,8 +2,8 @@
 
 They stand still in the world beside the path of the ego and its continuation, clear of every annotated box, so that
 all cameras show the same objects over the whole scene. Each is rendered by `ssad.rendering.camera`, exposed by the
-brightness of the ground around it, and blended into the image in linear light behind nearer surfaces. LiDAR rays that hit one
-return from it.
+brightness of the ground around it, and blended into the image in linear light behind nearer surfaces. LiDAR rays
+that hit one return from it.
 """
 
 from __future__ import annotations
