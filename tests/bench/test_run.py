@@ -452,7 +452,7 @@ def test_run_json_says_what_the_folder_holds(bench: Bench) -> None:
 
 def test_a_plan_is_read_back_unless_something_has_changed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.run("a b", "one two", device="cuda")
-    monkeypatch.setattr(engine, "kind_of", lambda name: {"bench.test_run:Words": Words()}[name])
+    monkeypatch.setattr("ssad.experiments.runs.kind_of", lambda name: {"bench.test_run:Words": Words()}[name])
     plan = read_plan(bench.folder)
     assert [cell.name for cell in plan.cells] == ["a/one", "b/one", "a/two", "b/two"]
     assert plan.device == "cuda"

@@ -12,6 +12,7 @@ from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.types import Pose, Scenario
 from ssad.engine.command import command_of
 from ssad.engine.kind import Plan, find_cell
+from ssad.experiments import scenario_kind
 from ssad.experiments.driving import kind as driving
 from ssad.experiments.driving.kind import Driving, DrivingSuite
 from ssad.experiments.suites import load_suite, suite_files
@@ -82,9 +83,9 @@ def test_unknown_suite() -> None:
 
 def plan_of(scenarios: list[Scenario], monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Plan:
     """A plan without a world behind it."""
-    monkeypatch.setattr(driving, "suite_scenarios", lambda suite: tuple(scenarios))
-    monkeypatch.setattr(driving, "town", lambda name: None)
-    monkeypatch.setattr(driving, "town_version", lambda graph: "0")
+    monkeypatch.setattr(scenario_kind, "suite_scenarios", lambda suite: tuple(scenarios))
+    monkeypatch.setattr(scenario_kind, "town", lambda name: None)
+    monkeypatch.setattr(scenario_kind, "town_version", lambda graph: "0")
     values = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"], "repetitions": 2}
     return Driving().plan(DrivingSuite(**(values | changes)), check=False)
 
@@ -133,7 +134,7 @@ def test_a_changed_system_or_town_is_another_cell(monkeypatch: pytest.MonkeyPatc
         for town in "12":
             monkeypatch.setattr(driving, "system_version", lambda name, v=version: v)
             plan = plan_of([scenario("a")], monkeypatch)
-            monkeypatch.setattr(driving, "town_version", lambda graph, v=town: v)
+            monkeypatch.setattr(scenario_kind, "town_version", lambda graph, v=town: v)
             found.add(Driving().plan(plan.suite, check=False).cells[0].key)
     assert len(found) == 4
 

@@ -210,7 +210,6 @@ def search(
     requested = 0
     while requested < budget:
         batch_size = min(batch, budget - requested)
-        requested += batch_size
         proposals = [list(base_proposals) for base_proposals in generator.ask(batch_size)]
         if len(proposals) != len(bases) or any(len(base_proposals) > batch_size for base_proposals in proposals):
             raise ConfigError(
@@ -219,6 +218,8 @@ def search(
             )
         if not any(proposals):
             break
+        # A generator may want fewer at once than the batch has room for; that costs none of its budget.
+        requested += max(map(len, proposals))
         # A resumed search replays known outcomes, so the generator reaches the same state.
         batch_outcomes = [
             list(known[base_index][len(collected[base_index]) : len(collected[base_index]) + len(base_proposals)])

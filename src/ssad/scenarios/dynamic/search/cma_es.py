@@ -41,13 +41,15 @@ class CmaEs(BoxSearch):
         self._known: list[list[tuple[F64, float]]] = [[] for _ in self.boxes]
 
     def points(self, index: int, count: int) -> F64:
-        """Draw from the current distribution."""
-        return np.array([self._search[index].ask() for _ in range(count)])
+        """Draw from the current distribution, at most what its generation still needs."""
+        # Points of an older distribution would count as the next one's, and mislead its update.
+        missing = POPULATION - len(self._known[index])
+        return np.array([self._search[index].ask() for _ in range(min(count, missing))])
 
     def learn(self, index: int, points: F64, danger: F64) -> None:
-        """Update the distribution for every 8 outcomes; the search minimises negative danger."""
+        """Update the distribution once its 8 outcomes are there; the search minimises negative danger."""
         pending = self._known[index]
         pending += zip(points, (-danger).tolist(), strict=True)
-        while len(pending) >= POPULATION:
-            self._search[index].tell(pending[:POPULATION])
-            del pending[:POPULATION]
+        if len(pending) == POPULATION:
+            self._search[index].tell(pending)
+            self._known[index] = []

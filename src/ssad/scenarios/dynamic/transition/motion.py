@@ -145,14 +145,16 @@ class MotionSearch(ABC):
             self._worst[base_index][agent] = max([self._worst[base_index].get(agent, -np.inf), *dangers])
             pending = self._told[base_index][agent]
             pending += zip(points, (-value for value in dangers), strict=True)
-            while len(pending) >= POPULATION:
-                self._search[base_index][agent].tell(pending[:POPULATION])
-                del pending[:POPULATION]
+            if len(pending) == POPULATION:
+                self._search[base_index][agent].tell(pending)
+                self._told[base_index][agent] = []
 
     def _next(self, base: int, count: int) -> tuple[int, F64]:
         untried = [agent for agent in self._agents[base] if agent not in self._worst[base]]
         agent = untried[0] if untried else max(self._worst[base], key=lambda candidate: self._worst[base][candidate])
-        return agent, np.array([self._search[base][agent].ask() for _ in range(count)])
+        # At most what the generation still needs: points of an older distribution would mislead the next update.
+        missing = POPULATION - len(self._told[base][agent])
+        return agent, np.array([self._search[base][agent].ask() for _ in range(min(count, missing))])
 
     def _proposal(self, k: int, agent: int, point: F64) -> Proposal:
         base = self.bases[k]
