@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from ssad.core.source import source_files, source_version
+from ssad.experiments.driving.kind import Driving
+from ssad.experiments.perception.shifts.kind import Detection
 
 Write = Callable[[Mapping[str, str]], None]
 
@@ -113,7 +115,7 @@ def test_a_package_is_followed_from_its_own_place(write: Write) -> None:
 
 def test_the_source_of_a_cell_is_found() -> None:
     """What a drive depends on is in its key, and a report or a detector is not."""
-    found = set(source_files("ssad.experiments.driving.kind"))
+    found = set(source_files(Driving.__module__, without=Driving.presentation()))
     for name in (
         "core.safeio",
         "core.registry",
@@ -124,22 +126,23 @@ def test_the_source_of_a_cell_is_found() -> None:
         "world.kernels.traffic",
         "drivers.careful.grade",
         "drivers.builtin",
-        "roads.router",
+        "world.roads.router",
         "scenarios.dynamic.knowledge.lane_changing",
         "scenarios.dynamic.knowledge._placing",
     ):
         assert f"ssad.{name}" in found, name
     assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)
-    seen = set(source_files("ssad.experiments.perception.shifts.kind"))
+    assert "ssad.experiments.driving.page" not in found
+    seen = set(source_files(Detection.__module__, without=Detection.presentation()))
     for name in (
         "detectors.mono3d.nms",
         "detectors.yolo.decode",
         "scenarios.static.shifts.kernels.falling",
         "metrics.detection_match",
-        "evaluation.scene_boxes",
-        "recording.drives",
-        "camera.kernels.shade",
-        "assets.street.palette",
+        "experiments.perception.scene_boxes",
+        "recorders.drives",
+        "rendering.camera.kernels.shade",
+        "rendering.street.palette",
         "datasets.nuscenes.truth",
     ):
         assert f"ssad.{name}" in seen, name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,13 +16,13 @@ _IMPORT = re.compile(r"^[ \t]*import[ \t]+([^\n]+)", re.MULTILINE)
 _STRING = re.compile(r"""["'](\w+(?:\.\w+)+)(?::\w+)?["']""")  # "package.module:object", as tables of names have it
 
 
-def source_version(module: str) -> str:
+def source_version(module: str, *, without: Sequence[str] = ()) -> str:
     """Return 12 hex digits over the source files that a module depends on; see `source_files`."""
-    files = source_files(module)
+    files = source_files(module, without=without)
     return digest("source", *[part for name, path in sorted(files.items()) for part in (name, _scan(path)[0])])[:12]
 
 
-def source_files(module: str) -> dict[str, Path]:
+def source_files(module: str, *, without: Sequence[str] = ()) -> dict[str, Path]:
     """Return the files of a module and of its dependencies, by module name.
 
     Imports are followed anywhere in the text, and so are strings that name a module (for a package, all its
@@ -30,6 +31,7 @@ def source_files(module: str) -> dict[str, Path]:
 
     Args:
         module: Full name. Nothing is imported.
+        without: Modules and packages that are not followed, by their full names.
 
     Returns:
         Module name -> its file; empty where the module has no source.
@@ -44,7 +46,8 @@ def source_files(module: str) -> dict[str, Path]:
     while queue:
         name = queue.pop()
         path = _file(base, name)
-        if name in files_by_module or path is None:
+        skipped = any(name == excluded or name.startswith(f"{excluded}.") for excluded in without)
+        if skipped or name in files_by_module or path is None:
             continue
         files_by_module[name] = path
         parent = name.rpartition(".")[0]

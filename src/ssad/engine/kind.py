@@ -310,7 +310,16 @@ class Kind(ABC):
     @cached_property
     def code(self) -> str:
         """12 hex digits over the source that results depend on, as it was when first asked for."""
-        return source_version(type(self).__module__)
+        return source_version(type(self).__module__, without=self.presentation())
+
+    @classmethod
+    def presentation(cls) -> tuple[str, ...]:
+        """Modules that present results and decide none: the report, and `page` and `verdict` beside the kind.
+
+        They are no part of a cell's key, so that a page can be changed without running anything again.
+        """
+        package = cls.__module__.rpartition(".")[0]
+        return ("ssad.report", *(f"{package}.{name}" for name in ("page", "verdict") if package))
 
     def make_cell(
         self, name: str, system: str, seed: int, fields: Mapping[str, Any], spec: Mapping[str, Any], *inputs: object
