@@ -1,6 +1,6 @@
-"""SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?
+"""SSAD: a testbed for the safety and robustness of autonomous-driving systems in safety-critical scenarios.
 
-The public names. They are loaded on first use, so that `import ssad` costs nothing.
+The public names are loaded on first use, so that `import ssad` costs nothing.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ __all__ = ["__version__", *_WHERE]  # noqa: PLE0604
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for."""
+    """Import a public name on first use."""
     if name in _WHERE:
         return getattr(import_module(f"ssad.{_WHERE[name]}"), name)
     raise AttributeError(f"module 'ssad' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
-    """Name what is public."""
+    """Return the public names."""
     return sorted(__all__)

@@ -1,4 +1,4 @@
-"""`python -m ssad` is `ssad`."""
+"""Entry point of `python -m ssad`."""
 
 from ssad.cli import main
 

@@ -1,4 +1,4 @@
-"""Python's door to runs: `ssad.run` runs a suite, `ssad.load_results` reads a results folder."""
+"""Python interface of runs: `ssad.run` runs a suite, `ssad.load_results` reads a results folder."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ PICTURES = (".jpg", ".jpeg", ".png")
 
 
 class Results(Run):
-    """A run: its records, and what they were made from.
+    """A run: its records and their inputs.
 
-    Printed, it is the table that `ssad run` ends with. Besides what follows it has `folder`, `header` (run.json),
-    `suite`, `kind`, `title`, `names` (key of a cell -> its name), `failures` (the rows of failed cells), `episodes`
-    (key -> line of episodes.jsonl), `planned` (number of cells of the whole run) and `command` (runs it again).
+    Printed, it is the table that `ssad run` ends with. It also has `folder`, `header` (run.json), `suite`, `kind`,
+    `title`, `names` (key of a cell -> its name), `failures` (the rows of failed cells), `episodes` (key -> line of
+    episodes.jsonl), `planned` (number of cells of the complete run) and `command` (runs it again).
     """
 
     @property
     def rows(self) -> tuple[Mapping[str, Any], ...]:
-        """The lines of results.jsonl in the order of the suite, one a cell."""
+        """Lines of results.jsonl in the order of the suite, one a cell."""
         return self.lines
 
     @property
     def report(self) -> Path:
-        """Where report.html is; it is written if it is missing.
+        """Path of report.html; it is written if it is missing.
 
         Raises:
             StoreError: It cannot be written.
@@ -50,13 +50,13 @@ class Results(Run):
 
     @property
     def pictures(self) -> tuple[Path, ...]:
-        """The pictures of the run: those of its report, and those that its cells name."""
-        named = [path for row in self.rows for path in (row.get("hashes") or {}) if path.endswith(PICTURES)]
-        beside = sorted(p for p in (self.folder / "pictures").glob("*") if p.suffix in PICTURES)
-        return tuple(dict.fromkeys([*beside, *(self.folder / path for path in named)]))
+        """Pictures of the run: those of its report, and those that its cells name."""
+        cell_paths = [path for row in self.rows for path in (row.get("hashes") or {}) if path.endswith(PICTURES)]
+        report_paths = sorted(p for p in (self.folder / "pictures").glob("*") if p.suffix in PICTURES)
+        return tuple(dict.fromkeys([*report_paths, *(self.folder / path for path in cell_paths)]))
 
     def find(self, cell: str) -> Mapping[str, Any]:
-        """The row of one cell.
+        """Return the row of one cell.
 
         Args:
             cell: Its key, the start of it, or its name, such as "blind/StraightObstacle/00".
@@ -71,7 +71,7 @@ class Results(Run):
         return find_cell(cells, cell).spec
 
     def trace(self, cell: str) -> EpisodeTrace:
-        """The trace of one drive: where everybody was at each step.
+        """Return the trace of one drive: the states of all agents at each step.
 
         Args:
             cell: As for `find`.
@@ -88,13 +88,13 @@ class Results(Run):
         return load_trace(self.folder / path)
 
     def traces(self) -> Iterator[EpisodeTrace]:
-        """The traces of all drives, in the order of the rows; each is read when it is asked for."""
+        """Yield the traces of all drives, in the order of the rows; each is read on demand."""
         for row in self.rows:
             if "trace" in (row.get("artefacts") or {}):
                 yield self.trace(row["key"])
 
     def frame(self) -> pandas.DataFrame:
-        """The rows as a pandas DataFrame: one line a cell, its fields and then its metrics as columns.
+        """Return the rows as a pandas DataFrame: one line a cell, its fields and then its metrics as columns.
 
         Raises:
             ConfigError: pandas is not installed.
@@ -107,23 +107,23 @@ class Results(Run):
         nested = ("metrics", "spec", "versions", "artefacts", "hashes", "intervals", "replicates", "witness")
         table = []
         for row in self.rows:
-            own = {key: value for key, value in row.items() if key not in nested}
-            table.append({"cell": names.get(row["key"], row["key"])} | own | dict(row.get("metrics") or {}))
+            cell_fields = {key: value for key, value in row.items() if key not in nested}
+            table.append({"cell": names.get(row["key"], row["key"])} | cell_fields | dict(row.get("metrics") or {}))
         return pandas.DataFrame(table)
 
     def __str__(self) -> str:
-        """The table that `ssad run` ends with."""
-        out = io.StringIO()
-        Console(file=out, width=120).print(summary(self.folder))
-        return out.getvalue().rstrip()
+        """Return the table that `ssad run` ends with."""
+        buffer = io.StringIO()
+        Console(file=buffer, width=120).print(summary(self.folder))
+        return buffer.getvalue().rstrip()
 
     def __repr__(self) -> str:
-        """One line: what was run, and how it went."""
-        failed = f", {len(self.failures)} failed" if self.failures else ""
-        return f"<Results {self.folder}: {len(self.rows)} of {self.planned} cells of kind {self.kind}{failed}>"
+        """Return folder, number of cells, kind and failures in one line."""
+        failure_text = f", {len(self.failures)} failed" if self.failures else ""
+        return f"<Results {self.folder}: {len(self.rows)} of {self.planned} cells of kind {self.kind}{failure_text}>"
 
     def _repr_html_(self) -> str:
-        """The table, for notebooks."""
+        """Return the table for notebooks."""
         console = Console(file=io.StringIO(), record=True, width=120)
         console.print(summary(self.folder))
         return console.export_html(inline_styles=True, code_format="<pre style='line-height:1.25'>{code}</pre>")
@@ -136,7 +136,7 @@ def load_results(folder: Path | str) -> Results:
         folder: Results folder.
 
     Returns:
-        What is in it.
+        The results.
 
     Raises:
         StoreError: The folder holds no run with results.
@@ -154,7 +154,7 @@ def make_plan(suite: str | Path, settings: Sequence[str] | Mapping[str, Any] = (
         device: auto, cpu or cuda.
 
     Returns:
-        The cells of the run and all that they depend on.
+        The cells of the run and all of their inputs.
 
     Raises:
         SSADError: The suite, a setting or the device is wrong.
@@ -164,8 +164,8 @@ def make_plan(suite: str | Path, settings: Sequence[str] | Mapping[str, Any] = (
 
     if isinstance(settings, Mapping):
         settings = [f"{key}={json.dumps(value, default=str)}" for key, value in settings.items()]
-    chosen = load_suite(str(suite), settings)
-    return kind_of(chosen.kind).plan(chosen, device=pick_device(device))
+    resolved_suite = load_suite(str(suite), settings)
+    return kind_of(resolved_suite.kind).plan(resolved_suite, device=pick_device(device))
 
 
 def run_plan(
@@ -176,12 +176,12 @@ def run_plan(
     retry: bool = False,
     only: Mapping[str, Sequence[str]] | None = None,
 ) -> Results:
-    """Run what is missing of a plan, and write its report.
+    """Run the missing cells of a plan, and write its report.
 
     Args:
-        plan: What to run.
+        plan: The plan.
         folder: Results folder.
-        resources: What the run may use.
+        resources: Resources of the run.
         retry: Whether failed cells are run again.
         only: As `only` of `run`.
 
@@ -212,7 +212,7 @@ def run(
     only: Mapping[str, Sequence[str]] | None = None,
     quiet: bool = False,
 ) -> Results:
-    """Run a suite and write its report, as the command `ssad run` does; called again, it goes on where it stopped.
+    """Run a suite and write its report, as the command `ssad run` does; called again, it continues.
 
     Args:
         suite: Name of a suite (`ssad list suites`), or YAML file.
@@ -225,7 +225,7 @@ def run(
         retry: Whether failed cells are run again.
         only: Run a slice: the cells whose fields, or name, have one of these values, such as
             {"perturbation": ["none", "fog"]}; "none,fog" means the same. Slices add up in the folder.
-        quiet: Whether nothing is said about progress.
+        quiet: Whether progress is hidden.
 
     Returns:
         The results. A failed cell raises nothing: see `Results.failures`.

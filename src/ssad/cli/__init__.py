@@ -1,4 +1,4 @@
-"""The command line: one short function per command. Heavy imports are inside them, so that --help is quick."""
+"""Command line: one short function per command. Heavy imports are inside them, so that --help is quick."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ imports.command("drive")(exchange.import_drive)
 
 
 def show_version(asked: bool) -> None:
-    """Print the version and stop, if it is asked for."""
+    """Print the version and exit, if requested."""
     if asked:
         print(f"ssad {__version__}")
         raise typer.Exit
@@ -74,26 +74,31 @@ def list_names(
     what: Annotated[str | None, typer.Argument(metavar="[WHAT]", help=f"One of: {', '.join(LISTS)}.")] = None,
 ) -> None:
     """List the names that other commands and suites accept. Without WHAT: all lists, scenarios by set and class."""
-    chosen = ALIASES.get(what or "", what)
-    if chosen is not None and chosen not in LISTS:
+    selected_list = ALIASES.get(what or "", what)
+    if selected_list is not None and selected_list not in LISTS:
         raise unknown_name("list", str(what), [*LISTS, *ALIASES])
-    for name, rows in LISTS.items():
-        if chosen not in (None, name):
+    for name, make_rows in LISTS.items():
+        if selected_list not in (None, name):
             continue
         try:
-            found = rows()
+            # A list may need packages of an extra; the other lists are still shown.
+            entries = make_rows()
         except ModuleNotFoundError as error:
             missing = missing_extra(error, f"the list of {name}")
-            if missing is None or chosen is not None:
+            if missing is None or selected_list is not None:
                 raise (missing or error) from None
-            found = {str(missing): ""}
-        if chosen is None:
+            entries = {str(missing): ""}
+        if selected_list is None:
             print(f"{name}:")
-            if name == "scenarios":  # hundreds of single ones: only when asked for
-                found = {key: text for key, text in found.items() if text.startswith(("set", "class"))}
-        width = max((len(key) for key in found), default=0)
-        for key, text in found.items():
-            print(f"{'  ' if chosen is None else ''}{key:<{width}}  {text}".rstrip())
+            if name == "scenarios":  # hundreds of single scenarios: only if this list is selected
+                entries = {
+                    entry: description
+                    for entry, description in entries.items()
+                    if description.startswith(("set", "class"))
+                }
+        width = max((len(entry) for entry in entries), default=0)
+        for entry, description in entries.items():
+            print(f"{'  ' if selected_list is None else ''}{entry:<{width}}  {description}".rstrip())
 
 
 @app.command()
@@ -109,7 +114,7 @@ def doctor() -> None:
 
 
 def give_up_output() -> None:
-    """Let what is still to be printed go nowhere, so that the end of the process raises nothing."""
+    """Discard all further output, so that the end of the process raises nothing."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -120,16 +125,19 @@ def main() -> None:
     usage_error: Any = typer.BadParameter.__mro__[1]
     try:
         code = app(standalone_mode=False)
+        # Flush here: a closed pipe would otherwise raise while the interpreter exits, outside this handler.
         sys.stdout.flush()
-    except (BrokenPipeError, SystemExit) as end:  # `ssad ... | head`: who reads has read enough
-        if isinstance(end, SystemExit) and type(sys.stdout).__name__ != "PacifyFlushWrapper":  # typer's, after EPIPE
+    except (BrokenPipeError, SystemExit) as exit_error:  # `ssad ... | head`: the reader has closed the pipe
+        if (
+            isinstance(exit_error, SystemExit) and type(sys.stdout).__name__ != "PacifyFlushWrapper"
+        ):  # typer's, after EPIPE
             raise
         give_up_output()
         sys.exit(141)  # as a program that the signal ends
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else "standard output: " if error.errno == ENOSPC else ""
+        subject = f"{error.filename}: " if error.filename else "standard output: " if error.errno == ENOSPC else ""
         give_up_output()
-        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
+        print(f"error: {subject}{error.strerror or error}", file=sys.stderr)
         sys.exit(2)
     except SSADError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -147,7 +155,9 @@ def main() -> None:
             print(error.format_message())
             sys.exit(2)
         command = error.ctx.command_path if error.ctx is not None else "ssad"
-        told = " ".join(error.format_message().replace("Value error, ", "").split())  # pydantic's, and choices in lines
-        print(f"error: {told} (see: {command} --help)", file=sys.stderr)
+        message = " ".join(
+            error.format_message().replace("Value error, ", "").split()
+        )  # pydantic's, and choices in lines
+        print(f"error: {message} (see: {command} --help)", file=sys.stderr)
         sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)

@@ -65,7 +65,7 @@ def shift(
     if verify:
         raise typer.Exit(verify_folder(out))
     names = [name.strip() for name in shifts.split(",") if name.strip()]
-    listed = [name.strip() for name in scenes.split(",") if name.strip()]
+    scene_names = [name.strip() for name in scenes.split(",") if name.strip()]
     if source.is_file() or out.suffix.lower() in (".png", ".jpg", ".jpeg"):
         write_contact_sheets(
             source,
@@ -73,7 +73,7 @@ def shift(
             version=version,
             channel=channel,
             split=split,
-            scenes=listed,
+            scenes=scene_names,
             boxes=box or [],
             severity=severity,
             seed=seed,
@@ -81,8 +81,8 @@ def shift(
         )
         return
     if source.is_dir() and not any(source.glob("*/sample_data.json")):
-        for name, value in (("--version", version), ("--split", split), ("--scenes", scenes)):
-            if value:
+        for name, option_value in (("--version", version), ("--split", split), ("--scenes", scenes)):
+            if option_value:
                 raise ConfigError(f"{name} is for a nuScenes folder; {source} has no VERSION/sample_data.json")
         raise typer.Exit(
             shift_picture_folder(
@@ -102,7 +102,7 @@ def shift(
         severity=severity,
         version=version,
         split=split,
-        scenes=listed,
+        scenes=scene_names,
         workers=workers,
         ray=ray,
         settings={
@@ -137,13 +137,13 @@ def score(
     from ssad.cli.shift import checked
     from ssad.datasets.nuscenes.score import score_results, tables, write_summary
 
-    found = score_results(
+    scores = score_results(
         results, dataroot=dataroot, version=version, split=split, replicates=intervals, check=checked(dataroot)
     )
     if file is not None:
-        write_summary(file, found)
+        write_summary(file, scores)
     console = Console()
-    for table in tables(found):
+    for table in tables(scores):
         console.print(table)
 
 
@@ -190,22 +190,23 @@ def record(
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
 
-    idle = ("scenes", "seconds", "width", "sweeps") if clips is not None else ("images", "target")
-    for name in idle:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE":
+    unusable = ("scenes", "seconds", "width", "sweeps") if clips is not None else ("images", "target")
+    for name in unusable:
+        # Defaults cannot be told from given values otherwise: only an option on the command line is an error.
+        parameter_source = context.get_parameter_source(name)
+        if parameter_source is not None and parameter_source.name == "COMMANDLINE":
             raise ConfigError(f"--{name} {'cannot be used' if clips is not None else 'can only be used'} with --clips")
     unit = "parts" if clips is not None else "scenes"
-    with Live("record", 1, 0, console=Console(stderr=True), unit=unit) as live:
+    with Live("record", 1, 0, console=Console(stderr=True), unit=unit) as progress:
         if clips is not None:
             from ssad.recorders.target_images import record_clips
             from ssad.recorders.target_recording import Clips, pair_images
             from ssad.rendering.target import parse_target
 
-            pairs = pair_images(names(towns), names(images))
-            todo = Clips(
+            images_per_town = pair_images(names(towns), names(images))
+            target_recording = Clips(
                 out,
-                pairs,
+                images_per_town,
                 names(held_out),
                 clips,  # type: ignore[arg-type]
                 target=parse_target(target) if target else None,
@@ -213,10 +214,13 @@ def record(
                 device=pick_device(device),
                 streets=streets,
             )
-            record_clips(todo, workers=workers, ray=ray, progress=live.show)
-            text = f"{out}: {sum(count for _, count in pairs)} images, annotations train.json, test.json and all.json"
+            record_clips(target_recording, workers=workers, ray=ray, progress=progress.show)
+            message = (
+                f"{out}: {sum(image_count for _, image_count in images_per_town)} images, "
+                f"annotations train.json, test.json and all.json"
+            )
         else:
-            drives = Recording(
+            recording = Recording(
                 out,
                 names(towns),
                 names(held_out),
@@ -228,6 +232,8 @@ def record(
                 device=pick_device(device),
                 streets=streets,
             )
-            record_nuscenes(drives, workers=workers, ray=ray, progress=live.show)
-            text = f"{out}: {len(drives.towns) * scenes} scenes, version {drives.version}, splits train and val"
-    print(text)
+            record_nuscenes(recording, workers=workers, ray=ray, progress=progress.show)
+            message = (
+                f"{out}: {len(recording.towns) * scenes} scenes, version {recording.version}, splits train and val"
+            )
+    print(message)

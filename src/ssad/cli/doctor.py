@@ -1,4 +1,4 @@
-"""`ssad doctor`: what works on this machine, what is missing, and how to get it."""
+"""`ssad doctor`: working and missing parts of this machine, and how to install the missing ones."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Finding:
     """One check.
 
     Attributes:
-        what: What is checked.
+        what: Name of the check.
         state: ok, missing (some commands need it) or broken (no suite runs without it).
-        detail: What was found.
+        detail: Result in words.
     """
 
     what: str
@@ -33,9 +33,11 @@ class Finding:
 
 def examine() -> Iterator[Finding]:
     """Run the checks one by one."""
-    ok = (3, 11) <= sys.version_info < (3, 14)
+    supported = (3, 11) <= sys.version_info < (3, 14)
     python = f"{platform.python_version()} on {platform.platform(terse=True)}"
-    yield Finding("python", "ok" if ok else "broken", python if ok else f"{python}; SSAD needs 3.11 to 3.13")
+    yield Finding(
+        "python", "ok" if supported else "broken", python if supported else f"{python}; SSAD needs 3.11 to 3.13"
+    )
     yield Finding("ssad", "ok", ssad.__version__)
     yield _machine()
     yield from _warp()
@@ -49,11 +51,11 @@ def examine() -> Iterator[Finding]:
 def _machine() -> Finding:
     from ssad.core.machine import default_workers
 
-    cores, memory = default_workers(), "memory unknown"
+    core_count, memory = default_workers(), "memory unknown"
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         memory = f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB memory"
-    disk = shutil.disk_usage(os.getcwd()).free / 2**30
-    return Finding("machine", "ok", f"{cores} cores, {memory}, {disk:.1f} GiB free here")
+    free_disk = shutil.disk_usage(os.getcwd()).free / 2**30
+    return Finding("machine", "ok", f"{core_count} cores, {memory}, {free_disk:.1f} GiB free here")
 
 
 def _warp() -> Iterator[Finding]:
@@ -63,12 +65,15 @@ def _warp() -> Iterator[Finding]:
         from ssad.core.machine import quiet_warp
 
         quiet_warp()
-        devices = ", ".join(f"{d.alias} ({d.name})" for d in warp.get_devices())
+        devices = ", ".join(f"{device.alias} ({device.name})" for device in warp.get_devices())
         yield Finding("warp", "ok", f"{version('warp-lang')}: {devices}")
-        gpu = warp.is_cuda_available()
+        has_cuda = warp.is_cuda_available()
         yield Finding(
-            "cuda", "ok" if gpu else "missing", "usable" if gpu else "no CUDA device found; everything runs on the CPU"
+            "cuda",
+            "ok" if has_cuda else "missing",
+            "usable" if has_cuda else "no CUDA device found; everything runs on the CPU",
         )
+    # Whatever an import of a broken installation raises is a finding, not a crash of the doctor.
     except Exception as error:
         yield Finding("warp", "broken", f"{type(error).__name__}: {error}; reinstall the package warp-lang")
 
@@ -79,20 +84,21 @@ def _torch() -> Finding:
         import torchvision
     except Exception as error:
         missing = isinstance(error, ModuleNotFoundError) and error.name in EXTRA_OF
-        why = "not installed" if missing else f"{type(error).__name__}: {' '.join(str(error).split())}"
+        problem = "not installed" if missing else f"{type(error).__name__}: {' '.join(str(error).split())}"
         return Finding(
             "perception",
             "missing",
-            f"{why}; detectors, attacks and learned drivers need torch and torchvision; {install_extra('perception')}",
+            f"{problem}; detectors, attacks and learned drivers need torch and torchvision; "
+            f"{install_extra('perception')}",
         )
-    gpu = "with CUDA" if torch.cuda.is_available() else "on the CPU"
-    return Finding("perception", "ok", f"torch {torch.__version__} {gpu}, torchvision {torchvision.__version__}")
+    processor = "with CUDA" if torch.cuda.is_available() else "on the CPU"
+    return Finding("perception", "ok", f"torch {torch.__version__} {processor}, torchvision {torchvision.__version__}")
 
 
 def _carla() -> Finding:
     if importlib.util.find_spec("carla") is None:
-        why = f"`ssad import map` needs it, and Python 3.11 or 3.12; {install_extra('carla')}"
-        return Finding("carla", "missing", why)
+        problem = f"`ssad import map` needs it, and Python 3.11 or 3.12; {install_extra('carla')}"
+        return Finding("carla", "missing", problem)
     try:
         return Finding("carla", "ok", f"{version('carla')}: `ssad import map` works")
     except PackageNotFoundError:
@@ -101,10 +107,11 @@ def _carla() -> Finding:
 
 def _home() -> Finding:
     folder = home()
-    near = folder
-    while not near.exists() and near != near.parent:
-        near = near.parent
-    if not os.access(near, os.W_OK):
+    existing_folder = folder
+    # The folder is created on first use: the nearest existing parent decides whether it can be.
+    while not existing_folder.exists() and existing_folder != existing_folder.parent:
+        existing_folder = existing_folder.parent
+    if not os.access(existing_folder, os.W_OK):
         return Finding(
             "SSAD_HOME",
             "missing",
@@ -116,20 +123,20 @@ def _home() -> Finding:
 def _towns() -> Iterator[Finding]:
     from ssad.world.roads import load_town, town_names
 
-    good, bad = [], []
-    for name, where in town_names().items():
+    readable, problems = [], []
+    for name, origin in town_names().items():
         try:
             load_town(name)
-            good.append(name)
+            readable.append(name)
         except (SSADError, OSError) as error:
-            built_in = where == "built-in"
-            bad.append(Finding(f"town {name}", "broken" if built_in else "missing", str(error)))
-    yield Finding("towns", "ok" if good else "broken", ", ".join(good) or "no town can be read; reinstall SSAD")
-    yield from bad
+            built_in = origin == "built-in"
+            problems.append(Finding(f"town {name}", "broken" if built_in else "missing", str(error)))
+    yield Finding("towns", "ok" if readable else "broken", ", ".join(readable) or "no town can be read; reinstall SSAD")
+    yield from problems
 
 
 def _suites() -> Finding:
     from ssad.experiments.suites import suite_files
 
-    found = ", ".join(suite_files())
-    return Finding("suites", "ok" if found else "broken", found or "no suite found; reinstall SSAD")
+    suite_names = ", ".join(suite_files())
+    return Finding("suites", "ok" if suite_names else "broken", suite_names or "no suite found; reinstall SSAD")

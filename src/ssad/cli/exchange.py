@@ -1,4 +1,4 @@
-"""`ssad import` of maps, routes and drives, and `ssad export` of what a run has made."""
+"""`ssad import` of maps, routes and drives, and `ssad export` of artefacts of a run."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def export_texture(
     from ssad.experiments.perception.physical.kind import shown_by
     from ssad.experiments.perception.physical.target_export import export_shown_texture
 
-    attacks, found = shown_by(folder, cell)
-    for path in export_shown_texture(attacks, found.spec, out, name=found.name, dots=dots):
+    attacks, attack_cell = shown_by(folder, cell)
+    for path in export_shown_texture(attacks, attack_cell.spec, out, name=attack_cell.name, dots=dots):
         print(path)
 
 
@@ -39,12 +39,12 @@ def export_light(
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
-    """Write the settings of a light attack, and what a projector shows."""
+    """Write the settings of a light attack, and the picture that a projector shows."""
     from ssad.experiments.perception.physical.kind import shown_by
     from ssad.experiments.perception.physical.target_export import export_shown_light
 
-    attacks, found = shown_by(folder, cell)
-    for path in export_shown_light(attacks, found.spec, out, name=found.name):
+    attacks, attack_cell = shown_by(folder, cell)
+    for path in export_shown_light(attacks, attack_cell.spec, out, name=attack_cell.name):
         print(path)
 
 
@@ -59,11 +59,11 @@ def import_map(
     from ssad.world.roads import import_map as bake
     from ssad.world.roads import load_town, town_names
 
-    label = name or file.stem
-    if town_names().get(label) == "built-in":
-        raise ConfigError(f"'{label}' is a built-in town; choose another name with --name")
-    path = bake(file, label, home())
-    print(f"town {label}: {len(load_town(label).kind)} lanes, written to {path}")
+    town_name = name or file.stem
+    if town_names().get(town_name) == "built-in":
+        raise ConfigError(f"'{town_name}' is a built-in town; choose another name with --name")
+    path = bake(file, town_name, home())
+    print(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}")
 
 
 def import_routes(
@@ -79,22 +79,23 @@ def import_routes(
     from ssad.scenarios.dynamic.sets import BUILT_IN_SETS
     from ssad.world.roads import is_town
 
-    label = name or folder.resolve().name
-    if not label.replace("-", "").replace("_", "").isalnum():
-        raise ConfigError(f"'{label}' cannot name a set; choose a name of letters, digits, _ and - with --name")
-    if label in BUILT_IN_SETS:
-        raise ConfigError(f"'{label}' is a built-in set; choose another name with --name")
+    set_name = name or folder.resolve().name
+    if not set_name.replace("-", "").replace("_", "").isalnum():
+        raise ConfigError(f"'{set_name}' cannot name a set; choose a name of letters, digits, _ and - with --name")
+    if set_name in BUILT_IN_SETS:
+        raise ConfigError(f"'{set_name}' is a built-in set; choose another name with --name")
     left_out: list[str] = []
     scenarios = read(folder, left_out=left_out)
-    path = home() / "scenarios" / f"{label}.yaml"
+    path = home() / "scenarios" / f"{set_name}.yaml"
     save_scenarios(path, scenarios)
-    towns = sorted({s.town for s in scenarios})
-    print(f"set {label}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}")
+    towns = sorted({scenario.town for scenario in scenarios})
+    print(f"set {set_name}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}")
     if missing := [town for town in towns if not is_town(town)]:
         print(f"before they can run, import the maps of {', '.join(missing)}: ssad import map FILE.xodr")
-    counted = Counter(re.sub(r": entry \d+", "", line) for line in left_out)
-    for line, count in counted.items():
-        print(f"left out or not read: {line}{f' ({count} entries)' if count > 1 else ''}")
+    # Entries of one file with the same problem are reported in one line.
+    reasons = Counter(re.sub(r": entry \d+", "", reason) for reason in left_out)
+    for reason, count in reasons.items():
+        print(f"left out or not read: {reason}{f' ({count} entries)' if count > 1 else ''}")
 
 
 def import_drive(
@@ -122,16 +123,16 @@ def import_drive(
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a scenario file ends in .yaml")
     with NuScenes(root, version) as data:
-        drive = scenario_of_drive(data, scene, town=out.stem, map_name=on)
-    town = drive.scenario.town
-    if not drive.known:
+        imported_drive = scenario_of_drive(data, scene, town=out.stem, map_name=on)
+    town = imported_drive.scenario.town
+    if not imported_drive.known:
         if town_names().get(town) == "built-in":
             raise ConfigError(f"'{town}' is a built-in town; choose another name for {out}")
-        save_graph(drive.graph, out.with_suffix(".npz"))
+        save_graph(imported_drive.graph, out.with_suffix(".npz"))
         store(out.with_suffix(".npz"), town, home())
-    save_scenarios(out, drive.scenario)
-    left = ", ".join(f"{count} {what}" for what, count in sorted(drive.left_out.items()))
+    save_scenarios(out, imported_drive.scenario)
+    omissions = ", ".join(f"{count} {category}" for category, count in sorted(imported_drive.left_out.items()))
     print(
-        f"scenario {drive.scenario.name}: {len(drive.scenario.actors)} actors in {town}"
-        f"{f'; left out: {left}' if left else ''}; written to {out}"
+        f"scenario {imported_drive.scenario.name}: {len(imported_drive.scenario.actors)} actors in {town}"
+        f"{f'; left out: {omissions}' if omissions else ''}; written to {out}"
     )

@@ -1,4 +1,4 @@
-"""What `ssad list` shows: names that other commands and suites accept, each list looked up when it is asked for."""
+"""Lists of `ssad list`: names that other commands and suites accept, looked up on demand."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ def _scenario_list() -> dict[str, str]:
     from ssad.scenarios.dynamic.sets import SHIPPED
 
     sets = {name: load_scenarios(name) for name in set_names()}
-    rows = {name: f"set of {len(found)} scenarios" for name, found in sets.items()}
-    shipped = Counter(s.type for name in SHIPPED for s in sets[name])
-    for name, where in names("scenario", SCENARIOS).items():
-        rows[name] = f"class with {shipped[name]} scenarios" if name in SCENARIOS else f"class of your own: {where}"
-    return rows | {s.name: f"{s.type} in {s.town}" for found in sets.values() for s in found}
+    rows = {name: f"set of {len(scenarios)} scenarios" for name, scenarios in sets.items()}
+    counts = Counter(scenario.type for name in SHIPPED for scenario in sets[name])
+    for name, origin in names("scenario", SCENARIOS).items():
+        rows[name] = f"class with {counts[name]} scenarios" if name in SCENARIOS else f"class of your own: {origin}"
+    return rows | {
+        scenario.name: f"{scenario.type} in {scenario.town}" for scenarios in sets.values() for scenario in scenarios
+    }
 
 
 def _system_list() -> dict[str, str]:
@@ -52,8 +54,8 @@ def _suite_list() -> dict[str, str]:
 def _shift_list() -> dict[str, str]:
     from ssad.scenarios.static.shifts.spec import EXTRA, KNOWN
 
-    beside = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
-    return {name: f"{family}: {text}{beside.get(name, '')}" for name, (family, text) in KNOWN.items()}
+    remarks = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
+    return {name: f"{family}: {description}{remarks.get(name, '')}" for name, (family, description) in KNOWN.items()}
 
 
 def _attack_list() -> dict[str, str]:
@@ -61,7 +63,7 @@ def _attack_list() -> dict[str, str]:
     from ssad.scenarios.static.physical import default_carrier, physical_names
     from ssad.scenarios.static.physical.lights import LIGHTS
 
-    def about(name: str, where: str) -> str:
+    def describe(name: str, where: str) -> str:
         if name not in ATTACKS:
             return where
         if needs(name):
@@ -69,7 +71,7 @@ def _attack_list() -> dict[str, str]:
         access = make_attack(name).access
         return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
 
-    rows = {name: about(name, where) for name, where in attack_names().items()}
+    rows = {name: describe(name, origin) for name, origin in attack_names().items()}
     rows |= {name: f"physical: trains a {default_carrier(name)} (docs/physical.md)" for name in physical_names()}
     rows |= dict.fromkeys(LIGHTS, "physical: light on a target, not on its paint (docs/physical.md)")
     return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
@@ -78,23 +80,23 @@ def _attack_list() -> dict[str, str]:
 def _generator_list() -> dict[str, str]:
     from ssad.scenarios.dynamic.generate import generator_list
 
-    more = {
+    templates = {
         "scenic:FILE.scenic": "samples of a Scenic program (docs/interchange.md)",
         "module:object": "a generator of your own (docs/generators.md)",
     }
-    return generator_list() | more
+    return generator_list() | templates
 
 
 def _detector_list() -> dict[str, str]:
     from ssad.detectors import SHIPPED, detector_names
 
-    def about(name: str, where: str) -> str:
+    def describe(name: str, where: str) -> str:
         if where.startswith("ssad."):
             kind = "3D" if "fcos3d" in name or "pgd" in name else "2D"
             return f"{kind}, weights shipped" if (SHIPPED / f"{name}.json").is_file() else f"{kind}, no weights shipped"
         return where
 
-    rows = {name: about(name, where) for name, where in detector_names().items()}
+    rows = {name: describe(name, origin) for name, origin in detector_names().items()}
     return rows | {"module:object": "a detector of your own (docs/detectors.md)"}
 
 
@@ -103,10 +105,10 @@ def _recipe_list() -> dict[str, str]:
     from ssad.training.reinforcement import LEARNINGS
 
     detectors = {
-        name: f"{r.detector}: {r.epochs} epochs, batch {r.batch}, {r.optimizer}, lr {r.lr:g}"
-        for name, r in RECIPES.items()
+        name: f"{recipe.detector}: {recipe.epochs} epochs, batch {recipe.batch}, {recipe.optimizer}, lr {recipe.lr:g}"
+        for name, recipe in RECIPES.items()
     }
-    return detectors | {name: f"driver: {r.steps:,} steps, lr {r.lr:g}" for name, r in LEARNINGS.items()}
+    return detectors | {name: f"driver: {recipe.steps:,} steps, lr {recipe.lr:g}" for name, recipe in LEARNINGS.items()}
 
 
 LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {

@@ -51,15 +51,17 @@ def detect(
         raise ConfigError(
             f"{directory}: no nuScenes folder (no VERSION/sample_data.json in it); name its pictures instead"
         )
-    idle = {"--focal": focal} if folders else {"--version": version, "--split": split}
-    for name, value in idle.items():
+    unusable = {"--focal": focal} if folders else {"--version": version, "--split": split}
+    for name, value in unusable.items():
         if value is not None:
             raise ConfigError(f"{name} cannot be used with {'a nuScenes folder' if folders else 'pictures'}")
-    where = pick_device(device)
-    made = make_detector(detector or ("fcos3d-light" if folders else "yolov5n"), weights=weights, device=where)
+    compute_device = pick_device(device)
+    network = make_detector(
+        detector or ("fcos3d-light" if folders else "yolov5n"), weights=weights, device=compute_device
+    )
     if not folders:
-        for one in detect_pictures(made, sources, out, threshold=threshold, focal=focal, device=where):
-            print(f"{one.path}: {one.count} boxes{''.join(f'; {note}' for note in one.notes)}")
+        for picture in detect_pictures(network, sources, out, threshold=threshold, focal=focal, device=compute_device):
+            print(f"{picture.path}: {picture.count} boxes{''.join(f'; {note}' for note in picture.notes)}")
         print(f"boxes: {out / 'detections.json'}")
         return
     from ssad.datasets.nuscenes.reader import NuScenes
@@ -67,9 +69,9 @@ def detect(
 
     root = folders[0]
     manifest = "clean" if read_manifest(root) is None else manifest_digest(root)
-    with NuScenes(root, version) as data, Live("detect", 1, 0, console=Console(stderr=True), unit="scenes") as live:
+    with NuScenes(root, version) as data, Live("detect", 1, 0, console=Console(stderr=True), unit="scenes") as progress:
         path, samples, boxes = detect_dataset(
-            made, data, out, split=split, manifest=manifest, device=where, progress=live.show
+            network, data, out, split=split, manifest=manifest, device=compute_device, progress=progress.show
         )
         version = data.version
     print(f"{path}: {boxes} boxes in {samples} samples")
@@ -95,6 +97,6 @@ def show(
     names = [name.strip() for name in scenes.split(",") if name.strip()]
     with NuScenes(root, version) as data:
         check_scenes(data, names)
-        with Live("show", 1, 0, console=Console(stderr=True), unit="scenes") as live:
-            page = write_page(data, out, scenes=names, moments=samples, progress=live.show)
+        with Live("show", 1, 0, console=Console(stderr=True), unit="scenes") as progress:
+            page = write_page(data, out, scenes=names, moments=samples, progress=progress.show)
     print(f"page: {page}")

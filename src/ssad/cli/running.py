@@ -1,4 +1,4 @@
-"""`ssad run` and what looks at a run: report, compare, replay."""
+"""`ssad run`, and the commands that read a run: report, compare, replay."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def run(
         from ssad.cli.forecast import forecast
         from ssad.engine.run import slice_of
 
-        part = replace(plan, cells=tuple(slice_of(plan, _wanted(only or []))))
-        for line in forecast(part, folder, Resources(workers, ray, plan.device), sample=sample):
+        sliced_plan = replace(plan, cells=tuple(slice_of(plan, _wanted(only or []))))
+        for line in forecast(sliced_plan, folder, Resources(workers, ray, plan.device), sample=sample):
             print(line)
         return
     try:
@@ -88,27 +88,27 @@ def run(
         raise typer.Exit(130) from None
     console = Console()
     console.print(summary(folder))
-    failed = results.failures
-    for row in failed[:5]:
+    failures = results.failures
+    for row in failures[:5]:
         name = results.names[row["key"]]
         console.print(f"{row['status']}: {name}: {row['reason']}", markup=False, soft_wrap=True)
-    if len(failed) > 5:
-        console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
-    if failed:
+    if len(failures) > 5:
+        console.print(f"... and {len(failures) - 5} more: see {folder / 'results.jsonl'}", markup=False)
+    if failures:
         console.print("to run the failed cells again, repeat the command with --retry")
     report(folder)
-    raise typer.Exit(1 if failed else 0)
+    raise typer.Exit(1 if failures else 0)
 
 
 def _wanted(texts: list[str]) -> dict[str, list[str]]:
-    """What is said of each field, of texts "field=value,value"."""
-    found: dict[str, list[str]] = {}
+    """Return the values by field, of texts "field=value,value"."""
+    selections: dict[str, list[str]] = {}
     for text in texts:
-        name, sign, values = text.partition("=")
-        if not name or not sign or not values:
+        name, separator, values = text.partition("=")
+        if not name or not separator or not values:
             raise ConfigError(f"--only {text}: expected FIELD=VALUE,..., such as perturbation=none,fog")
-        found.setdefault(name, []).append(values)
-    return found
+        selections.setdefault(name, []).append(values)
+    return selections
 
 
 def report(folder: Dir) -> None:
@@ -140,16 +140,18 @@ def compare(
     from ssad.report.compare import write_comparison
     from ssad.report.terminal import comparison_table
 
-    page, found = write_comparison(folders, out or folders[-1])
+    page, comparisons = write_comparison(folders, out or folders[-1])
     console = Console()
-    for each in found:
-        console.print(comparison_table(each.table))
-        told = f"{each.both} cells in both, {each.equal} of them equal to the last digit"
-        console.print(told + f"; {len(each.verdicts)} with another outcome" if each.verdicts else told)
-        for sentence in each.findings:
+    for comparison in comparisons:
+        console.print(comparison_table(comparison.table))
+        message = f"{comparison.both} cells in both, {comparison.equal} of them equal to the last digit"
+        console.print(
+            message + f"; {len(comparison.verdicts)} with another outcome" if comparison.verdicts else message
+        )
+        for sentence in comparison.findings:
             console.print(sentence, markup=False, highlight=False)
-        if each.left_out:
-            console.print(f"left out, since only one of them has it: {', '.join(each.left_out)}", markup=False)
+        if comparison.left_out:
+            console.print(f"left out, since only one of them has it: {', '.join(comparison.left_out)}", markup=False)
     print(f"comparison: {page}")
 
 
@@ -184,42 +186,48 @@ def replay(
     from ssad.report import write_video
     from ssad.report.video import frames, save_frames
 
-    film_of = _film(wear, wearer, detector)  # whatever is wrong with it ends before the drive
+    write_film = _film(wear, wearer, detector)  # wrong options fail before the drive, which takes minutes
     if mcap:
         from ssad.experiments.gap.mcap import need_mcap, write_mcap
 
         need_mcap()
-    found = run_again(folder, cell)
-    target = make_folder(out or folder / "replays") / found.cell.key
-    verdict = f"differs: {found.difference}" if found.difference else "identical"
-    if found.trace is None or found.graph is None:
-        print(f"{found.cell.key} {found.cell.name}: {found.compared}, {verdict}")
+    replayed = run_again(folder, cell)
+    stem = make_folder(out or folder / "replays") / replayed.cell.key
+    verdict = f"differs: {replayed.difference}" if replayed.difference else "identical"
+    if replayed.trace is None or replayed.graph is None:
+        print(f"{replayed.cell.key} {replayed.cell.name}: {replayed.compared}, {verdict}")
         if mcap:
-            raise ConfigError(f"--mcap: cell {found.cell.key} ({found.cell.name}) is no drive")
-        if film_of is not None:
-            raise ConfigError(f"--wear: cell {found.cell.key} ({found.cell.name}) is no drive")
-        if found.picture is not None:
-            save_picture(target.with_suffix(".jpg"), found.picture())
-            print(f"picture: {target.with_suffix('.jpg')}")
-        raise typer.Exit(1 if found.difference else 0)
-    save_trace(target.with_suffix(".npz"), found.trace)
-    film = write_video(found.trace, found.graph, target.with_suffix(f".{video.value}"))
-    print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
-    print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
-    if found.film is not None:
-        shown, dt = found.film
-        print(f"camera: {save_frames(shown, target.with_suffix(f'.camera.{video.value}'), dt=dt)}")
+            raise ConfigError(f"--mcap: cell {replayed.cell.key} ({replayed.cell.name}) is no drive")
+        if write_film is not None:
+            raise ConfigError(f"--wear: cell {replayed.cell.key} ({replayed.cell.name}) is no drive")
+        if replayed.picture is not None:
+            save_picture(stem.with_suffix(".jpg"), replayed.picture())
+            print(f"picture: {stem.with_suffix('.jpg')}")
+        raise typer.Exit(1 if replayed.difference else 0)
+    save_trace(stem.with_suffix(".npz"), replayed.trace)
+    video_path = write_video(replayed.trace, replayed.graph, stem.with_suffix(f".{video.value}"))
+    print(f"{replayed.cell.key} {replayed.cell.name}: {len(replayed.trace.accel) - 1} steps, {verdict}")
+    print(f"video: {video_path}\ntrace: {stem.with_suffix('.npz')}")
+    if replayed.film is not None:
+        camera_frames, dt = replayed.film
+        print(f"camera: {save_frames(camera_frames, stem.with_suffix(f'.camera.{video.value}'), dt=dt)}")
     if mcap:
-        above = frames(found.trace, found.graph, size=(640, 360))
-        path = write_mcap(target.with_suffix(".mcap"), found.trace, found.graph, seen=found.seen, above=above)
+        top_view_frames = frames(replayed.trace, replayed.graph, size=(640, 360))
+        path = write_mcap(
+            stem.with_suffix(".mcap"), replayed.trace, replayed.graph, seen=replayed.seen, above=top_view_frames
+        )
         print(f"mcap: {path}")
-    if film_of is not None:
-        print(f"film: {film_of(found.trace, found.graph, target.with_suffix(f'.worn.{video.value}'))}")
-    raise typer.Exit(1 if found.difference else 0)
+    if write_film is not None:
+        print(f"film: {write_film(replayed.trace, replayed.graph, stem.with_suffix(f'.worn.{video.value}'))}")
+    raise typer.Exit(1 if replayed.difference else 0)
 
 
 def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any, Any, Path], Path] | None:
-    """What films a drive with an attack in it; None without one. SSADError: no such attack or detector."""
+    """Return a function that films a drive with an attack in it; None without an attack.
+
+    Raises:
+        SSADError: There is no such attack or detector.
+    """
     if wear is None:
         if wearer is not None:
             raise ConfigError("--wearer says who is attacked: give --wear ATTACK as well")
@@ -231,16 +239,16 @@ def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any
     from ssad.report.video import save_frames
     from ssad.scenarios.static.physical.lights.export import load_worn
 
-    worn, judge = load_worn(wear), None if detector == "none" else make_detector(detector)
-    kind = worn.live(1).kind
+    attack, film_detector = load_worn(wear), None if detector == "none" else make_detector(detector)
+    target_kind = attack.live(1).kind
 
     def film(trace: Any, graph: Any, path: Path) -> Path:
-        agent = first_ahead(trace, kind) if wearer is None else wearer
+        agent = first_ahead(trace, target_kind) if wearer is None else wearer
         if agent is None:
-            whom = kind.name.lower()
+            whom = target_kind.name.lower()
             raise ConfigError(f"{trace.key}: no {whom} is ahead of the ego at any time; name the agent with --wearer")
-        weather = at_hour(DAY, worn.hour)
-        shown = attacked_frames(trace, graph, worn.live(agent), detector=judge, every=2, weather=weather)
+        weather = at_hour(DAY, attack.hour)
+        shown = attacked_frames(trace, graph, attack.live(agent), detector=film_detector, every=2, weather=weather)
         return save_frames(shown, path, dt=2 * trace.dt)
 
     return film

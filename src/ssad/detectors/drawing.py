@@ -1,4 +1,4 @@
-"""Boxes of detectors, drawn into images."""
+"""Drawing of detections into images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ TRUE, FOUND = (255, 255, 255), (255, 170, 30)
 
 
 def draw_flat(canvas: U8, boxes: torch.Tensor, scale: float, *, colour: tuple[int, int, int], width: int) -> None:
-    """2D boxes."""
+    """Draw 2D boxes into an image."""
+    # OpenCV takes fixed-point coordinates: 3 fractional bits are eighths of a pixel.
     for box in np.rint(boxes.cpu().double().numpy() * scale * 8).astype(int).tolist():
         cv2.rectangle(canvas, tuple(box[:2]), tuple(box[2:]), colour, width, cv2.LINE_AA, 3)
 
@@ -26,36 +27,39 @@ def draw_flat(canvas: U8, boxes: torch.Tensor, scale: float, *, colour: tuple[in
 def draw_solids(
     canvas: U8, solid: Solids | None, intrinsic: F64, scale: float, *, colour: tuple[int, int, int], width: int
 ) -> None:
-    """Edges of boxes that lie before the camera."""
+    """Draw the edges of 3D boxes in front of the camera into an image."""
     if solid is None or not len(solid.yaw):
         return
-    points = corners(solid.centre.double(), solid.size_lhw.double(), solid.yaw.double()).cpu().numpy()
-    draw_edges(canvas, points, intrinsic, scale, colour=colour, width=width)
+    corner_points = corners(solid.centre.double(), solid.size_lhw.double(), solid.yaw.double()).cpu().numpy()
+    draw_edges(canvas, corner_points, intrinsic, scale, colour=colour, width=width)
 
 
 def clear_detections(detector: Detector, image: Tensor, intrinsic: Tensor | None) -> Detections:
     """Return the detections in an image [1, 3, H, W] whose scores are high enough to be drawn."""
     camera = None if intrinsic is None or detector.task == "2d" else intrinsic[None].to(image)
-    (found,) = detector.predict(image, camera, threshold=LEAST[detector.task])
-    return found
+    (detections,) = detector.predict(image, camera, threshold=LEAST[detector.task])
+    return detections
 
 
 @torch.no_grad()
 def marked(detector: Detector, image: Tensor, intrinsic: Tensor | None = None) -> U8:
-    """A picture with the boxes that a detector finds, RGB [H, W, 3].
+    """Return an image with the detected boxes, RGB [H, W, 3].
 
     Args:
-        detector: Whose boxes are drawn.
-        image: [1, 3, H, W] in 0 to 1, where the detector is.
+        detector: Detector of the boxes.
+        image: [1, 3, H, W] in 0 to 1, on the detector's device.
         intrinsic: Camera matrix [3, 3], for a 3D detector.
     """
-    found = clear_detections(detector, image, intrinsic)
+    detections = clear_detections(detector, image, intrinsic)
     picture = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
-    for box, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
-        low, high = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
-        cv2.rectangle(picture, low, high, FOUND, 2, cv2.LINE_AA)
+    for box, label, score in zip(
+        detections.box.tolist(), detections.label.tolist(), detections.score.tolist(), strict=True
+    ):
+        top_left, bottom_right = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
+        cv2.rectangle(picture, top_left, bottom_right, FOUND, 2, cv2.LINE_AA)
         text = f"{detector.classes[label]} {score:.2f}"
-        place = (low[0], max(low[1] - 4, 12))
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)
+        text_position = (top_left[0], max(top_left[1] - 4, 12))
+        # A dark outline first, so that the text is readable on any background.
+        cv2.putText(picture, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.putText(picture, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)
     return picture

@@ -1,4 +1,4 @@
-"""The command that runs a suite again."""
+"""Command that runs a suite again."""
 
 from __future__ import annotations
 
@@ -15,24 +15,28 @@ def command_of(suite: SuiteBase, device: str | None = None) -> str:
         suite: What was run.
         device: Where it ran; None: left out, and what is there is taken.
     """
-    values, short = suite.model_dump(mode="json"), suite.model_dump(mode="json", exclude_defaults=True)
+    values, set_values = suite.model_dump(mode="json"), suite.model_dump(mode="json", exclude_defaults=True)
     origin = suite._origin or suite.name
-    stock = values if suite._stock is None else suite._stock  # made without a file: nothing to compare with
+    defaults = values if suite._stock is None else suite._stock  # made without a file: nothing to compare with
     words = ["ssad", "run", origin] + (["--device", device] if device else [])
     for key, value in values.items():
-        if value != stock.get(key):
-            words += ["--set", f"{key}={_flow(short.get(key, value))}"]
+        if value != defaults.get(key):
+            words += ["--set", f"{key}={_flow(set_values.get(key, value))}"]
     return shlex.join(words)
 
 
 def _flow(value: Any) -> str:
-    """A value as YAML in one line; keys without a value are left out of mappings in lists."""
+    """Return a value as YAML in one line; keys without a value are left out of mappings in lists."""
     if isinstance(value, list):
-        return f"[{','.join(_flow(_given(one)) for one in value)}]"
+        return f"[{','.join(_flow(_given(entry)) for entry in value)}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_flow(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {_flow(entry)}" for key, entry in value.items()) + "}"
     return "null" if value is None else str(value)
 
 
 def _given(value: Any) -> Any:
-    return {key: one for key, one in value.items() if one not in (None, {}, [])} if isinstance(value, dict) else value
+    return (
+        {key: entry for key, entry in value.items() if entry not in (None, {}, [])}
+        if isinstance(value, dict)
+        else value
+    )

@@ -1,4 +1,4 @@
-"""What a kind of experiment brings, and the plan of a run.
+"""Interface of a kind of experiment, and the plan of a run.
 
 A kind says what its cells are (`plan`), how a worker executes some of them (`execute`), and which columns its records
 have. Everything else is the engine's: processes, time-outs, resume, retry, progress, the store, tables.
@@ -32,16 +32,17 @@ Names = schema.Names
 
 
 class SuiteBase(schema.Schema):
-    """What suites of every kind say.
+    """Keys that suites of every kind have.
 
     Attributes:
-        kind: the kind of experiment (`ssad list kinds`).
-        name: of the suite, and of the results folder if none is given.
-        title, description: what people read.
-        seed: root of all random numbers.
-        timeout_s: seconds that one cell may take.
-        chunk: cells that run as one batch, where they can (results do not depend on it).
-        reference: the published table that the report shows beside this one.
+        kind: Kind of experiment (`ssad list kinds`).
+        name: Name of the suite, and of the results folder if none is given.
+        title: Title of the report.
+        description: Text of the report.
+        seed: Root of all random numbers.
+        timeout_s: Seconds that one cell may take.
+        chunk: Cells that run as one batch, where they can (results do not depend on it).
+        reference: Published table that the report shows beside this one.
     """
 
     kind: str
@@ -56,13 +57,13 @@ class SuiteBase(schema.Schema):
     _stock: dict[str, Any] | None = PrivateAttr(default=None)  # the values of that file, before any `--set`
 
     def beside(self, path: Path) -> Self:
-        """The suite with the files that it names found: in the working folder, else beside the suite's own file."""
+        """Return the suite with its files resolved: in the working folder, else beside the suite's own file."""
         return self
 
 
 @dataclass(frozen=True)
 class Column:
-    """A metric of a kind's records: its name in them, what it is, its unit, and which way is better ("": neither)."""
+    """A metric of a kind's records: name, title, unit, and which way is better ("": neither)."""
 
     name: str
     title: str = ""
@@ -72,15 +73,15 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """One row of the results: the smallest thing that is run, kept, retried and counted.
+    """One row of the results: the smallest unit that is run, kept, retried and counted.
 
     Attributes:
-        key: hash of all that the result depends on; made by `make_cell`.
-        name: what people call it, such as "blind/StraightObstacle/00".
-        system: what is put to the test; cells of one system may run as one batch.
-        seed: its random numbers.
-        fields: columns of its record that tell it from other cells.
-        spec: plain data, all that a worker needs.
+        key: Hash of all that the result depends on; made by `make_cell`.
+        name: Readable name, such as "blind/StraightObstacle/00".
+        system: System under test; cells of one system may run as one batch.
+        seed: Seed of its random numbers.
+        fields: Columns of its record that tell it from other cells.
+        spec: Plain data, all that a worker needs.
     """
 
     key: str
@@ -93,16 +94,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that a run will do, known and checked before anything is written.
+    """All cells of a run, resolved and checked before anything is written.
 
     Attributes:
-        kind: the kind.
-        suite: the resolved suite.
+        kind: Kind of experiment.
+        suite: Resolved suite.
         device: cpu or cuda.
-        cells: in the order of the tables.
-        inputs: what the results depend on besides source and suite, by name: versions of systems, towns, weights, data.
-        versions: of what else decides results, beside those of the packages.
-        details: what else the kind's own methods want to know; not written.
+        cells: Cells in the order of the tables.
+        inputs: Inputs of the results besides source and suite, by name: versions of systems, towns, weights, data.
+        versions: Versions that decide results, beside those of the packages.
+        details: Further data for the kind's own methods; not written.
     """
 
     kind: Kind
@@ -116,7 +117,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Resources:
-    """What a run may use: processes of this machine (None: one a core) or a Ray cluster, a device, a place to talk."""
+    """Resources of a run: local processes (None: one a core) or a Ray cluster, a device, a console for progress."""
 
     workers: int | None = None
     ray: str | None = None
@@ -126,7 +127,7 @@ class Resources:
 
 @dataclass(frozen=True)
 class Job:
-    """What the workers of a run know besides the cells: the results folder, the device, and the kind's settings."""
+    """Data that the workers of a run share: the results folder, the device, and the kind's settings."""
 
     folder: Path
     device: str
@@ -139,13 +140,13 @@ class Replay:
 
     Attributes:
         cell: The cell.
-        difference: None if the result is equal to the bit, else where the two differ.
-        trace: What happened in the drive; None for a cell that is no drive.
-        graph: The town of the drive.
-        compared: What was compared, in words.
-        picture: Makes a picture of what the system was shown and found, clean and under the cell's condition.
-        film: Frames [H, W, 3] of what the driver saw, with the s from one to the next; None: there are none.
-        seen: What the driver saw, found and believed; None: it does not perceive.
+        difference: First difference from the record, in words; None: equal to the bit.
+        trace: Trace of the drive; None for a cell that is no drive.
+        graph: Town of the drive.
+        compared: Compared results, in words.
+        picture: Makes a picture of the system's input and output, clean and under the cell's condition.
+        film: Frames [H, W, 3] of the driver's camera, with the seconds between two of them; None: there are none.
+        seen: Perception of the driver: input, detections, belief; None: it does not perceive.
     """
 
     cell: Cell
@@ -159,19 +160,19 @@ class Replay:
 
 
 class CellError(SSADError):
-    """Why a cell has no result, in words for the record."""
+    """Reason why a cell has no result, in words for the record."""
 
 
 class Kind(ABC):
     """A kind of experiment. It has no state: workers get it by the name of its class.
 
     Attributes:
-        name: in suites (`kind: NAME`) and in run.json; the report looks for a section of that name.
-        suite: the schema of its suites.
-        columns: the metrics of its records.
-        factors: fields of a record that make a row of the default table, from coarse to fine.
-        patience: crashes and time-outs of one system after which its other cells are not tried any more (None: all
-            are tried); for systems of which one hanging call says all.
+        name: Name in suites (`kind: NAME`) and in run.json.
+        suite: Schema of its suites.
+        columns: Metrics of its records.
+        factors: Fields of a record that make a row of the default table, from coarse to fine.
+        patience: Crashes and time-outs of one system after which its other cells are skipped (None: all are tried);
+            for systems of which one hanging call predicts the others.
     """
 
     name: ClassVar[str]
@@ -181,11 +182,11 @@ class Kind(ABC):
     patience: ClassVar[int | None] = None
 
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Resolve a suite: by default, what `cells` says of it.
+        """Resolve a suite: by default, to the cells of `cells`.
 
         Args:
             suite: The suite.
-            device: Where its cells run.
+            device: Device of its cells.
             check: Whether to check all input, so that errors show up here and not in a record.
 
         Raises:
@@ -195,13 +196,13 @@ class Kind(ABC):
         return Plan(self, suite, device, tuple(self.cells(suite)), {})
 
     def cells(self, suite: Any) -> Iterable[Cell]:
-        """The cells of a suite; a kind brings this or `plan`."""
+        """Return the cells of a suite; a kind implements this or `plan`."""
         raise NotImplementedError
 
     def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
-        """In a worker: results of some cells by key; by default of one after another. What goes wrong raises.
+        """Return results of some cells by key, in a worker; by default of one after another. Failures raise.
 
-        Alone, a cell then fails with that reason; of several, each is run again alone.
+        A cell that fails alone keeps that reason; a batch that fails is run again cell by cell.
         """
         return {cell.key: self.result(cell, job) for cell in cells}
 
@@ -215,15 +216,15 @@ class Kind(ABC):
         raise NotImplementedError
 
     def start(self, job: Job) -> None:  # noqa: B027  nothing to do by default
-        """In a worker, once: what no cell's time-out shall pay for."""
+        """Initialise a worker, once, outside of the time-out of any cell."""
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """In the main process, before cells run: make data.
+        """Make data in the main process, before cells run.
 
         Args:
             plan: The cells of the run.
             folder: Results folder.
-            resources: What the run may use.
+            resources: Resources of the run.
             retry: Cells that failed before and are tried again.
 
         Returns:
@@ -232,11 +233,11 @@ class Kind(ABC):
         return {}
 
     def workers(self, plan: Plan, asked: int | None) -> int | None:
-        """How many may work at once.
+        """Return the number of workers that may run at once.
 
         Args:
             plan: The cells of the run.
-            asked: What the user wants; None: what the machine allows.
+            asked: Number that the user wants; None: as many as the machine allows.
 
         Returns:
             The same, or less.
@@ -244,45 +245,44 @@ class Kind(ABC):
         return asked
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
-        """Cells in groups that `execute` is given at once: alike, of one system, and fewer where workers would idle."""
+        """Return cells in batches for `execute`: of one system, alike, and fewer where workers would idle."""
         return grouped(cells, plan.suite.chunk, workers=workers, by=self.alike)
 
     def alike(self, cell: Cell) -> Hashable:
-        """Cells for which this is equal can run as one batch; they share a system."""
+        """Return a value that is equal for cells that can run as one batch; they share a system."""
         return cell.system
 
     def order(self, cell: Cell) -> float:
-        """Cells of a lower number run earlier."""
+        """Return the priority of a cell: lower numbers run earlier."""
         return 0.0
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """Work that cells of different systems can share and that is done before them.
+        """Return work that cells of different systems share and that is done before them.
 
         Args:
             cell: A cell that needs the work.
-            job: What the workers of the run know.
+            job: Data that the workers of the run share.
 
         Returns:
-            Name -> plain data; what already exists may be left out.
+            Name -> plain data; work that is already done may be left out.
         """
         return {}
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
-        """In a worker: do a piece of shared work for some systems, and leave its result in the folder.
+        """Do a piece of shared work for some systems, in a worker, and leave its result in the folder.
 
-        If this fails, only time is lost: `execute` must be able to do without it, and it is the failure of `execute`
-        that counts.
+        A failure costs only time: `execute` must be able to do without the piece, and its own failure counts.
 
         Args:
             name: Name of the piece.
             data: Its data; see `pieces`.
             systems: Systems to do it for.
-            job: What the workers of the run know.
+            job: Data that the workers of the run share.
         """
         raise CellError(f"the kind {self.name} names pieces of work, but not how they are made")
 
     def finish(self, plan: Plan, folder: Path) -> None:  # noqa: B027  nothing to do by default
-        """In the main process, when all cells have run: pictures for the report."""
+        """Write pictures for the report, in the main process, when all cells have run."""
 
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
         """Run a finished cell again, alone, and compare it with its record.
@@ -293,23 +293,23 @@ class Kind(ABC):
         raise ConfigError(f"{folder}: cells of kind '{self.name}' cannot be replayed")
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
-        """In the main process: the page of a run as HTML, and its tables; by default the columns by the factors.
+        """Return the page of a run as HTML, and its tables; by default the columns by the factors.
 
-        A kind of your own renders a template of its own with `ssad.report.pages.render`, or leaves this out.
+        A kind of your own renders its own template with `ssad.report.pages.render`, or leaves this out.
         """
         return default.section(run, verdict=self.verdict(run))
 
     def summary(self, run: Run) -> Table:
-        """Main table of a run, for the terminal and for pages that link to the run."""
+        """Return the main table of a run, for the terminal and for pages that link to the run."""
         return default.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences, the most important first; empty: none can be drawn."""
+        """Return the findings of a run in sentences, the most important first; empty: there are none."""
         return []
 
     @cached_property
     def code(self) -> str:
-        """12 hex digits over the source that results depend on, as it was when first asked for."""
+        """12 hex digits over the source that results depend on, as it was on first use."""
         return source_version(type(self).__module__, without=self.presentation())
 
     @classmethod
@@ -332,41 +332,47 @@ class Kind(ABC):
         if label != system:
             name = name.replace(system, label, 1)
             fields = {key: label if value == system else value for key, value in fields.items()}
-        described = safeio.parse_json(safeio.dump_json({"fields": dict(fields), "spec": dict(spec)}))
-        key = digest("cell", self.name, self.code, safeio.dump_json(described), system, seed, *inputs)
-        return Cell(key[:16], name, system, seed, described["fields"], described["spec"])
+        # Through JSON and back: the key is made of the values that the record will hold, tuples being lists.
+        plain_data = safeio.parse_json(safeio.dump_json({"fields": dict(fields), "spec": dict(spec)}))
+        key = digest("cell", self.name, self.code, safeio.dump_json(plain_data), system, seed, *inputs)
+        return Cell(key[:16], name, system, seed, plain_data["fields"], plain_data["spec"])
 
 
 def check_distinct(suite: SuiteBase, key: str, names: Sequence[object]) -> None:
-    """ConfigError: a name, or the label of two, appears twice under a key of a suite."""
-    called = [label_of(name) if isinstance(name, str) else name for name in names]
-    twice = next((name for name in called if called.count(name) > 1), None)
-    if twice is None:
+    """Raise ConfigError if a name, or the label of two, appears twice under a key of a suite."""
+    labels = [label_of(name) if isinstance(name, str) else name for name in names]
+    repeated = next((name for name in labels if labels.count(name) > 1), None)
+    if repeated is None:
         return
-    hint = f" ('{twice}'); tell two of a name apart by a label, {twice}@first" if key == "systems" else ""
+    hint = f" ('{repeated}'); tell two of a name apart by a label, {repeated}@first" if key == "systems" else ""
     raise ConfigError(f"suite {suite.name}: {key}: a name appears twice{hint}")
 
 
 def grouped(cells: Sequence[Cell], chunk: int, *, workers: int, by: Callable[[Cell], Hashable]) -> list[list[Cell]]:
     """Batches of cells with a value in common, of `chunk` at most, and smaller where cells are few for the workers."""
-    size = max(1, min(chunk, -(-len(cells) // workers)))
+    batch_size = max(1, min(chunk, -(-len(cells) // workers)))
     groups: dict[Hashable, list[Cell]] = {}
     for cell in cells:
         groups.setdefault(by(cell), []).append(cell)
-    return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
+    return [
+        group[start : start + batch_size] for group in groups.values() for start in range(0, len(group), batch_size)
+    ]
 
 
 def find_cell(cells: Sequence[Cell], text: str) -> Cell:
-    """The one cell whose key begins with `text`, or that is called `text` ("blind/StraightObstacle/00").
+    """Return the one cell whose key begins with `text`, or whose name is `text` ("blind/StraightObstacle/00").
 
     Raises:
-        ConfigError: there is none, or more than one.
+        ConfigError: There is none, or more than one.
     """
-    found = [c for c in cells if c.name == text] or [c for c in cells if text and c.key.startswith(text)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        shown = ", ".join(f"{c.key} ({c.name})" for c in found[:3])
-        raise ConfigError(f"'{text}' means {len(found)} cells: {shown} ...; give more of the key")
-    close = difflib.get_close_matches(text, [c.name for c in cells], n=3, cutoff=0.0)
-    raise ConfigError(f"no cell '{text}' in this run; closest: {', '.join(close)}")
+    # An exact name wins over a prefix of a key.
+    matches = [cell for cell in cells if cell.name == text] or [
+        cell for cell in cells if text and cell.key.startswith(text)
+    ]
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        examples = ", ".join(f"{cell.key} ({cell.name})" for cell in matches[:3])
+        raise ConfigError(f"'{text}' means {len(matches)} cells: {examples} ...; give more of the key")
+    suggestions = difflib.get_close_matches(text, [cell.name for cell in cells], n=3, cutoff=0.0)
+    raise ConfigError(f"no cell '{text}' in this run; closest: {', '.join(suggestions)}")

@@ -1,4 +1,4 @@
-"""`ssad replay`: run one cell again, alone, and compare every bit with what was recorded."""
+"""`ssad replay`: run one cell again, alone, and compare every bit with the record."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ssad.engine.store import RESULTS
 
 
 def replay_cell(plan: Plan, folder: str | Path, name: str) -> Replay:
-    """Run the cell that `name` means (key, unique start of it, or "system/scenario") once more.
+    """Run the cell that `name` denotes (key, unique start of it, or "system/scenario") once more.
 
     Raises:
-        StoreError: it was not recorded.
-        ConfigError: there is no such cell, or its kind has no replay.
+        StoreError: It was not recorded.
+        ConfigError: There is no such cell, or its kind has no replay.
     """
     cell = find_cell(plan.cells, name)
-    record = next((r for r in read_lines(Path(folder) / RESULTS) if r["key"] == cell.key), None)
+    record = next((line for line in read_lines(Path(folder) / RESULTS) if line["key"] == cell.key), None)
     if record is None:
         raise StoreError(f"{folder}: cell {cell.key} ({cell.name}) has not run yet; run the suite again first")
     if record["status"] != "ok":
@@ -31,13 +31,13 @@ def replay_cell(plan: Plan, folder: str | Path, name: str) -> Replay:
 
 
 def difference(recorded: Mapping[str, Any], result: Mapping[str, Any]) -> str | None:
-    """Where a result differs from the record, in words; None: nowhere."""
+    """Return the first difference between a result and its record, in words; None: there is none."""
     for part, value in result.items():
         if isinstance(value, dict):
-            old = recorded.get(part, {})
+            recorded_values = recorded.get(part, {})
             for name in value:
-                if value[name] != old.get(name):
-                    return f"{part}: {name} is {value[name]}, was {old.get(name)}"
+                if value[name] != recorded_values.get(name):
+                    return f"{part}: {name} is {value[name]}, was {recorded_values.get(name)}"
         elif value != recorded.get(part):
             return f"{part} is {value}, was {recorded.get(part)}"
     return None

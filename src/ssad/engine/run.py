@@ -1,4 +1,4 @@
-"""The engine: cells become records in a folder; run again to go on where it stopped. One way for every kind."""
+"""The engine of every kind: cells become records in a folder, and a repeated run continues where it stopped."""
 
 from __future__ import annotations
 
@@ -32,53 +32,58 @@ def run(
     retry: bool = False,
     only: Mapping[str, Sequence[str]] | None = None,
 ) -> list[dict[str, Any]]:
-    """Run what is missing (retry: and what failed) and return the records that there are, in the order of the plan.
+    """Run the missing cells (retry: and failed ones) and return all records, in the order of the plan.
 
     Args:
         plan: The whole run.
-        folder: Where its records are.
-        resources: What may be used.
+        folder: Folder of its records.
+        resources: Resources of the run.
         retry: Whether failed cells run again; of a slice, those that are in it.
         only: Run a slice: the cells whose fields, or name, have one of these values, as text.
 
     Raises:
-        ConfigError: no cell has such a value.
-        StoreError: the folder cannot be written, is in use, or holds another run.
-        SSADError: no worker can start, or data cannot be made.
+        ConfigError: No cell has such a value.
+        StoreError: The folder cannot be written, is in use, or holds another run.
+        SSADError: No worker can start, or data cannot be made.
     """
     resources = resources or Resources(device=plan.device)
-    chosen = slice_of(plan, only or {})  # a wrong name is told before there is a folder
-    header, out = run_json(plan), Path(folder).resolve()
-    with Store.open(folder, header, retry=[cell.key for cell in chosen] if retry else False) as store:
-        missing = sorted((c for c in chosen if c.key not in store.results), key=plan.kind.order)
+    selected_cells = slice_of(plan, only or {})  # a wrong name raises before a folder is made
+    header, results_folder = run_json(plan), Path(folder).resolve()
+    with Store.open(folder, header, retry=[cell.key for cell in selected_cells] if retry else False) as store:
+        missing = sorted((c for c in selected_cells if c.key not in store.results), key=plan.kind.order)
         if missing:
-            again = [cell for cell in missing if cell.key in store.retried]
-            settings = plan.kind.prepare(plan, out, resources, retry=again)
-            job = Job(out, plan.device, settings)
+            retried_cells = [cell for cell in missing if cell.key in store.retried]
+            settings = plan.kind.prepare(plan, results_folder, resources, retry=retried_cells)
+            job = Job(results_folder, plan.device, settings)
             _Schedule(plan, job, store, header["versions"], resources).work(missing)
         return [store.results[cell.key] for cell in plan.cells if cell.key in store.results]
 
 
 def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
-    """The cells whose fields, or name, have one of these values, as text.
+    """Return the cells whose fields, or name, have one of these values, as text.
 
-    A value "a,b" means a and b, unless a cell has that very value. ConfigError: no cell has such a field or value.
+    A value "a,b" means a and b, unless a cell has that very value.
+
+    Raises:
+        ConfigError: No cell has such a field or value.
     """
     rows = [{"name": cell.name} | {key: str(value) for key, value in cell.fields.items()} for cell in plan.cells]
-    chosen = list(zip(plan.cells, rows, strict=True))
+    selected = list(zip(plan.cells, rows, strict=True))
     for field, texts in only.items():
-        known = dict.fromkeys(row[field] for row in rows if field in row)
-        if not known:
+        field_values = dict.fromkeys(row[field] for row in rows if field in row)
+        if not field_values:
             raise unknown_name("field of cells", field, dict.fromkeys(key for row in rows for key in row))
-        wanted = [value for text in map(str, texts) for value in ([text] if text in known else text.split(","))]
-        for value in wanted:
-            if value not in known:
-                raise unknown_name(field, value.strip(), known)
-        chosen = [(cell, row) for cell, row in chosen if row.get(field) in wanted]
-    if not chosen:
-        asked = " and ".join(f"{field}={','.join(map(str, texts))}" for field, texts in only.items())
-        raise ConfigError(f"no cell has {asked} at once")
-    return [cell for cell, _ in chosen]
+        selected_values = [
+            value for text in map(str, texts) for value in ([text] if text in field_values else text.split(","))
+        ]
+        for value in selected_values:
+            if value not in field_values:
+                raise unknown_name(field, value.strip(), field_values)
+        selected = [(cell, row) for cell, row in selected if row.get(field) in selected_values]
+    if not selected:
+        condition = " and ".join(f"{field}={','.join(map(str, texts))}" for field, texts in only.items())
+        raise ConfigError(f"no cell has {condition} at once")
+    return [cell for cell, _ in selected]
 
 
 def run_json(plan: Plan) -> dict[str, Any]:
@@ -101,7 +106,7 @@ def run_json(plan: Plan) -> dict[str, Any]:
 
 
 class _Schedule:
-    """Who waits for what: shared pieces of work first, then cells in batches, one by one where a batch fails."""
+    """Dependencies of a run: shared pieces of work first, then cells in batches, one by one where a batch fails."""
 
     def __init__(self, plan: Plan, job: Job, store: Store, versions: Mapping[str, str], resources: Resources) -> None:
         self.plan, self.kind, self.job, self.store = plan, plan.kind, job, store
@@ -127,18 +132,20 @@ class _Schedule:
             for name in pieces:
                 self.users.setdefault((name, cell.system), []).append(cell)
                 self.sharing.setdefault(name, {})[cell.system] = None
-        ready = [cell for cell in missing if not self.left[cell.key]]
-        count = len(self.data) + len(missing)
-        place = self.resources
-        workers = self.kind.workers(self.plan, place.workers)
-        start = (_start, (self.kind, self.job))  # of every kind: importing it takes seconds that are no cell's
+        ready_cells = [cell for cell in missing if not self.left[cell.key]]
+        task_count = len(self.data) + len(missing)
+        resources = self.resources
+        workers = self.kind.workers(self.plan, resources.workers)
+        initialiser = (_start, (self.kind, self.job))  # of every kind: importing it takes seconds that are no cell's
         total = len(self.plan.cells) + len(self.data)
-        done = len(self.plan.cells) - len(missing)
+        finished_count = len(self.plan.cells) - len(missing)
         with (
-            open_pool(count, workers=workers, ray=place.ray, device=self.plan.device, start=start) as self.pool,
-            Live(self.plan.suite.name, total, done, console=place.console) as self.live,
+            open_pool(
+                task_count, workers=workers, ray=resources.ray, device=self.plan.device, start=initialiser
+            ) as self.pool,
+            Live(self.plan.suite.name, total, finished_count, console=resources.console) as self.live,
         ):
-            for batch in self.kind.batches(self.plan, ready, min(count, workers or default_workers())):
+            for batch in self.kind.batches(self.plan, ready_cells, min(task_count, workers or default_workers())):
                 self._add(batch)
             for name in self.data:
                 self._add_piece(name, list(self.sharing[name]))
@@ -151,15 +158,15 @@ class _Schedule:
 
     def _add(self, batch: list[Cell], *, first: bool = False) -> None:
         # a batch may take longer than one cell, but not the sum of all
-        limit = self.timeout * (1 if len(batch) == 1 else 2)
-        self.pool.add(Task(_execute, (self.kind, batch, self.job), limit, label=batch), first=first)
+        time_limit = self.timeout * (1 if len(batch) == 1 else 2)
+        self.pool.add(Task(_execute, (self.kind, batch, self.job), time_limit, label=batch), first=first)
 
     def _add_piece(self, name: str, systems: Sequence[str], *, first: bool = False) -> None:
         argument = (self.kind, name, self.data[name], tuple(systems), self.job)
         self.pool.add(Task(_make, argument, self.timeout, label=(name, tuple(systems))), first=first)
 
     def _piece_ended(self, name: str, systems: Sequence[str], outcome: Outcome) -> None:
-        """Lets go the cells that waited; a piece that failed for several systems is done again for each alone."""
+        """Release the cells that waited; a piece that failed for several systems is done again for each alone."""
         if outcome.status != "ok" and len(systems) > 1:
             for system in systems:
                 if system in self.alone:
@@ -174,12 +181,13 @@ class _Schedule:
             self._blame(systems[0], outcome)
 
     def _release(self, name: str, system: str, seconds: float = 0.0) -> None:
-        waiting = self.users.pop((name, system), [])
+        waiting_cells = self.users.pop((name, system), [])
         self.sharing[name].pop(system, None)
         if not self.sharing[name]:
             self.live.advance(True)
-        for cell in waiting:
-            self.shared[cell.key] = self.shared.get(cell.key, 0.0) + seconds / len(waiting)
+        # The cells that used a shared piece carry its seconds in equal parts.
+        for cell in waiting_cells:
+            self.shared[cell.key] = self.shared.get(cell.key, 0.0) + seconds / len(waiting_cells)
             self.left[cell.key].discard(name)
             if self.left[cell.key]:
                 continue
@@ -205,19 +213,19 @@ class _Schedule:
             self._blame(batch[0].system, outcome)
 
     def _share_no_more(self, system: str) -> None:
-        """A system failed alone: its cells do without shared pieces from now on."""
+        """Exclude a system that failed alone from shared pieces: its cells do without them from now on."""
         if system in self.alone:
             return
         self.alone.add(system)
         for task in self.pool.drop(lambda task: isinstance(task.label, tuple) and system in task.label[1]):
             name, systems = task.label
-            others = [one for one in systems if one != system]
-            if others:
-                self._add_piece(name, others)
+            remaining_systems = [other for other in systems if other != system]
+            if remaining_systems:
+                self._add_piece(name, remaining_systems)
             self._release(name, system)
 
     def _blame(self, system: str, outcome: Outcome) -> None:
-        """A system has hung or died alone; after some times it is given up."""
+        """Count a system's time-outs and crashes; after `patience` of them, give it up."""
         if self.kind.patience is None or outcome.status not in ("timeout", "crashed"):
             return
         self.trouble[system] += 1
@@ -229,15 +237,20 @@ class _Schedule:
 
     def _give_up(self, cell: Cell) -> None:
         outcome = self.given_up[cell.system]
-        why = f"not tried after {self.kind.patience} others of {cell.system} ended like this: {outcome.reason}"
-        self._record(cell, outcome.status, why, {}, 0.0)
+        reason = f"not tried after {self.kind.patience} others of {cell.system} ended like this: {outcome.reason}"
+        self._record(cell, outcome.status, reason, {}, 0.0)
 
     def _record(self, cell: Cell, status: str, reason: str, result: dict[str, Any], seconds: float) -> None:
-        """A line for results.jsonl, and one for episodes.jsonl when the kind has one."""
-        common: dict[str, Any] = {"key": cell.key, "suite": self.plan.suite.name, **cell.fields, "seed": cell.seed}
+        """Append a line to results.jsonl, and one to episodes.jsonl if the kind has one."""
+        shared_fields: dict[str, Any] = {
+            "key": cell.key,
+            "suite": self.plan.suite.name,
+            **cell.fields,
+            "seed": cell.seed,
+        }
         episode = result.pop("episode", None)
         record = (
-            common
+            shared_fields
             | {
                 "status": status,
                 "reason": reason,
@@ -250,7 +263,7 @@ class _Schedule:
             }
             | result
         )
-        self.store.append(record, None if episode is None else common | episode)
+        self.store.append(record, None if episode is None else shared_fields | episode)
         self.live.advance(status == "ok")
 
 
@@ -265,12 +278,12 @@ def _make(argument: tuple[Kind, str, Any, Sequence[str], Job]) -> None:
 
 
 def _execute(argument: tuple[Kind, list[Cell], Job]) -> dict[str, Mapping[str, Any]]:
-    """Results of a batch, checked to be what a store can keep, with the hashes of their artefacts."""
+    """Return the results of a batch, checked to be plain data, with the hashes of their artefacts."""
     kind, batch, job = argument
     results = kind.execute(batch, job)
     if set(results) != {cell.key for cell in batch}:
         raise CellError(f"the kind {kind.name} answered for other cells")
-    checked: dict[str, Mapping[str, Any]] = {}
+    checked_results: dict[str, Mapping[str, Any]] = {}
     for key, result in results.items():
         try:
             safeio.dump_json(dict(result))
@@ -281,17 +294,17 @@ def _execute(argument: tuple[Kind, list[Cell], Job]) -> dict[str, Mapping[str, A
             for value in result.get("artefacts", {}).values()
             for path in ([value] if isinstance(value, str) else value)
         ]
-        checked[key] = {**result, "hashes": hash_artefacts(job.folder, paths)}
-    return checked
+        checked_results[key] = {**result, "hashes": hash_artefacts(job.folder, paths)}
+    return checked_results
 
 
 def hash_artefacts(folder: Path, paths: Iterable[str]) -> dict[str, str]:
-    """Path below the folder -> 32 hex digits of BLAKE2b, of files and of all files in folders."""
-    found = {}
+    """Return path below the folder -> 32 hex digits of BLAKE2b, of files and of all files in folders."""
+    hashes = {}
     for path in (folder / name for name in paths):
-        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-            if file.is_file():
-                data = safeio.read_bytes(file, limit=MOST)
-                name = os.path.relpath(file, folder)
-                found[name] = hashlib.blake2b(data, digest_size=16).hexdigest()
-    return found
+        for artefact in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if artefact.is_file():
+                content = safeio.read_bytes(artefact, limit=MOST)
+                name = os.path.relpath(artefact, folder)
+                hashes[name] = hashlib.blake2b(content, digest_size=16).hexdigest()
+    return hashes

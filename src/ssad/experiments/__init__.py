@@ -1,4 +1,4 @@
 """Kinds of experiments, a folder each.
 
-A folder holds what one kind consists of: suite schema, cells, columns, page, verdict.
+A folder holds all parts of one kind: suite schema, cells, columns, page, verdict.
 """

@@ -1,4 +1,4 @@
-"""Runs on disk, with what their kind knows of them: the plan, one cell again, the report, the terminal's table."""
+"""Runs on disk with the methods of their kind: the plan, a cell run again, the report, the terminal's table."""
 
 from __future__ import annotations
 
@@ -21,19 +21,26 @@ from ssad.report.terminal import terminal_table
 
 
 def read_plan(folder: str | Path) -> Plan:
-    """The plan of a folder that holds a run. ConfigError when code or inputs have changed since."""
+    """Return the plan of a folder that holds a run.
+
+    Raises:
+        ConfigError: Code or inputs have changed since.
+    """
     header = read_run(folder)
     try:
         kind = kind_of(str(header["suite"]["kind"]))
         suite, device = kind.suite.model_validate(header["suite"]), str(header["versions"]["device"])
     except (KeyError, TypeError, ValidationError) as error:
-        what = f"no key {error}" if isinstance(error, KeyError) else "its suite is of another version of SSAD"
-        raise StoreError(f"{folder}/run.json: not what ssad run writes: {what}; run the suite again") from None
+        problem = f"no key {error}" if isinstance(error, KeyError) else "its suite is of another version of SSAD"
+        raise StoreError(f"{folder}/run.json: not what ssad run writes: {problem}; run the suite again") from None
     plan = kind.plan(suite, device=device, check=False)
-    now = run_json(plan)
-    if now["identity"] != header["identity"]:
-        what = ", ".join(name for name in ("code", *plan.inputs) if now[name] != header.get(name)) or "scenarios"
-        raise ConfigError(f"{folder}: {what} changed since this run was made; run the suite again to compare")
+    current_header = run_json(plan)
+    if current_header["identity"] != header["identity"]:
+        problem = (
+            ", ".join(name for name in ("code", *plan.inputs) if current_header[name] != header.get(name))
+            or "scenarios"
+        )
+        raise ConfigError(f"{folder}: {problem} changed since this run was made; run the suite again to compare")
     return plan
 
 

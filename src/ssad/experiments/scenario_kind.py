@@ -30,21 +30,23 @@ from ssad.simulators.closed_loop import (
 
 
 class ScenarioSuite(SuiteBase):
-    """What suites say that drive scenarios.
+    """Keys of suites that drive scenarios.
 
     Attributes:
-        scenarios: what `load_scenarios` understands (sets, types, names, YAML files), or highway-env: that simulator's
+        scenarios: Arguments of `load_scenarios` (sets, types, names, YAML files), or highway-env: that simulator's
             intersection and highway.
     """
 
     scenarios: Names
 
     def beside(self, path: Path) -> Self:
-        """Scenario files are looked for in the working folder, then beside the suite."""
+        """Return the suite with its scenario files resolved: in the working folder, then beside the suite."""
 
         def find(ref: str) -> str:
-            near = path.parent / ref
-            return str(near) if ref.endswith((".yaml", ".yml")) and not Path(ref).exists() and near.exists() else ref
+            sibling = path.parent / ref
+            return (
+                str(sibling) if ref.endswith((".yaml", ".yml")) and not Path(ref).exists() and sibling.exists() else ref
+            )
 
         return self.model_copy(update={"scenarios": [find(ref) for ref in self.scenarios]})
 
@@ -59,7 +61,7 @@ class Described:
 
 
 class ScenarioKind(Kind):
-    """Cells are scenarios that a system drives."""
+    """Kind whose cells are scenarios that a system drives."""
 
     def scenario_cell(
         self,
@@ -72,27 +74,29 @@ class ScenarioKind(Kind):
         fields: Mapping[str, Any] | None = None,
         **spec: Any,
     ) -> Cell:
-        """A cell in which a system meets a scenario.
+        """Return a cell in which a system meets a scenario.
 
         Args:
-            suite: Of the cell.
+            suite: Suite of the cell.
             one: The scenario.
-            inputs: What the result depends on besides the scenario and the cell's own description.
+            inputs: Inputs of the result besides the scenario and the cell's own description.
             title: Name of the cell.
             system: Name of the system.
-            chance: What tells apart cells of a scenario that shall not meet the same chance.
+            chance: Parts of the seed: cells of a scenario with equal parts have equal random numbers.
             fields: Columns of the record besides system, group and cluster.
-            spec: What a worker needs besides scenario and system.
+            spec: Data for the worker besides scenario and system.
         """
-        kind, *others = chance
-        seed = seed32(kind, suite.seed, safeio.dump_json(one.data), *others)
+        kind, *seed_parts = chance
+        seed = seed32(kind, suite.seed, safeio.dump_json(one.data), *seed_parts)
         scenario = one.scenario
-        about = {"system": system, "group": scenario.group or scenario.type, "cluster": scenario.name}
-        told = {"scenario": one.data, "system": system, **spec}
-        return self.make_cell(title, system, seed, {**about, **(fields or {})}, told, *one.versions, *inputs)
+        identification = {"system": system, "group": scenario.group or scenario.type, "cluster": scenario.name}
+        cell_spec = {"scenario": one.data, "system": system, **spec}
+        return self.make_cell(
+            title, system, seed, {**identification, **(fields or {})}, cell_spec, *one.versions, *inputs
+        )
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
+        """Store copies of the towns beside the results, so that a report can be made where they are not imported."""
         for name in plan.inputs["towns"]:
             path = folder / "towns" / town_file(name)
             if not path.exists():
@@ -101,15 +105,19 @@ class ScenarioKind(Kind):
         return {}
 
     def start(self, job: Job) -> None:
-        """Loads the world's kernels, which are compiled on first use."""
+        """Load the world's kernels, which are compiled on first use."""
         load_world(job.device)
 
     def drive_again(self, plan: Plan, cell: Cell, record: Mapping[str, Any]) -> EpisodeTrace:
-        """The drive of a record, once more. ConfigError: the kind's cells cannot be replayed."""
+        """Drive the cell of a record again and return its trace.
+
+        Raises:
+            ConfigError: The kind's cells cannot be replayed.
+        """
         raise ConfigError(f"{cell.name}: cells of kind '{self.name}' cannot be replayed")
 
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
-        """Drives the episode again and compares every bit of its trace."""
+        """Drive the episode again and compare every bit of its trace."""
         quiet_warp()
         trace = self.drive_again(plan, cell, record)
         recorded = load_trace(folder / record["artefacts"]["trace"])
@@ -117,46 +125,52 @@ class ScenarioKind(Kind):
 
 
 def drive_record(cell: Cell, episode: Episode, trace: EpisodeTrace, folder: Path) -> dict[str, Any]:
-    """What a drive gives as the result of its cell; the trace is written."""
+    """Return the result of a cell from its drive, and write the trace."""
     artefact = f"traces/{cell.key}.npz"
     save_trace(folder / artefact, trace)
-    signs = bool((town(trace.town).sign_kind == SignKind.STOP).any())
-    metrics = plain(episode_metrics(trace, stop_signs=signs).as_dict())
-    about = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
-    about |= {"end": trace.end, "trace_hash": trace_hash(trace), "trace": artefact, "metrics": metrics}
-    return {"metrics": metrics, "artefacts": {"trace": artefact}, "episode": about, "case": motion_hash(trace)}
+    has_stop_signs = bool((town(trace.town).sign_kind == SignKind.STOP).any())
+    metrics = plain(episode_metrics(trace, stop_signs=has_stop_signs).as_dict())
+    episode_fields = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
+    episode_fields |= {"end": trace.end, "trace_hash": trace_hash(trace), "trace": artefact, "metrics": metrics}
+    return {"metrics": metrics, "artefacts": {"trace": artefact}, "episode": episode_fields, "case": motion_hash(trace)}
 
 
 def described(suite: ScenarioSuite) -> tuple[list[Described], dict[str, str]]:
-    """All scenarios of a suite, in order, and the versions of their towns.
+    """Return all scenarios of a suite, in order, and the versions of their towns.
 
     Raises:
         ConfigError: There are no such scenarios, or two differ but share a name.
     """
     scenarios = suite_scenarios(suite)
-    towns = {name: town_version(town(name)) for name in sorted({one.town for one in scenarios})}
-    found = []
-    for one in scenarios:
-        policies = [system_version(name) for name in policies_of(one)]
-        found.append(Described(one, scenario_json(one), (towns[one.town], type_version(one.type), *policies)))
-    return found, towns
+    towns = {name: town_version(town(name)) for name in sorted({scenario.town for scenario in scenarios})}
+    entries = []
+    for scenario in scenarios:
+        policies = [system_version(name) for name in policies_of(scenario)]
+        entries.append(
+            Described(scenario, scenario_json(scenario), (towns[scenario.town], type_version(scenario.type), *policies))
+        )
+    return entries, towns
 
 
 def suite_scenarios(suite: ScenarioSuite) -> tuple[Scenario, ...]:
-    """All scenarios of a suite, in order, each once. ConfigError when two differ but share a name."""
+    """Return all scenarios of a suite, in order, each once.
+
+    Raises:
+        ConfigError: Two differ but share a name.
+    """
     from ssad.scenarios.dynamic import load_scenarios
     from ssad.simulators.highway_env import highway_scenarios
 
-    found: dict[str, Scenario] = {}
+    scenarios_by_name: dict[str, Scenario] = {}
     for ref in suite.scenarios:
         try:
             loaded = highway_scenarios() if ref == HIGHWAY else load_scenarios(ref)
         except UnknownNameError as error:
             raise UnknownNameError(f"suite {suite.name}: {error}") from None
         for scenario in loaded:
-            if found.setdefault(scenario.name, scenario) != scenario:
+            if scenarios_by_name.setdefault(scenario.name, scenario) != scenario:
                 raise ConfigError(
                     f"suite {suite.name}: two different scenarios are named '{scenario.name}' (one from {ref}); "
                     "rename one"
                 )
-    return tuple(found.values())
+    return tuple(scenarios_by_name.values())

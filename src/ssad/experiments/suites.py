@@ -1,4 +1,4 @@
-"""Suites: YAML files with a strict schema, one a table; which schema, their kind says."""
+"""Suites: YAML files with a strict schema, one a table; the schema is that of their kind."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ KINDS: dict[str, str] = {
 
 
 def kind_of(name: str) -> Kind:
-    """The kind of that name, entry point or "module:class".
+    """Return the kind of that name, entry point or "module:class".
 
     Raises:
-        UnknownNameError: there is none.
-        ConfigError: it cannot be imported, or is no kind.
+        UnknownNameError: There is none.
+        ConfigError: It cannot be imported, or is no kind.
     """
-    found = resolve("kind", KINDS, name)
-    if not isinstance(found, type) or not issubclass(found, Kind):
+    resolved = resolve("kind", KINDS, name)
+    if not isinstance(resolved, type) or not issubclass(resolved, Kind):
         raise ConfigError(f"kind '{name}': expected a class derived from ssad.engine.kind.Kind")
-    return found()
+    return resolved()
 
 
 def suite_folders() -> list[Path]:
-    """Where suites lie: the repository of a source checkout, or inside the installed package."""
+    """Return the folders of suites: the repository of a source checkout, or inside the installed package."""
     package = Path(ssad.__file__).resolve().parent
     root = package.parent.parent
     folders = [package / "suites"]
@@ -54,7 +54,7 @@ def suite_folders() -> list[Path]:
 
 
 def suite_files() -> dict[str, Path]:
-    """Suite name -> its file."""
+    """Return suite name -> its file."""
     files: dict[str, Path] = {}
     for folder in suite_folders():
         for path in sorted(folder.glob("*.yaml")):
@@ -63,9 +63,10 @@ def suite_files() -> dict[str, Path]:
 
 
 def load_suite(ref: str, settings: Sequence[str] = ()) -> Any:
-    """The suite of that name or YAML file, with `--set key=value` settings applied; its key `kind` says of which kind.
+    """Return the suite of that name or YAML file, with `--set key=value` settings applied.
 
-    ConfigError or FormatError say file, line and key; UnknownNameError shows the closest names.
+    Its key `kind` selects the schema. ConfigError and FormatError name file, line and key; UnknownNameError lists the
+    closest names.
     """
     files = suite_files()
     path = files.get(ref)
@@ -83,58 +84,59 @@ def load_suite(ref: str, settings: Sequence[str] = ()) -> Any:
         raise document.error(
             ("kind",), f"'{data['kind']}' is no kind of suite; choose from: {', '.join(KINDS)}"
         ) from None
-    changed: dict[str, str] = {}
+    setting_of_key: dict[str, str] = {}
     for setting in settings:
-        changed[_apply(data, setting, schema)] = setting
+        setting_of_key[_apply(data, setting, schema)] = setting
     try:
-        found = schema.model_validate(data).beside(path)
+        suite = schema.model_validate(data).beside(path)
     except ValidationError as error:
-        raise _explain(error, document, changed, list(schema.model_fields)) from None
-    found._origin = ref
+        raise _explain(error, document, setting_of_key, list(schema.model_fields)) from None
+    suite._origin = ref
     try:
-        found._stock = schema.model_validate(document.data).beside(path).model_dump(mode="json")
-    except ValidationError:  # complete with the settings alone
-        found._stock = found.model_dump(mode="json")
-    return found
+        suite._stock = schema.model_validate(document.data).beside(path).model_dump(mode="json")
+    except ValidationError:  # the file is incomplete without the settings
+        suite._stock = suite.model_dump(mode="json")
+    return suite
 
 
 def _apply(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
-    """Put one `key=value` into the data; returns the top-level key."""
-    key, equals, text = setting.partition("=")
+    """Put one `key=value` into the data; return the top-level key."""
+    key, separator, text = setting.partition("=")
     parts = key.strip().split(".")
-    if not equals or not all(parts):
+    if not separator or not all(parts):
         raise ConfigError(f"--set {setting}: expected key=value, such as --set repetitions=3")
     if parts[0] not in schema.model_fields:
         raise ConfigError(f"--set {setting}: {_unknown_key(parts[0], list(schema.model_fields))}")
     value = parse_yaml(text, f"--set {key}")
     if len(parts) == 1 and _is_list(schema, parts[0]) and isinstance(value, str | int):
         value = [value]
-    place = data
+    mapping = data
     for part in parts[:-1]:
-        place.setdefault(part, {})
-        if not isinstance(place.get(part), dict):
+        mapping.setdefault(part, {})
+        if not isinstance(mapping.get(part), dict):
             raise ConfigError(f"--set {setting}: '{part}' has no keys of its own")
-        place[part] = dict(place[part])
-        place = place[part]
-    place[parts[-1]] = value
+        # Copy each level: the document that `_stock` is made of must not change.
+        mapping[part] = dict(mapping[part])
+        mapping = mapping[part]
+    mapping[parts[-1]] = value
     return parts[0]
 
 
 def _is_list(schema: type[SuiteBase], key: str) -> bool:
-    """Whether a key takes a list; one value alone then is a list of one."""
+    """Return whether a key takes a list; one value alone then is a list of one."""
     return typing.get_origin(schema.model_fields[key].annotation) is list
 
 
 def _unknown_key(key: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(key, known, n=3, cutoff=0.0)
-    return f"unknown key '{key}'; closest: {', '.join(close)}"
+    suggestions = difflib.get_close_matches(key, known, n=3, cutoff=0.0)
+    return f"unknown key '{key}'; closest: {', '.join(suggestions)}"
 
 
 UNION = re.compile(r"constrained-\w+|literal\[.*\]")  # how pydantic names the members of a union in a location
 
 
 def _explain(error: ValidationError, document: Document, changed: dict[str, str], known: Sequence[str]) -> ConfigError:
-    """The first problem as one line with file, line and key, or with the setting that caused it."""
+    """Return the first problem as one line with file, line and key, or with the setting that caused it."""
     problem = error.errors(include_url=False)[0]
     location = tuple(part for part in problem["loc"] if not UNION.fullmatch(str(part)))
     if problem["type"] == "extra_forbidden":
@@ -143,11 +145,11 @@ def _explain(error: ValidationError, document: Document, changed: dict[str, str]
     elif problem["type"] == "missing":
         text = f"the key '{location[-1]}' is missing"
         location = location[:-1]
-    elif problem["type"] == "value_error":  # a check of ours, which says it all
+    elif problem["type"] == "value_error":  # a validator of SSAD, whose message is complete
         text = problem["msg"].removeprefix("Value error, ")
     else:
-        shown = repr(problem["input"])
-        text = f"{problem['msg']}, not {shown if len(shown) < 60 else shown[:57] + '...'}"
+        input_text = repr(problem["input"])
+        text = f"{problem['msg']}, not {input_text if len(input_text) < 60 else input_text[:57] + '...'}"
     if location and location[0] in changed:
         return ConfigError(f"--set {changed[str(location[0])]}: {dotted(location)}: {text}")
     return document.error(location, text)

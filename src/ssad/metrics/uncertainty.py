@@ -275,10 +275,10 @@ def _distinct(values: Iterable[CaseValue]) -> list[CaseValue]:
 
 def _clusters(values: Sequence[CaseValue]) -> tuple[Clusters, npt.NDArray[np.intp]]:
     """Return the clusters of the values, and the cluster of each value."""
-    strata = {name: k for k, name in enumerate(dict.fromkeys(case_value.stratum for case_value in values))}
+    strata = {name: index for index, name in enumerate(dict.fromkeys(case_value.stratum for case_value in values))}
     names = {
-        name: k
-        for k, name in enumerate(dict.fromkeys((case_value.stratum, case_value.cluster) for case_value in values))
+        name: index
+        for index, name in enumerate(dict.fromkeys((case_value.stratum, case_value.cluster) for case_value in values))
     }
     cluster_index = np.array([names[case_value.stratum, case_value.cluster] for case_value in values])
     size = np.bincount(cluster_index).astype(np.float64)

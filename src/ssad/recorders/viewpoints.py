@@ -190,7 +190,7 @@ def has_room(target: ObjectBody, shot: Viewpoint, around: Sequence[PlacedObject]
         return True
     yaws = [np.arctan2(pose[1, 0], pose[0, 0]) for pose in (shot.target, *(placed.pose for placed in around))]
     boxes = np.array(
-        [(*placed.pose[:2, 3], turn, *placed.body.size[:2]) for placed, turn in zip(around, yaws[1:], strict=True)]
+        [(*placed.pose[:2, 3], yaw, *placed.body.size[:2]) for placed, yaw in zip(around, yaws[1:], strict=True)]
     )
     target_box = np.array([*shot.target[:2, 3], yaws[0], *target.size[:2]])
     is_tall = np.array([placed.pose[2, 3] + placed.body.size[2] + 0.3 > camera_position[2] for placed in around])

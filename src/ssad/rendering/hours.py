@@ -1,4 +1,4 @@
-"""Weather at a stated hour: the height of the sun, where it stands, and the night."""
+"""Weather at a stated hour: height and direction of the sun, and the night."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ ASIDE: Final = 0.3  # rad from straight behind the target to a sun that is behin
 
 
 def at_hour(weather: Weather, hour: str, heading: float | None = None) -> Weather:
-    """A weather at an hour: clear and dry, with the sun where it was to the side; recorded: as it was.
+    """Return a weather at an hour: clear and dry, with the sun in its recorded direction; recorded: unchanged.
 
     Args:
-        weather: As it was.
+        weather: Recorded weather.
         hour: See `HOURS`; sun_behind: the sun shines on the target's rear.
-        heading: Of the target, rad; None: the sun stays where it was to the side.
+        heading: Heading of the target, rad; None: the sun keeps its direction.
 
     Raises:
         UnknownNameError: There is no such hour.
@@ -29,7 +29,8 @@ def at_hour(weather: Weather, hour: str, heading: float | None = None) -> Weathe
         raise unknown_name("hour", hour, HOURS)
     if hour == "recorded":
         return weather
-    side = weather.sun_heading
+    sun_heading = weather.sun_heading
     if hour == "sun_behind" and heading is not None:
-        side = heading + np.pi + ASIDE
-    return Weather(SUN[hour], float(side), min(weather.clouds, 0.3), turn=weather.turn)
+        # A little to the side, not straight behind the target.
+        sun_heading = heading + np.pi + ASIDE
+    return Weather(SUN[hour], float(sun_heading), min(weather.clouds, 0.3), turn=weather.turn)

@@ -1,4 +1,4 @@
-"""From the records of a run to tables, figures and pages. Knows no kind of experiment.
+"""Tables, figures and pages from the records of a run, for every kind of experiment.
 
 Reads records, traces and baked towns only: a report is rebuilt without the world.
 """

@@ -1,4 +1,4 @@
-"""Two or more runs side by side: differences cell by cell, with intervals and a test, and what changed between them."""
+"""Comparison of runs: differences cell by cell, with intervals and a test, and changes between their headers."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _SUBJECTS = ("system", "detector")
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """One of the runs that are compared.
+    """One of the compared runs.
 
     Attributes:
-        label: What tables call it.
+        label: Label in tables.
         run: The run.
     """
 
@@ -35,13 +35,13 @@ class ComparedRun:
 
     @cached_property
     def lines(self) -> Mapping[tuple[str, str], Mapping[str, Any]]:
-        """(subject, cell without its subject) -> its line; the subject is the system or detector that is tested."""
-        found = {}
+        """(subject, cell without its subject) -> its line; the subject is the system or detector under test."""
+        lines_by_cell = {}
         for line in self.run.lines:
             subject = next((str(line[name]) for name in _SUBJECTS if line.get(name)), "")
             name = self.run.names.get(line["key"], line["key"])
-            found[subject, name.removeprefix(f"{subject}/")] = line
-        return found
+            lines_by_cell[subject, name.removeprefix(f"{subject}/")] = line
+        return lines_by_cell
 
     @property
     def subjects(self) -> list[str]:
@@ -54,16 +54,16 @@ class Comparison:
     """A run beside the first one.
 
     Attributes:
-        first: The run that others are compared with.
+        first: The reference run.
         second: The run that is compared with it.
         table: Differences over all cells, or of each cell where the metrics are scores.
         groups: Differences in each group of scenarios; None where the metrics are scores.
-        changes: What differs between the runs' headers, a line each.
+        changes: Differences between the runs' headers, a line each.
         verdicts: Cells whose outcome changed, a line each.
-        findings: What differs by more than chance, a sentence for each system or detector.
+        findings: Differences larger than chance, a sentence for each system or detector.
         equal: Cells whose metrics are equal to the last digit, of those that both runs measure.
-        both: Cells that both have.
-        only: How many cells only the first has, and only the second.
+        both: Number of cells that both have.
+        only: Number of cells that only the first has, and that only the second has.
         left_out: Systems or detectors that only one of them has.
     """
 
@@ -112,7 +112,7 @@ def write_comparison(folders: Sequence[Path], out: Path) -> tuple[Path, list[Com
 
     Args:
         folders: As for `compare_runs`.
-        out: Where they go.
+        out: Output folder.
 
     Returns:
         Path of the page, and the comparisons.
@@ -121,21 +121,21 @@ def write_comparison(folders: Sequence[Path], out: Path) -> tuple[Path, list[Com
         ConfigError: As for `compare_runs`.
         StoreError: A folder holds no run with results, or the files cannot be written.
     """
-    found = compare_runs(folders)
+    comparisons = compare_runs(folders)
     safeio.make_folder(out)
-    write_tables(out, [table for each in found for table in (each.table, each.groups) if table])
+    write_tables(out, [table for comparison in comparisons for table in (comparison.table, comparison.groups) if table])
     path = out / "compare.html"
-    safeio.write_atomic(path, render("compare.html", found[0].first.run, comparisons=found))
-    return path, found
+    safeio.write_atomic(path, render("compare.html", comparisons[0].first.run, comparisons=comparisons))
+    return path, comparisons
 
 
 def _labels(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of the folders' paths that tell them apart."""
+    """Return the shortest ends of the folders' paths that tell them apart."""
     parts = [folder.resolve().parts for folder in folders]
     for length in range(1, max(map(len, parts)) + 1):
-        found = ["/".join(each[-length:]) for each in parts]
-        if len(set(found)) == len(found):
-            return found
+        labels = ["/".join(path_parts[-length:]) for path_parts in parts]
+        if len(set(labels)) == len(labels):
+            return labels
     raise ConfigError("a run is compared with itself; give different folders")
 
 
@@ -144,18 +144,22 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
     rows: list[Row] = []
     verdicts: list[str] = []
     equal = both = 0
-    only = [0, 0]
-    for a, b in pairs:
-        own = {name: line for (subject, name), line in first.lines.items() if subject == a}
-        other = {name: line for (subject, name), line in second.lines.items() if subject == b}
-        shared = [name for name in own if name in other]
+    unshared = [0, 0]
+    for first_subject, second_subject in pairs:
+        first_lines = {name: line for (subject, name), line in first.lines.items() if subject == first_subject}
+        second_lines = {name: line for (subject, name), line in second.lines.items() if subject == second_subject}
+        shared = [name for name in first_lines if name in second_lines]
         both += len(shared)
-        only = [only[0] + len(own) - len(shared), only[1] + len(other) - len(shared)]
-        equal += sum(_equal(_metrics(own[name]), _metrics(other[name])) for name in shared)
-        title = a if a == b else f"{a} → {b}"
-        verdicts += [f"{title}/{name}: {told}" for name in shared if (told := _verdict(own[name], other[name]))]
+        unshared = [unshared[0] + len(first_lines) - len(shared), unshared[1] + len(second_lines) - len(shared)]
+        equal += sum(_equal(_metrics(first_lines[name]), _metrics(second_lines[name])) for name in shared)
+        title = first_subject if first_subject == second_subject else f"{first_subject} → {second_subject}"
+        verdicts += [
+            f"{title}/{name}: {change}"
+            for name in shared
+            if (change := _verdict(first_lines[name], second_lines[name]))
+        ]
         if shared:
-            rows += _rows(first.run, second.run, title, own, other)
+            rows += _rows(first.run, second.run, title, first_lines, second_lines)
     if not both:
         raise ConfigError(f"{second.run.folder}: it shares no cell with {first.run.folder}; run the same suite twice")
     note = (
@@ -164,11 +168,13 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
     )
     columns = (first.label, second.label, "difference", "p")
     name = "difference" if number == 1 else f"difference_{number}"
-    whole = [row for row in rows if row.head[1] == EVERYTHING]
+    overall_rows = [row for row in rows if row.head[1] == EVERYTHING]
     title, heads = f"{second.label} beside {first.label}", (*_heads(first.run), "Metric")
-    table = Table(name, title, heads, columns, tuple(whole or rows), note)
-    apart = tuple(row for row in rows if row.head[1] != EVERYTHING)
-    groups = Table(f"{name}_groups", "Each group of scenarios", heads, columns, apart, note) if whole else None
+    table = Table(name, title, heads, columns, tuple(overall_rows or rows), note)
+    group_rows = tuple(row for row in rows if row.head[1] != EVERYTHING)
+    groups = (
+        Table(f"{name}_groups", "Each group of scenarios", heads, columns, group_rows, note) if overall_rows else None
+    )
     left_out = {*first.subjects, *second.subjects} - {name for pair in pairs for name in pair}
     return Comparison(
         first,
@@ -180,35 +186,38 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
         findings=tuple(_findings(table)),
         equal=equal,
         both=both,
-        only=(only[0], only[1]),
+        only=(unshared[0], unshared[1]),
         left_out=tuple(sorted(left_out)),
     )
 
 
 def _findings(table: Table) -> Iterator[str]:
-    """Sentences about the differences that remain when as many are tested as the table has (Holm, 5 %)."""
+    """Yield sentences about the differences that remain significant after Holm's correction at 5 %."""
     tested = [row for row in table.rows if not math.isnan(row.cells[-1].mean)]
     tested.sort(key=lambda row: row.cells[-1].mean)
-    told: dict[str, list[str]] = {}
-    for k, row in enumerate(tested):
-        before, now, difference, p = row.cells
-        if p.mean > 0.05 / (len(tested) - k):
+    changes_by_subject: dict[str, list[str]] = {}
+    for rank, row in enumerate(tested):
+        first_cell, second_cell, difference, p_value = row.cells
+        # Holm: the k-th smallest p-value is compared with 5 % over the number of tests that are left.
+        if p_value.mean > 0.05 / (len(tested) - rank):
             break
-        what = " ".join(name for name in row.head[1:] if name != EVERYTHING)
+        quantity = " ".join(name for name in row.head[1:] if name != EVERYTHING)
         change = f"{difference.text} {difference.interval}".strip()
-        told.setdefault(row.head[0], []).append(f"{what} {before.text} → {now.text} ({change})")
-    for subject, changes in told.items():
-        more = f" and {len(changes) - 4} more" if len(changes) > 4 else ""
-        yield f"{subject}: {', '.join(changes[:4])}{more}: more than chance alone makes."
+        changes_by_subject.setdefault(row.head[0], []).append(
+            f"{quantity} {first_cell.text} → {second_cell.text} ({change})"
+        )
+    for subject, changes in changes_by_subject.items():
+        remainder = f" and {len(changes) - 4} more" if len(changes) > 4 else ""
+        yield f"{subject}: {', '.join(changes[:4])}{remainder}: more than chance alone makes."
     if not tested:
         yield "There is too little data to tell a difference from chance."
-    elif not told:
+    elif not changes_by_subject:
         yield "No difference is larger than chance alone makes."
 
 
 def _equal(own: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    both = {name for name in own.keys() & other.keys() if own[name] is not None and other[name] is not None}
-    return bool(both) and all(own[name] == other[name] for name in both)
+    shared = {name for name in own.keys() & other.keys() if own[name] is not None and other[name] is not None}
+    return bool(shared) and all(own[name] == other[name] for name in shared)
 
 
 def _heads(run: Run) -> tuple[str, str]:
@@ -217,7 +226,7 @@ def _heads(run: Run) -> tuple[str, str]:
 
 
 def _subject_pairs(first: ComparedRun, second: ComparedRun) -> list[tuple[str, str]]:
-    """Which subject of the first run is compared with which of the second."""
+    """Return the pairs of subjects of the first and the second run that are compared."""
     shared = [name for name in first.subjects if name in second.subjects]
     if shared:
         return [(name, name) for name in shared]
@@ -232,23 +241,25 @@ def _subject_pairs(first: ComparedRun, second: ComparedRun) -> list[tuple[str, s
 def _rows(
     first: Run, second: Run, title: str, own: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[Row]:
-    """Differences of one subject: of all cells that both have if the metrics are means, then of each group."""
+    """Yield the differences of one subject: of all shared cells if the metrics are means, then of each group."""
     if first.kind == "driving":
         groups = {EVERYTHING: list(own)} | {
             group: [name for name in own if own[name]["group"] == group]
             for group in dict.fromkeys(line["group"] for line in own.values())
         }
         for group, names in groups.items():
-            ours, theirs = ({n: run[n] for n in names if n in run} for run in (own, other))
-            if set(ours) & set(theirs):
+            first_lines, second_lines = (
+                {cell_name: lines[cell_name] for cell_name in names if cell_name in lines} for lines in (own, other)
+            )
+            if set(first_lines) & set(second_lines):
                 for symbol in SHOWN:
-                    yield _driving_row(title, group, symbol, ours, theirs)
+                    yield _driving_row(title, group, symbol, first_lines, second_lines)
         return
-    same = first.suite.get("seed") == second.suite.get("seed")
+    same_seed = first.suite.get("seed") == second.suite.get("seed")
     for name in own:
         if name in other:
             for metric in _common_metrics(first, own[name], other[name]):
-                yield _score_row(title, name, metric, own[name], other[name], paired=same)
+                yield _score_row(title, name, metric, own[name], other[name], paired=same_seed)
 
 
 def _driving_row(
@@ -258,15 +269,20 @@ def _driving_row(
     kind = "share" if metric.kind == "share" else "mean"
     values = [{name: _case(line, metric.field, kind) for name, line in lines.items()} for lines in (own, other)]
     shared = set(own) & set(other)
-    ran = [name for name in shared if not any(v[name].failed or math.isnan(v[name].value) for v in values)]
-    found = paired_difference(values[1], values[0], kind=kind)  # type: ignore[arg-type]
+    measured = [
+        name for name in shared if not any(cases[name].failed or math.isnan(cases[name].value) for cases in values)
+    ]
+    difference = paired_difference(values[1], values[0], kind=kind)  # type: ignore[arg-type]
     test = Cell(sign_flip_test(values[1], values[0]), digits=4)
-    means = [Cell(math.fsum(v[name].value for name in ran) / len(ran) if ran else math.nan) for v in values]
-    return Row((title, group, symbol), (*means, Cell.of(found), test))
+    means = [
+        Cell(math.fsum(cases[name].value for name in measured) / len(measured) if measured else math.nan)
+        for cases in values
+    ]
+    return Row((title, group, symbol), (*means, Cell.of(difference), test))
 
 
 def _case(line: Mapping[str, Any], field: str, kind: str) -> CaseValue:
-    """What a line gives to a metric, without what a failed episode counts as: a pair needs two that ran."""
+    """Return the value of a line in a metric; failed episodes have none, since a pair needs two that ran."""
     outcome = Outcome.from_record(line)
     number = None if outcome.metrics is None else getattr(outcome.metrics, field)
     value = math.nan if number is None else float(number)
@@ -279,31 +295,47 @@ def _score_row(
     title: str, name: str, metric: str, own: Mapping[str, Any], other: Mapping[str, Any], *, paired: bool
 ) -> Row:
     """A score in each run; the interval of the difference where both resampled the same scenes in the same way."""
-    a, b = float(own["metrics"][metric]), float(other["metrics"][metric])
-    draws = [(line.get("replicates") or {}).get(metric) or [] for line in (own, other)]
-    scenes, others = (int(line.get("scenes") or line.get("drives") or 0) for line in (own, other))
-    found = Estimate(b - a, math.nan, math.nan, int(own.get("n", 1)), clusters=scenes)
-    p = math.nan
-    if paired and scenes == others and own.get("n") == other.get("n") and len(draws[0]) == len(draws[1]):
-        found, p = _replicate_difference(b - a, [y - x for x, y in zip(*draws, strict=True)], found)
-    return Row((title, name, metric), (Cell(a), Cell(b), Cell.of(found), Cell(p, digits=4)))
+    first_score, second_score = float(own["metrics"][metric]), float(other["metrics"][metric])
+    replicates = [(line.get("replicates") or {}).get(metric) or [] for line in (own, other)]
+    scenes, other_scenes = (int(line.get("scenes") or line.get("drives") or 0) for line in (own, other))
+    difference = Estimate(second_score - first_score, math.nan, math.nan, int(own.get("n", 1)), clusters=scenes)
+    p_value = math.nan
+    if (
+        paired
+        and scenes == other_scenes
+        and own.get("n") == other.get("n")
+        and len(replicates[0]) == len(replicates[1])
+    ):
+        difference, p_value = _replicate_difference(
+            second_score - first_score,
+            [second_draw - first_draw for first_draw, second_draw in zip(*replicates, strict=True)],
+            difference,
+        )
+    return Row(
+        (title, name, metric), (Cell(first_score), Cell(second_score), Cell.of(difference), Cell(p_value, digits=4))
+    )
 
 
 def _replicate_difference(value: float, draws: Sequence[float], bare: Estimate) -> tuple[Estimate, float]:
     """Interval and p-value of a difference of scores in [0, 1]; its limits are those of (1 + difference) / 2."""
-    found = replicate_difference(value, draws, n=bare.n, clusters=bare.clusters)
-    known = [d for d in draws if not math.isnan(d)]
-    if math.isnan(found.low) or not known:
+    difference = replicate_difference(value, draws, n=bare.n, clusters=bare.clusters)
+    finite = [draw for draw in draws if not math.isnan(draw)]
+    if math.isnan(difference.low) or not finite:
         return bare, math.nan
-    beyond = min(sum(d <= 0.0 for d in known), sum(d >= 0.0 for d in known))
-    return found, min(2.0 * (beyond + 1) / (len(known) + 1), 1.0)
+    smaller_tail = min(sum(draw <= 0.0 for draw in finite), sum(draw >= 0.0 for draw in finite))
+    # Two-sided; plus one, so that a finite number of draws never gives p = 0.
+    return difference, min(2.0 * (smaller_tail + 1) / (len(finite) + 1), 1.0)
 
 
 def _common_metrics(run: Run, own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """Metrics that both lines have a number for, in the order of the kind's columns."""
-    mine, theirs = _metrics(own), _metrics(other)
-    columns = [str(column["name"]) for column in run.header.get("columns") or []] or list(mine)
-    return [name for name in columns if all(isinstance(values.get(name), int | float) for values in (mine, theirs))]
+    """Return the metrics that both lines have a number for, in the order of the kind's columns."""
+    first_metrics, second_metrics = _metrics(own), _metrics(other)
+    columns = [str(column["name"]) for column in run.header.get("columns") or []] or list(first_metrics)
+    return [
+        name
+        for name in columns
+        if all(isinstance(values.get(name), int | float) for values in (first_metrics, second_metrics))
+    ]
 
 
 def _metrics(line: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -311,7 +343,7 @@ def _metrics(line: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _verdict(own: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """How a cell's outcome changed: whether it ran, whether it collided; empty if it did not."""
+    """Return how a cell's outcome changed: whether it ran, whether it collided; empty if it did not."""
     states = [_state(line) for line in (own, other)]
     return "" if states[0] == states[1] else f"{states[0]} before, {states[1]} now"
 
@@ -324,7 +356,7 @@ def _state(line: Mapping[str, Any]) -> str:
 
 
 def _changes(first: Run, second: Run) -> Iterator[str]:
-    """What the headers of two runs say that differs: code, versions, suite, systems, weights, towns."""
+    """Yield the differences between the headers of two runs: code, versions, suite, systems, weights, towns."""
     for name in sorted(
         (set(first.header) | set(second.header)) - {"cells", "columns", "identity", "command", "started"}
     ):

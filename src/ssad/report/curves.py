@@ -14,7 +14,7 @@ WIDE, HIGH, COLUMNS, GAP = 178, 118, 4, 34
 
 @dataclass(frozen=True)
 class Point:
-    """A number of a line: where it lies along the axis, 0 to 1, the number, and what is told of it."""
+    """A number of a line: its place along the axis, 0 to 1, the number, and its tool tip."""
 
     at: float
     cell: Cell
@@ -26,9 +26,9 @@ class Panel:
     """One small plot.
 
     Attributes:
-        title: above it.
-        ticks: places along the axis, 0 to 1, and what stands there.
-        lines: points of each line, in the order of the colours; the number n/a is left out.
+        title: Title above it.
+        ticks: Places along the axis, 0 to 1, and their labels.
+        lines: Points of each line, in the order of the colours; points without a number are left out.
     """
 
     title: str
@@ -37,19 +37,19 @@ class Panel:
 
 
 def panels(found: Sequence[Panel], *, label: str, columns: int = COLUMNS) -> str:
-    """All plots in one scale from 0; as SVG text.
+    """Draw all plots in one scale from 0; as SVG text.
 
     Args:
-        found: the plots.
-        label: what a screen reader says.
-        columns: plots in a row.
+        found: The plots.
+        label: Label for screen readers.
+        columns: Plots in a row.
     """
     cells = [point.cell for panel in found for line in panel.lines for point in line]
-    ends = [cell.mean if math.isnan(cell.high) else cell.high for cell in cells if not math.isnan(cell.mean)]
-    top = max(10.0, 10 * math.ceil(max(ends, default=1.0) / 10))
+    upper_ends = [cell.mean if math.isnan(cell.high) else cell.high for cell in cells if not math.isnan(cell.mean)]
+    top = max(10.0, 10 * math.ceil(max(upper_ends, default=1.0) / 10))
     parts = []
-    for number, panel in enumerate(found):
-        left, under = 36 + (number % columns) * (WIDE + GAP), 24 + (number // columns) * (HIGH + 46)
+    for panel_index, panel in enumerate(found):
+        left, under = 36 + (panel_index % columns) * (WIDE + GAP), 24 + (panel_index // columns) * (HIGH + 46)
 
         def place(at: float, value: float, left: int = left, under: int = under) -> str:
             return f"{left + WIDE * at:.1f},{under + HIGH * (1 - min(max(value / top, 0.0), 1.0)):.1f}"
@@ -63,15 +63,18 @@ def panels(found: Sequence[Panel], *, label: str, columns: int = COLUMNS) -> str
             x = left + WIDE * at
             parts.append(f'<text x="{x:.1f}" y="{under + HIGH + 15}" text-anchor="middle">{escape(name)}</text>')
         for index, line in enumerate(panel.lines):
-            shown = [point for point in line if not math.isnan(point.cell.mean)]
+            measured = [point for point in line if not math.isnan(point.cell.mean)]
             colour = f"var(--s{index % 5})"
-            known = [point for point in shown if not math.isnan(point.cell.low)]
-            if known:
-                edge = [place(p.at, p.cell.high) for p in known] + [place(p.at, p.cell.low) for p in reversed(known)]
-                parts.append(f'<polygon points="{" ".join(edge)}" fill="{colour}" opacity=".16"/>')
-            path = " ".join(place(p.at, p.cell.mean) for p in shown)
+            with_interval = [point for point in measured if not math.isnan(point.cell.low)]
+            if with_interval:
+                # The outline of the band: along the upper limits and back along the lower ones.
+                band_outline = [place(vertex.at, vertex.cell.high) for vertex in with_interval] + [
+                    place(vertex.at, vertex.cell.low) for vertex in reversed(with_interval)
+                ]
+                parts.append(f'<polygon points="{" ".join(band_outline)}" fill="{colour}" opacity=".16"/>')
+            path = " ".join(place(vertex.at, vertex.cell.mean) for vertex in measured)
             parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2"/>')
-            for point in shown:
+            for point in measured:
                 x_text, y_text = place(point.at, point.cell.mean).split(",")
                 tip = escape(f"{point.tip}: {point.cell.text} {point.cell.interval}")
                 parts.append(f'<circle cx="{x_text}" cy="{y_text}" r="3" fill="{colour}"><title>{tip}</title></circle>')

@@ -33,11 +33,11 @@ class Run:
     """A run folder.
 
     Attributes:
-        folder: where it lies.
-        header: run.json.
-        lines: lines of results.jsonl, in the order of the suite.
-        episodes: lines of episodes.jsonl by key; empty for kinds that have none.
-        planned: how many cells the run has when it is whole.
+        folder: Its path.
+        header: Content of run.json.
+        lines: Lines of results.jsonl, in the order of the suite.
+        episodes: Lines of episodes.jsonl by key; empty for kinds that have none.
+        planned: Number of cells of the complete run.
     """
 
     folder: Path
@@ -54,32 +54,32 @@ class Run:
 
     @property
     def kind(self) -> str:
-        """The kind of experiment; runs from before there were several are of kind "driving"."""
+        """Kind of experiment; runs from before there were several are of kind "driving"."""
         return str(self.header.get("kind") or self.suite.get("kind") or "driving")
 
     @property
     def title(self) -> str:
-        """What the page is called: the suite's title, unless the run differs from what that says."""
+        """Title of the page: the suite's title, unless the run differs from that suite."""
         name = str(self.suite.get("name") or "SSAD")
         title = str(self.suite.get("title") or name)
-        if not self.changed or any(one.startswith("title=") for one in self.changed):
+        if not self.changed or any(setting.startswith("title=") for setting in self.changed):
             return title
-        told = f"{name} with {'; '.join(_in_words(one) for one in self.changed)}"
-        if len(told) <= 100:
-            return told
-        keys = dict.fromkeys(one.partition("=")[0].replace("_", " ") for one in self.changed)
+        description = f"{name} with {'; '.join(_in_words(setting) for setting in self.changed)}"
+        if len(description) <= 100:
+            return description
+        keys = dict.fromkeys(setting.partition("=")[0].replace("_", " ") for setting in self.changed)
         return textwrap.shorten(f"{title}, with other {', '.join(keys)}", 160, placeholder=" ...")
 
     @cached_property
     def changed(self) -> tuple[str, ...]:
         """What the run does otherwise than the suite of its name, as KEY=VALUE; what changes no result is left out."""
         words = shlex.split(self.command)
-        told = [word for before, word in itertools.pairwise(words) if before == "--set"]
-        return tuple(one for one in told if one.partition("=")[0] not in INCIDENTAL)
+        settings = [word for option, word in itertools.pairwise(words) if option == "--set"]
+        return tuple(setting for setting in settings if setting.partition("=")[0] not in INCIDENTAL)
 
     @property
     def command(self) -> str:
-        """The command that repeats the run."""
+        """Command that repeats the run."""
         return str(self.header.get("command") or f"ssad run {self.suite.get('name', 'quick')}")
 
     @cached_property
@@ -89,12 +89,12 @@ class Run:
 
     @property
     def failures(self) -> list[Mapping[str, Any]]:
-        """Lines of cells that failed."""
+        """Lines of failed cells."""
         return [line for line in self.lines if line["status"] != "ok"]
 
 
 def _in_words(setting: str) -> str:
-    """KEY=VALUE as a reader would say it: what has a name is called by it, and lists have no brackets."""
+    """Return KEY=VALUE in words: objects with a name by that name, lists without brackets."""
     key, _, text = setting.partition("=")
     try:
         value = safeio.parse_yaml(text)
@@ -105,9 +105,11 @@ def _in_words(setting: str) -> str:
 
 def _spoken(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(str(one.get("name", _spoken(one))) if isinstance(one, dict) else str(one) for one in value)
+        return ", ".join(
+            str(entry.get("name", _spoken(entry))) if isinstance(entry, dict) else str(entry) for entry in value
+        )
     if isinstance(value, dict):
-        return ", ".join(f"{key} {_spoken(one)}" for key, one in value.items())
+        return ", ".join(f"{key} {_spoken(entry)}" for key, entry in value.items())
     return str(value)
 
 
@@ -115,7 +117,7 @@ def load_run(folder: Path | str) -> Run:
     """Read run.json, results.jsonl and episodes.jsonl.
 
     Raises:
-        StoreError: the folder does not hold a run, the run has no result yet, or a line is broken or no result of a
+        StoreError: The folder does not hold a run, the run has no result yet, or a line is broken or no result of a
             cell.
     """
     folder = Path(folder)
@@ -127,9 +129,9 @@ def load_run(folder: Path | str) -> Run:
         raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
     for line in lines:
         if not (isinstance(line["key"], str) and "status" in line):
-            told = f"the line with key {line['key']!r} is no result of a cell"
-            raise StoreError(f"{folder}/results.jsonl: {told}; remove it and run the suite again")
-    order = {cell["key"]: k for k, cell in enumerate(header.get("cells", []))}
+            problem = f"the line with key {line['key']!r} is no result of a cell"
+            raise StoreError(f"{folder}/results.jsonl: {problem}; remove it and run the suite again")
+    order = {cell["key"]: position for position, cell in enumerate(header.get("cells", []))}
     lines.sort(key=lambda line: order.get(line["key"], len(order)))
     episodes = {line["key"]: line for line in read_lines(folder / "episodes.jsonl")}
     return Run(folder, header, tuple(lines), episodes, max(len(order), len(lines)))

@@ -1,4 +1,4 @@
-"""Pages of runs: rendering of a template, with what the pages of all kinds share."""
+"""Pages of runs: rendering of a template, with the common parts of the pages of all kinds."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ TABLE_HASH = "hash-of-the-main-table"  # stands on a page until its tables are k
 
 
 def table_hash(table: Table) -> str:
-    """12 hex digits over every number of a table, to the last digit: equal runs have equal ones."""
+    """Return 12 hex digits over every number of a table, to the last digit: equal runs have equal ones."""
     return hashlib.sha256(to_csv(table).encode()).hexdigest()[:12]
 
 
 def render(template: str | Path, run: Run, *, verdict: Sequence[str] = (), **values: Any) -> str:
-    """Render a page from its template, with what all pages show; every value is escaped.
+    """Render a page from its template, with the common parts of all pages; every value is escaped.
 
     Args:
         template: Name of a template of the report, or path of a template of a kind's own. It extends "base.html".
         run: The run.
-        verdict: Sentences that the page begins with (see `ssad.report.verdict.complete_verdict`).
-        values: What the template shows besides.
+        verdict: Leading sentences of the page (see `ssad.report.verdict.complete_verdict`).
+        values: Further values of the template.
     """
     path = Path(template)
     loaders: list[jinja2.BaseLoader] = [jinja2.PackageLoader("ssad.report")]
     if path.is_absolute():
+        # A kind's own folder first, so that its templates may replace those of the report.
         loaders.insert(0, jinja2.FileSystemLoader(path.parent))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader(loaders),
@@ -65,5 +66,5 @@ def heat(cell: Cell, symbol: str) -> str:
         return ""
     scale = {"OR": 10.0, "DR": 5.0}.get(symbol, metric.scale)
     share = min(max(cell.mean / scale, 0.0), 1.0)
-    bad = share if metric.better == "lower" else 1.0 - share
-    return f"--bad:{100 * bad:.0f}%"
+    badness = share if metric.better == "lower" else 1.0 - share
+    return f"--bad:{100 * badness:.0f}%"

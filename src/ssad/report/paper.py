@@ -1,4 +1,4 @@
-"""The paper's own tables, to be shown beside ours.
+"""Tables of the paper, shown beside ours.
 
 Source: Li et al., "Towards Benchmarking and Assessing the Safety and Robustness of Autonomous Driving on
 Safety-critical Scenarios". They were measured in CARLA 0.9.13 with SafeBench's agents; ours come from another

@@ -21,7 +21,7 @@ METHODS = (
 
 @dataclass(frozen=True)
 class Cell:
-    """One number, with what `ssad.metrics.Estimate` says about it; a published number has no more than its mean."""
+    """One number, with the interval and counts of `ssad.metrics.Estimate`; a published number has only its mean."""
 
     mean: float
     low: float = math.nan
@@ -34,7 +34,7 @@ class Cell:
 
     @classmethod
     def of(cls, e: Estimate) -> Cell:
-        """The cell that shows an estimate."""
+        """Return the cell of an estimate."""
         return cls(e.mean, e.low, e.high, e.n, e.failed, e.clusters, e.method)
 
     @property
@@ -44,7 +44,7 @@ class Cell:
 
     @property
     def interval(self) -> str:
-        """`[low, high]` of an interval, `low–high` (`low to high` below 0) of a range, or nothing."""
+        """`[low, high]` of an interval, `low–high` (`low to high` below 0) of a range, or empty."""
         if math.isnan(self.low) or math.isnan(self.high):
             return ""
         if self.method == "range":
@@ -56,15 +56,19 @@ class Cell:
         """`n = 40 in 4 clusters`, with the failed ones named."""
         if not self.n:
             return ""
-        grouped = f" in {self.clusters} clusters" if self.clusters not in (0, self.n) else ""
-        return f"n = {self.n}{grouped}" + (f", {self.failed} failed" if self.failed else "")
+        cluster_text = f" in {self.clusters} clusters" if self.clusters not in (0, self.n) else ""
+        return f"n = {self.n}{cluster_text}" + (f", {self.failed} failed" if self.failed else "")
 
     @property
     def tip(self) -> str:
-        """All that is known of the number, in a line."""
-        name = {"range": "range over the clusters", "beta": "95 % interval, beta", "t": "95 % interval, Student's t"}
-        told = f"{self.interval} ({name.get(self.method, '95 % interval')})" if self.interval else ""
-        return ", ".join(part for part in (self.count, told) if part)
+        """Count and interval of the number, in a line."""
+        method_names = {
+            "range": "range over the clusters",
+            "beta": "95 % interval, beta",
+            "t": "95 % interval, Student's t",
+        }
+        interval_text = f"{self.interval} ({method_names.get(self.method, '95 % interval')})" if self.interval else ""
+        return ", ".join(part for part in (self.count, interval_text) if part)
 
 
 @dataclass(frozen=True)
@@ -90,29 +94,29 @@ class Table:
 
 
 def to_csv(table: Table) -> str:
-    """One line a number, with interval, n, source, clusters and method: for further computation."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    """Return one line a number, with interval, n, source, clusters and method: for further computation."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
     heads = ("column", "mean", "low", "high", "n", "failed", "source", "clusters", "method")
-    writer.writerow([*(h.lower() for h in table.heads), *heads])
+    writer.writerow([*(head.lower() for head in table.heads), *heads])
     for row in table.rows:
         for column, cell in zip(table.columns, row.cells, strict=True):
-            numbers = ["" if math.isnan(v) else repr(float(v)) for v in (cell.mean, cell.low, cell.high)]
+            numbers = ["" if math.isnan(number) else repr(float(number)) for number in (cell.mean, cell.low, cell.high)]
             source = "published" if row.published else "ours"
-            known = [cell.n, cell.failed, source, cell.clusters, cell.method] if cell.n else ["", "", source, "", ""]
-            writer.writerow([*row.head, column, *numbers, *known])
-    return out.getvalue()
+            details = [cell.n, cell.failed, source, cell.clusters, cell.method] if cell.n else ["", "", source, "", ""]
+            writer.writerow([*row.head, column, *numbers, *details])
+    return buffer.getvalue()
 
 
 def to_markdown(table: Table) -> str:
-    """A table for a README or an issue."""
-    head = [*table.heads, *table.columns]
-    lines = [f"## {table.title}", "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    """Return a table for a README or an issue."""
+    titles = [*table.heads, *table.columns]
+    lines = [f"## {table.title}", "", "| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
     for row in table.rows:
-        mark = " (published)" if row.published else ""
-        names = [*row.head[:-1], row.head[-1] + mark]
-        cells = [f"{c.text} {c.interval}".strip() for c in row.cells]
-        lines.append("| " + " | ".join(n.replace("|", "\\|") for n in [*names, *cells]) + " |")
+        suffix = " (published)" if row.published else ""
+        names = [*row.head[:-1], row.head[-1] + suffix]
+        cells = [f"{cell.text} {cell.interval}".strip() for cell in row.cells]
+        lines.append("| " + " | ".join(text.replace("|", "\\|") for text in [*names, *cells]) + " |")
     return "\n".join([*lines, "", table.note, ""])
 
 
@@ -122,30 +126,30 @@ _TEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciic
 
 
 def tex(text: str) -> str:
-    """Text with LaTeX's special characters escaped."""
-    return "".join(_TEX.get(c, c) for c in text)
+    """Return text with LaTeX's special characters escaped."""
+    return "".join(_TEX.get(character, character) for character in text)
 
 
 def to_latex(table: Table) -> str:
-    r"""A booktabs tabular; it needs \usepackage{booktabs}."""
+    r"""Return a booktabs tabular; it needs \usepackage{booktabs}."""
     lines = [
         "\\begin{tabular}{" + "l" * len(table.heads) + "c" * len(table.columns) + "}",
         "\\toprule",
-        " & ".join(tex(h) for h in [*table.heads, *table.columns]) + r" \\",
+        " & ".join(tex(head) for head in [*table.heads, *table.columns]) + r" \\",
         "\\midrule",
     ]
-    last = None
+    previous_row = None
     for row in table.rows:
-        if last is not None and (
-            row.head[0] != last.head[0] if len(row.head) == 2 else row.published != last.published
+        if previous_row is not None and (
+            row.head[0] != previous_row.head[0] if len(row.head) == 2 else row.published != previous_row.published
         ):
             lines.append("\\midrule")
-        names = [tex(h) for h in row.head]
+        names = [tex(head) for head in row.head]
         if row.published:
             names[-1] += r"$^\dagger$"
-        cells = [c.text + (f" {{\\scriptsize {c.interval}}}" if c.interval else "") for c in row.cells]
+        cells = [cell.text + (f" {{\\scriptsize {cell.interval}}}" if cell.interval else "") for cell in row.cells]
         lines.append(" & ".join([*names, *cells]) + r" \\")
-        last = row
+        previous_row = row
     if any(row.published for row in table.rows):
         width = len(table.heads) + len(table.columns)
         lines += ["\\midrule", rf"\multicolumn{{{width}}}{{l}}{{\footnotesize $^\dagger$ {tex(table.source)}}} \\"]
@@ -156,7 +160,7 @@ def write_tables(folder: Path, found: Sequence[Table]) -> list[Path]:
     """Write tables/NAME.csv, .md and .tex, each whole or not at all.
 
     Args:
-        folder: Where `tables` is made.
+        folder: Parent of the folder `tables`.
         found: The tables.
 
     Returns:
@@ -165,11 +169,11 @@ def write_tables(folder: Path, found: Sequence[Table]) -> list[Path]:
     Raises:
         StoreError: A file cannot be written.
     """
-    out = []
+    paths = []
     (folder / "tables").mkdir(parents=True, exist_ok=True)
     for table in found:
         for suffix, text in (("csv", to_csv(table)), ("md", to_markdown(table)), ("tex", to_latex(table))):
             path = folder / "tables" / f"{table.name}.{suffix}"
             safeio.write_atomic(path, text)
-            out.append(path)
-    return out
+            paths.append(path)
+    return paths

@@ -1,4 +1,4 @@
-"""The table that a run ends with on the terminal: a few of the page's own numbers."""
+"""Table that a run ends with on the terminal: a few of the page's own numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MODULE = re.compile(r"^[\w.]+:(?=\w+$)")  # of "module:Class"
 
 
 def terminal_table(run: Run, table: Table) -> rich.table.Table:
-    """Rows of a table that were measured here: n and interval of the first metric, the values of the others."""
+    """Return the measured rows of a table: n and interval of the first metric, the values of the others."""
     result = rich.table.Table(
         title=escape(run.title),
         title_justify="left",
@@ -27,32 +27,35 @@ def terminal_table(run: Run, table: Table) -> rich.table.Table:
     )
     for name in table.heads:
         result.add_column(escape(name.lower()), no_wrap=True)
-    every = {head for row in table.rows for head in row.head}
-    bare = Counter(MODULE.sub("", head) for head in every)
-    shown = {head: short if bare[short := MODULE.sub("", head)] == 1 else head for head in ("", *every)}
+    row_heads = {head for row in table.rows for head in row.head}
+    # A module path is left out only where the short name is unique.
+    short_counts = Counter(MODULE.sub("", head) for head in row_heads)
+    display_names = {
+        head: short_name if short_counts[short_name := MODULE.sub("", head)] == 1 else head for head in ("", *row_heads)
+    }
     first, *others = table.columns
     for name in ("n", first, "", *others):
         result.add_column(escape(name), justify="right", min_width=4)
     rows = [row for row in table.rows if not row.published]
-    for before, row, after in zip([None, *rows], rows, [*rows[1:], None], strict=False):
-        one, *rest = row.cells
-        same = before is not None and len(row.head) > 1 and before.head[0] == row.head[0]
-        heads = ["" if same else row.head[0], *row.head[1:]]
-        average = row.head[0].startswith("Avg.")
-        values = [str(one.n or ""), one.text, one.interval, *(cell.text for cell in rest)]
+    for previous_row, row, next_row in zip([None, *rows], rows, [*rows[1:], None], strict=False):
+        first_cell, *other_cells = row.cells
+        repeats_head = previous_row is not None and len(row.head) > 1 and previous_row.head[0] == row.head[0]
+        heads = ["" if repeats_head else row.head[0], *row.head[1:]]
+        is_average = row.head[0].startswith("Avg.")
+        values = [str(first_cell.n or ""), first_cell.text, first_cell.interval, *(cell.text for cell in other_cells)]
         result.add_row(
-            *(escape(text) for text in (*(shown[head] for head in heads), *values)),
-            style="bold" if average else None,
-            end_section=after is not None and after.head[0].startswith("Avg.") and not average,
+            *(escape(text) for text in (*(display_names[head] for head in heads), *values)),
+            style="bold" if is_average else None,
+            end_section=next_row is not None and next_row.head[0].startswith("Avg.") and not is_average,
         )
-    failed = len(run.failures)
-    notes = [table.note, f"{failed} of {len(run.lines)} cells failed and count" if failed else ""]
+    failure_count = len(run.failures)
+    notes = [table.note, f"{failure_count} of {len(run.lines)} cells failed and count" if failure_count else ""]
     result.caption, result.caption_justify = escape("\n".join(filter(None, notes))), "left"
     return result
 
 
 def comparison_table(table: Table) -> rich.table.Table:
-    """A table of differences: the interval in a column of its own, leading columns that say nothing left out."""
+    """Return a table of differences: the interval in its own column, leading columns with one value left out."""
     result = rich.table.Table(
         title=escape(table.title),
         title_justify="left",
@@ -61,13 +64,13 @@ def comparison_table(table: Table) -> rich.table.Table:
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    telling = [k for k in range(len(table.heads)) if len({row.head[k] for row in table.rows}) > 1]
-    for k in telling:
-        result.add_column(escape(table.heads[k].lower()))
+    varying = [column for column in range(len(table.heads)) if len({row.head[column] for row in table.rows}) > 1]
+    for column in varying:
+        result.add_column(escape(table.heads[column].lower()))
     for name in (*table.columns, ""):
         result.add_column(escape(name), justify="right", no_wrap=True)
     for row in table.rows:
-        *values, difference, p = row.cells
-        texts = [*(cell.text for cell in values), difference.text, p.text, difference.interval]
-        result.add_row(*(escape(text) for text in (*(row.head[k] for k in telling), *texts)))
+        *values, difference, p_value = row.cells
+        texts = [*(cell.text for cell in values), difference.text, p_value.text, difference.interval]
+        result.add_row(*(escape(text) for text in (*(row.head[column] for column in varying), *texts)))
     return result

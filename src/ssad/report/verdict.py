@@ -1,4 +1,4 @@
-"""Sentences that a page begins with: what all verdicts share."""
+"""Leading sentences of a page: the common parts of all verdicts."""
 
 from __future__ import annotations
 
@@ -13,20 +13,18 @@ Line = Mapping[str, Any]
 
 
 def complete_verdict(run: Run, sentences: Sequence[str]) -> list[str]:
-    """Sentences of a kind, with the state of the run before them, and a default where there are none."""
-    started = (
-        [f"Not finished: {len(run.lines)} of {run.planned} cells have run."] if len(run.lines) < run.planned else []
-    )
-    return [sentence for sentence in [*started, *sentences] if sentence] or ["See the table."]
+    """Return the sentences of a kind after the state of the run, and a default where there are none."""
+    state = [f"Not finished: {len(run.lines)} of {run.planned} cells have run."] if len(run.lines) < run.planned else []
+    return [sentence for sentence in [*state, *sentences] if sentence] or ["See the table."]
 
 
 def worst_condition(who: str, metric: str, scores: Mapping[str, float], what: str) -> str:
-    """Clean ("") beside the lowest of the others."""
+    """Return in a sentence the clean score ("") and the lowest of the others."""
     others = {name: value for name, value in scores.items() if name and name != "clean" and not math.isnan(value)}
     clean = scores.get("", scores.get("clean", math.nan))
     if not others or math.isnan(clean):
         return ""
-    name = min(others, key=lambda one: others[one])
+    name = min(others, key=lambda condition: others[condition])
     if others[name] >= clean:
         return f"{who}: {metric} {clean:.0%} clean; no {what} takes any of it."
     return f"{who}: {metric} {clean:.0%} clean; the {what} that costs most is {name}, which leaves {others[name]:.0%}."
@@ -34,11 +32,11 @@ def worst_condition(who: str, metric: str, scores: Mapping[str, float], what: st
 
 def lines_by(run: Run, field: str, *, failed: bool = False) -> dict[str, list[Line]]:
     """Group the lines of a run by a field; `failed`: those of failed cells too."""
-    found: dict[str, list[Line]] = {}
+    lines_by_value: dict[str, list[Line]] = {}
     for line in run.lines:
         if line["status"] == "ok" or failed:
-            found.setdefault(str(line.get(field) or ""), []).append(line)
-    return found
+            lines_by_value.setdefault(str(line.get(field) or ""), []).append(line)
+    return lines_by_value
 
 
 def metric_of(line: Line, name: str) -> float:
@@ -49,5 +47,5 @@ def metric_of(line: Line, name: str) -> float:
 
 def mean_of(values: Iterable[float]) -> float:
     """Return the mean of the values that are not NaN; NaN where there are none."""
-    known = [CaseValue(value, str(k), str(k)) for k, value in enumerate(values) if not math.isnan(value)]
-    return estimate(known, "mean").mean if known else math.nan
+    cases = [CaseValue(value, str(index), str(index)) for index, value in enumerate(values) if not math.isnan(value)]
+    return estimate(cases, "mean").mean if cases else math.nan

@@ -20,27 +20,41 @@ CODECS = ("vp09", "mp4v")  # VP9, which browsers play; where it is missing MPEG-
 
 
 def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (960, 540)) -> Iterator[Frame]:
-    """RGB frames [H, W, 3], one a step, the camera following the ego from above."""
-    view = TopView(graph, size=size)
-    pose, size_of = np.stack([trace.x, trace.y, trace.yaw], -1), np.stack([trace.length, trace.width], -1)
+    """Yield RGB frames [H, W, 3], one a step, the camera following the ego from above."""
+    top_view = TopView(graph, size=size)
+    pose, sizes = np.stack([trace.x, trace.y, trace.yaw], -1), np.stack([trace.length, trace.width], -1)
     first_hit = next(iter(np.flatnonzero(trace.contact)), None)
-    places = graph.signal_xy[trace.signal_ids].tolist()
-    for t in range(len(trace.accel)):
-        words = [f"{t * trace.dt:5.1f} s   {trace.speed[t, 0]:5.1f} m/s   route {trace.route_complete[t]:3.0f} %"]
-        if t == len(trace.accel) - 1:
-            words.append(trace.end.replace("_", " "))
-        lamps = [(x, y, int(state)) for (x, y), state in zip(places, trace.signal[t], strict=True)]
-        hit = None if first_hit is None or t < first_hit else t - int(first_hit)
-        past = pose[max(t - 30, 0) : t + 1, 0, :2]
-        yield view.draw(
-            Moment(pose[t], size_of, trace.kind, trace.active[t], trace.route, past, lamps, hit=hit, words=words)
+    signal_positions = graph.signal_xy[trace.signal_ids].tolist()
+    for step in range(len(trace.accel)):
+        captions = [
+            f"{step * trace.dt:5.1f} s   {trace.speed[step, 0]:5.1f} m/s   route {trace.route_complete[step]:3.0f} %"
+        ]
+        if step == len(trace.accel) - 1:
+            captions.append(trace.end.replace("_", " "))
+        signals = [(x, y, int(state)) for (x, y), state in zip(signal_positions, trace.signal[step], strict=True)]
+        steps_since_contact = None if first_hit is None or step < first_hit else step - int(first_hit)
+        trail = pose[max(step - 30, 0) : step + 1, 0, :2]
+        yield top_view.draw(
+            Moment(
+                pose[step],
+                sizes,
+                trace.kind,
+                trace.active[step],
+                trace.route,
+                trail,
+                signals,
+                hit=steps_since_contact,
+                words=captions,
+            )
         )
 
 
 def write_video(trace: EpisodeTrace, graph: LaneGraph, path: Path | str) -> Path:
     """Write the episode as .mp4 (10 frames a second) or .gif (every second frame), whole or not at all.
 
-    ConfigError for another suffix or when no encoder answers; StoreError for a folder that cannot be written.
+    Raises:
+        ConfigError: Another suffix, or no encoder is available.
+        StoreError: The folder cannot be written.
     """
     path = Path(path)
     if path.suffix == ".gif":
@@ -53,11 +67,11 @@ def save_frames(shown: Iterable[Frame], path: Path, *, dt: float) -> Path:
 
     Args:
         shown: RGB, uint8 [H, W, 3], one size.
-        path: Where to.
-        dt: From one frame to the next, s.
+        path: Output file.
+        dt: Time between two frames, s.
 
     Raises:
-        ConfigError: Another suffix, no frames, or no encoder answers.
+        ConfigError: Another suffix, no frames, or no encoder is available.
         StoreError: The folder cannot be written.
     """
     if path.suffix not in (".mp4", ".gif"):
@@ -72,8 +86,8 @@ def _mp4(shown: Iterator[Frame], path: Path, dt: float) -> None:
     if first is None:
         raise ConfigError(f"{path}: a video without frames")
     size = first.shape[1], first.shape[0]
-    for code in CODECS:
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), round(1.0 / dt), size)
+    for codec in CODECS:
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), round(1.0 / dt), size)
         if writer.isOpened():
             break
     else:
@@ -86,7 +100,7 @@ def _mp4(shown: Iterator[Frame], path: Path, dt: float) -> None:
 
 
 def _gif(shown: Iterator[Frame], path: Path, dt: float) -> None:
-    pictures = [Image.fromarray(f).quantize(64) for k, f in enumerate(shown) if k % 2 == 0]
+    pictures = [Image.fromarray(frame).quantize(64) for index, frame in enumerate(shown) if index % 2 == 0]
     if not pictures:
         raise ConfigError(f"{path}: a video without frames")
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(2000 * dt), loop=0, optimize=False)

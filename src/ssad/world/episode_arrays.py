@@ -389,7 +389,7 @@ def build(
     agent_count = max(len(episode_index.agents) for episode_index in episodes)
     phase_count = max(1, *(len(arrays.phases) for episode_index in episodes for arrays in episode_index.agents))
     signal_count = max(1, *(len(graphs[town].signal_phase) for town in towns))
-    model_rows = {name: k for k, name in enumerate(models)}
+    model_rows = {name: index for index, name in enumerate(models)}
     shape = (len(episodes), agent_count)
     arrays: dict[str, npt.NDArray[np.generic]] = {
         "model": np.full(shape, -1, np.int32),
@@ -434,8 +434,8 @@ def build(
         setattr(bank, name, wp.array(arrays[name], dtype=array_type.dtype, device=device))
     town_graphs = [graphs[town] for town in towns]
     programs = np.zeros((len(towns), signal_count, 4))
-    for k, graph in enumerate(town_graphs):
-        programs[k, : len(graph.signal_phase)] = signal_programs(graph)
+    for index, graph in enumerate(town_graphs):
+        programs[index, : len(graph.signal_phase)] = signal_programs(graph)
     model_indices = np.asarray(arrays["model"])
     return Bank(
         bank,

@@ -40,15 +40,15 @@ class AdversarialSuite(ScenarioSuite):
     """One table: generators x scenarios x systems.
 
     Attributes:
-        systems: driving systems under test.
-        generators: names, or module:object.
-        budget: rollouts that a generator may spend on a base.
-        batch: how many of them it is asked for at once.
-        repetitions: searches of each, with seeds of their own.
-        keep: found scenarios that are saved, of each search, the most distinct first.
-        grade: tell of each of these who could have avoided the collision (docs/careful.md).
-        transfer: systems that the saved scenarios are also driven with.
-        chunk: base scenarios that one generator works on side by side.
+        systems: Driving systems under test.
+        generators: Names, or module:object.
+        budget: Rollouts that a generator may spend on a base.
+        batch: Rollouts that it proposes at once.
+        repetitions: Searches of each, with seeds of their own.
+        keep: Collisions that are saved of each search, the most distinct first.
+        grade: Whether to grade which careful drivers avoid each of these (docs/careful.md).
+        transfer: Systems that the saved scenarios are also driven with.
+        chunk: Base scenarios that one generator works on side by side.
     """
 
     kind: Literal["adversarial"] = "adversarial"
@@ -64,7 +64,7 @@ class AdversarialSuite(ScenarioSuite):
 
 
 class Adversarial(ScenarioKind):
-    """See the module."""
+    """Kind `adversarial`: a search for collisions by each generator, in each base scenario, against each system."""
 
     name = "adversarial"
     suite = AdversarialSuite
@@ -98,7 +98,7 @@ class Adversarial(ScenarioKind):
     )
 
     def plan(self, suite: AdversarialSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Systems, generators, scenarios and towns are looked up; with `check`, each scenario is built once."""
+        """Look up systems, generators, scenarios and towns; with `check`, build each scenario once."""
         from ssad.scenarios.dynamic import build_episode
         from ssad.scenarios.dynamic.generate import generator_factory
 
@@ -109,22 +109,24 @@ class Adversarial(ScenarioKind):
         generators = {name: source_version(factory.__module__) for name, factory in factories.items()}
         scenarios, towns = described(suite)
         if check:
-            episodes = [build_episode(one.scenario, town(one.scenario.town), seed=0) for one in scenarios]
+            episodes = [
+                build_episode(scenario.scenario, town(scenario.scenario.town), seed=0) for scenario in scenarios
+            ]
             for name, factory in factories.items():
-                refused = [refusal(factory, episode) for episode in episodes]
-                if all(refused):
-                    raise ConfigError(f"generator {name}: {refused[0]}")
-        others = [systems[name] for name in suite.transfer]
+                refusals = [refusal(factory, episode) for episode in episodes]
+                if all(refusals):
+                    raise ConfigError(f"generator {name}: {refusals[0]}")
+        transfer_versions = [systems[name] for name in suite.transfer]
         # all generators and systems meet the same bases with the same seeds
         cells = tuple(
             self.scenario_cell(
                 suite,
-                one,
+                scenario,
                 systems[system],
                 generators[generator],
-                *others,
+                *transfer_versions,
                 system=system,
-                title=f"{generator}/{system}/{one.scenario.name}{f'#{repetition}' if repetition else ''}",
+                title=f"{generator}/{system}/{scenario.scenario.name}{f'#{repetition}' if repetition else ''}",
                 chance=("adversarial", repetition),
                 fields={"generator": generator},
                 generator=generator,
@@ -135,23 +137,23 @@ class Adversarial(ScenarioKind):
                 grade=suite.grade,
                 transfer=list(suite.transfer),
             )
-            for generator, system, one, repetition in product(
+            for generator, system, scenario, repetition in product(
                 suite.generators, suite.systems, scenarios, range(suite.repetitions)
             )
         )
         return Plan(self, suite, device, cells, {"towns": towns, "systems": systems, "generators": generators})
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """See `ScenarioKind`; makes room for what is found."""
+        """Store the towns as `ScenarioKind` does, and make the folder of saved collisions."""
         safeio.make_folder(folder / "found")
         return super().prepare(plan, folder, resources)
 
     def alike(self, cell: Cell) -> Hashable:
-        """Cells of one generator and one system, whose bases it works on side by side."""
+        """Return generator and system: the generator works on the bases of one system side by side."""
         return cell.fields["generator"], cell.system
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
-        """Runs one generator on the bases that the system survives."""
+        """Run one generator on the bases that the system survives."""
         from ssad.drivers import make_system
         from ssad.scenarios.dynamic import scenario_from
         from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
@@ -160,93 +162,138 @@ class Adversarial(ScenarioKind):
         trials = Trials(lambda: make_system(system), make_system, device=job.device)
         scenarios = [scenario_from(cell.spec["scenario"]) for cell in cells]
         seeds = [cell.seed for cell in cells]
-        driven = trials.bases([(s, town(s.town), seed) for s, seed in zip(scenarios, seeds, strict=True)])
-        bases = {cell.key: base for cell, base in zip(cells, driven, strict=True)}
+        driven_bases = trials.bases(
+            [(value, town(value.town), seed) for value, seed in zip(scenarios, seeds, strict=True)]
+        )
+        bases = {cell.key: base for cell, base in zip(cells, driven_bases, strict=True)}
         factory = generator_factory(spec["generator"])
-        alive: list[Cell] = []
+        surviving_cells: list[Cell] = []
         results: dict[str, dict[str, Any]] = {}
         for cell in cells:
             base = bases[cell.key]
             refused, survived = refusal(factory, base.episode), not collides(base)
             if survived and not refused:
-                alive.append(cell)
+                surviving_cells.append(cell)
                 continue
             metrics: dict[str, Any] = {"applies": not refused, "survived": survived}
             results[cell.key] = {"metrics": metrics, "case": motion_hash(base.trace), "refused": refused}
-        if not alive:
+        if not surviving_cells:
             return results
-        began = time.process_time()
-        chosen = [bases[cell.key] for cell in alive]
-        generator = factory(chosen, seeds=[cell.seed for cell in alive], budget=spec["budget"])
-        clock: dict[int, float] = {}  # rollouts of each base -> s for all bases
+        start_time = time.process_time()
+        surviving_bases = [bases[cell.key] for cell in surviving_cells]
+        generator = factory(surviving_bases, seeds=[cell.seed for cell in surviving_cells], budget=spec["budget"])
+        time_by_rollouts: dict[int, float] = {}  # rollouts of each base -> s for all bases
         outcomes = search(
             generator,
-            chosen,
+            surviving_bases,
             trials,
             budget=spec["budget"],
             batch=spec["batch"],
-            after=lambda asked: clock.update({asked: time.process_time() - began}),
+            after=lambda rollout_count: time_by_rollouts.update({rollout_count: time.process_time() - start_time}),
         )
-        usual = reference(job.folder, job.device)
+        reference_motion = reference(job.folder, job.device)
         saved = [
-            self._save(cell, base, row, job.folder) for cell, base, row in zip(alive, chosen, outcomes, strict=True)
+            self._save(cell, base, trial_outcomes, job.folder)
+            for cell, base, trial_outcomes in zip(surviving_cells, surviving_bases, outcomes, strict=True)
         ]
-        kept = self._drive_again(alive, chosen, [made for _, made in saved], trials)
-        for cell, base, row, (about, _), more in zip(alive, chosen, outcomes, saved, kept, strict=True):
-            metrics = {"applies": True, "survived": True, **summary(row), **more.pop("metrics")}
-            metrics |= likeness(row, base.graph, usual)
-            metrics["seconds"] = max(clock.values()) / len(alive)
-            spent = [s for asked, s in clock.items() if metrics["CR"] and asked >= metrics["rollouts"]]
-            metrics["seconds_first"] = min(spent, default=math.nan) / len(alive)
-            results[cell.key] = {**about, **more, "metrics": plain(metrics), "case": cell.key, "n": len(row)}
+        replays = self._drive_again(
+            surviving_cells, surviving_bases, [saved_scenarios for _, saved_scenarios in saved], trials
+        )
+        for cell, base, trial_outcomes, (artefacts, _), replay_record in zip(
+            surviving_cells, surviving_bases, outcomes, saved, replays, strict=True
+        ):
+            metrics = {"applies": True, "survived": True, **summary(trial_outcomes), **replay_record.pop("metrics")}
+            metrics |= likeness(trial_outcomes, base.graph, reference_motion)
+            # All bases are searched side by side: each takes an equal part of the time.
+            metrics["seconds"] = max(time_by_rollouts.values()) / len(surviving_cells)
+            times_to_collision = [
+                value
+                for rollout_count, value in time_by_rollouts.items()
+                if metrics["CR"] and rollout_count >= metrics["rollouts"]
+            ]
+            metrics["seconds_first"] = min(times_to_collision, default=math.nan) / len(surviving_cells)
+            results[cell.key] = {
+                **artefacts,
+                **replay_record,
+                "metrics": plain(metrics),
+                "case": cell.key,
+                "n": len(trial_outcomes),
+            }
         return results
 
     def _save(
         self, cell: Cell, base: Base, row: Sequence[Outcome], folder: Path
     ) -> tuple[dict[str, Any], list[Scenario]]:
-        """Writes the most distinct collisions as scenarios, and keeps the trace of the first."""
-        mark = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
-        stem = f"{base.scenario.name}/{cell.spec['generator']}{mark}"
+        """Write the most distinct collisions as scenarios, and the trace of the first."""
+        suffix = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
+        stem = f"{base.scenario.name}/{cell.spec['generator']}{suffix}"
         artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
-        found, made = saved_collisions(folder / artefacts["scenarios"], base, row, keep=cell.spec["keep"], stem=stem)
-        if not found:
+        collisions, saved_scenarios = saved_collisions(
+            folder / artefacts["scenarios"], base, row, keep=cell.spec["keep"], stem=stem
+        )
+        if not collisions:
             return {}, []
-        assert found[0].trace is not None
-        save_trace(folder / artefacts["trace"], found[0].trace)
-        return {"artefacts": artefacts, "adversaries": list(found[0].adversaries)}, made
+        assert collisions[0].trace is not None
+        save_trace(folder / artefacts["trace"], collisions[0].trace)
+        return {"artefacts": artefacts, "adversaries": list(collisions[0].adversaries)}, saved_scenarios
 
     def _drive_again(
         self, cells: Sequence[Cell], bases: Sequence[Base], made: Sequence[Sequence[Scenario]], trials: Any
     ) -> list[dict[str, Any]]:
         """Drives what was saved again, grades it, and drives it with other systems; of all cells side by side."""
-        kept: list[dict[str, Any]] = [{"metrics": {"replayed": None}} for _ in cells]
-        some = [k for k, scenarios in enumerate(made) if scenarios]
-        # with another seed: what is saved must not depend on one
-        seeds = [cells[k].seed + 1 for k in some]
-        again = iter(
-            trials.bases([(s, bases[k].graph, seed) for k, seed in zip(some, seeds, strict=True) for s in made[k]])
+        records: list[dict[str, Any]] = [{"metrics": {"replayed": None}} for _ in cells]
+        cell_indices = [cell_index for cell_index, scenarios in enumerate(made) if scenarios]
+        # another seed: a saved collision must not depend on the seed of its search
+        seeds = [cells[cell_index].seed + 1 for cell_index in cell_indices]
+        replayed_bases = iter(
+            trials.bases(
+                [
+                    (scenario, bases[cell_index].graph, seed)
+                    for cell_index, seed in zip(cell_indices, seeds, strict=True)
+                    for scenario in made[cell_index]
+                ]
+            )
         )
-        others = transfer(
-            cells[0].spec["transfer"], [bases[k] for k in some], [made[k] for k in some], trials.device, seeds=seeds
+        transfer_records = transfer(
+            cells[0].spec["transfer"],
+            [bases[cell_index] for cell_index in cell_indices],
+            [made[cell_index] for cell_index in cell_indices],
+            trials.device,
+            seeds=seeds,
         )
-        hits = [[one for one in (next(again) for _ in made[k]) if collides(one)] for k in some]
-        graded = cells[0].spec["grade"]
-        found = iter(grades_of([(one.episode, one.trace) for row in hits for one in row if graded], trials.device))
-        for k, row, moved in zip(some, hits, others, strict=True):
-            metrics = {"replayed": len(row) / len(made[k])}
-            if graded:
-                metrics |= grades([next(found).metrics() for _ in row], row)
-            kept[k] = {"metrics": metrics, "transfer": moved}
-        return kept
+        collisions = [
+            [base for base in (next(replayed_bases) for _ in made[cell_index]) if collides(base)]
+            for cell_index in cell_indices
+        ]
+        is_graded = cells[0].spec["grade"]
+        collision_grades = iter(
+            grades_of(
+                [
+                    (base.episode, base.trace)
+                    for repeated_collisions in collisions
+                    for base in repeated_collisions
+                    if is_graded
+                ],
+                trials.device,
+            )
+        )
+        for cell_index, repeated_collisions, transfer_record in zip(
+            cell_indices, collisions, transfer_records, strict=True
+        ):
+            metrics = {"replayed": len(repeated_collisions) / len(made[cell_index])}
+            if is_graded:
+                metrics |= grades([next(collision_grades).metrics() for _ in repeated_collisions], repeated_collisions)
+            records[cell_index] = {"metrics": metrics, "transfer": transfer_record}
+        return records
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
-        """Page of a run and its tables."""
+        """Return the page of a run and its tables."""
         return page.section(run, self.verdict(run))
 
     def summary(self, run: Run) -> Table:
-        """Main table of a run."""
+        """Return the main table of a run."""
         return page.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences."""
+        """Return the findings of a run in sentences."""
         return verdict(run)

@@ -1,4 +1,4 @@
-"""The page of an adversarial run: generators on equal terms, against random search, and what they found from above."""
+"""Page of an adversarial run: generators on equal terms, against random search, and their collisions from above."""
 
 from __future__ import annotations
 
@@ -44,46 +44,46 @@ Line = Mapping[str, Any]
 
 
 def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
-    """The page of a run and its tables."""
-    makers = main_table, careful_table, budget_table, against_table, group_table, traffic_table, transfer_table
-    tables = [table for table in (make(run) for make in makers) if table]
-    failed = [
+    """Return the page of a run and its tables."""
+    table_builders = main_table, careful_table, budget_table, against_table, group_table, traffic_table, transfer_table
+    tables = [table for table in (build_table(run) for build_table in table_builders) if table]
+    failures = [
         ([str(line.get(name, "")) for name in ("generator", "system", "cluster")], line["status"], line["reason"])
         for line in run.failures
     ]
-    return render(TEMPLATE, run, verdict=verdict, tables=tables, failures=failed, views=views(run)), tables
+    return render(TEMPLATE, run, verdict=verdict, tables=tables, failures=failures, views=views(run)), tables
 
 
 def summary(run: Run) -> Table:
-    """The table that is shown on the terminal."""
-    wide = main_table(run)
-    keep = [k for k, column in enumerate(run.header["columns"]) if column["name"] in SUMMARY]
-    rows = tuple(replace(row, cells=tuple(row.cells[k] for k in keep)) for row in wide.rows)
+    """Return the table for the terminal."""
+    full_table = main_table(run)
+    column_indices = [index for index, column in enumerate(run.header["columns"]) if column["name"] in SUMMARY]
+    rows = tuple(replace(row, cells=tuple(row.cells[index] for index in column_indices)) for row in full_table.rows)
     columns = "survive plain replay", "CR", "rollouts to the first", "distinct", "ego moves", "avoidable"
-    return replace(wide, columns=columns, rows=rows, note=NOTE)
+    return replace(full_table, columns=columns, rows=rows, note=NOTE)
 
 
 def main_table(run: Run) -> Table:
-    """Generator and system: every column over all bases."""
-    wide = result_table(replace(run, header={**run.header, "factors": ["generator", "system"]}))
+    """Return every column over all bases, by generator and system."""
+    full_table = result_table(replace(run, header={**run.header, "factors": ["generator", "system"]}))
     note = (
         f"Over the base scenarios that the system survives in plain replay, {run.suite.get('budget')} rollouts each. "
         f"{METHODS}"
     )
-    return replace(wide, name="adversarial", title="Generators on equal terms", note=note)
+    return replace(full_table, name="adversarial", title="Generators on equal terms", note=note)
 
 
 def careful_table(run: Run) -> Table | None:
-    """How avoidable the collisions are, and how hard."""
+    """Return how avoidable and how hard the collisions are; None if none was graded."""
     rows = []
-    for head, lines in _searches(run).items():
+    for row_head, lines in _searches(run).items():
         cells = [
             Cell.of(
                 estimate([_case(line, _metric(line, name)) for line in lines], "mean" if "speed" in name else "bounded")
             )
             for name in GRADES
         ]
-        rows.append(Row(head, tuple(cells)))
+        rows.append(Row(row_head, tuple(cells)))
     if all(math.isnan(_metric(line, "attributable")) for line in run.lines):
         return None
     note = (
@@ -96,18 +96,18 @@ def careful_table(run: Run) -> Table | None:
 
 
 def transfer_table(run: Run) -> Table | None:
-    """Other systems in what was found against one: CR, and how much more than in the bases."""
+    """Return the CR of other systems in the saved scenarios, against the bases; None if none was transferred."""
     rows = []
-    for head, lines in _searches(run).items():
-        told = [line for line in lines if line.get("transfer")]
-        for system in dict.fromkeys(name for line in told for name in line["transfer"]):
-            found, base = (
-                {str(line["key"]): _case(line, float(line["transfer"][system][part])) for line in told}
-                for part in ("found", "base")
+    for row_head, lines in _searches(run).items():
+        transferred = [line for line in lines if line.get("transfer")]
+        for system in dict.fromkeys(name for line in transferred for name in line["transfer"]):
+            with_adversary, base = (
+                {str(line["key"]): _case(line, float(line["transfer"][system][condition])) for line in transferred}
+                for condition in ("found", "base")
             )
-            more = Cell.of(paired_difference(found, base))
-            ways = [Cell.of(estimate(list(part.values()), "bounded")) for part in (found, base)]
-            rows.append(Row((*head, system), (*ways, more)))
+            difference = Cell.of(paired_difference(with_adversary, base))
+            rates = [Cell.of(estimate(list(condition.values()), "bounded")) for condition in (with_adversary, base)]
+            rows.append(Row((*row_head, system), (*rates, difference)))
     if not rows:
         return None
     note = (
@@ -119,37 +119,39 @@ def transfer_table(run: Run) -> Table | None:
 
 
 def budget_table(run: Run) -> Table:
-    """CR within parts of the budget."""
+    """Return the CR within parts of the budget."""
     budget = int(run.suite.get("budget", 1))
-    steps = sorted({max(1, round(budget * share)) for share in (0.125, 0.25, 0.5, 1.0)})
+    rollout_limits = sorted({max(1, round(budget * share)) for share in (0.125, 0.25, 0.5, 1.0)})
     rows = []
-    for head, lines in _searches(run).items():
+    for row_head, lines in _searches(run).items():
         cells = []
-        for most in steps:
-            cases = [_case(line, _within(line, most)) for line in lines]
+        for rollout_limit in rollout_limits:
+            cases = [_case(line, _within(line, rollout_limit)) for line in lines]
             cells.append(Cell.of(estimate(cases, "share")))
-        rows.append(Row(head, tuple(cells)))
-    columns = tuple(f"CR within {n}" for n in steps)
+        rows.append(Row(row_head, tuple(cells)))
+    columns = tuple(f"CR within {count}" for count in rollout_limits)
     return Table("budget", "CR by rollouts spent", ("Generator", "System"), columns, tuple(rows), METHODS)
 
 
 def against_table(run: Run) -> Table | None:
-    """CR of each generator less that of random search, over the same bases."""
+    """Return the CR of each generator minus that of random search, over the same bases."""
     searches = _searches(run)
     rows = []
     for (generator, system), lines in searches.items():
-        other = searches.get((RANDOM, system))
-        if other is None or generator == RANDOM:
+        random_lines = searches.get((RANDOM, system))
+        if random_lines is None or generator == RANDOM:
             continue
-        first, second = (
+        generator_cases, random_cases = (
             {
                 f"{line['cluster']}#{line['spec']['repetition']}": _case(line, _within(line))
-                for line in part
+                for line in search_lines
                 if line["status"] != "ok" or not math.isnan(_within(line))
             }
-            for part in (lines, other)
+            for search_lines in (lines, random_lines)
         )
-        rows.append(Row((generator, system), (Cell.of(paired_difference(first, second, kind="share")),)))
+        rows.append(
+            Row((generator, system), (Cell.of(paired_difference(generator_cases, random_cases, kind="share")),))
+        )
     if not rows:
         return None
     note = f"CR of the generator minus that of random search in the same base scenarios with the same seeds. {METHODS}"
@@ -158,31 +160,36 @@ def against_table(run: Run) -> Table | None:
 
 
 def group_table(run: Run) -> Table:
-    """CR by group of base scenarios."""
+    """Return the CR by group of base scenarios."""
     groups = list(dict.fromkeys(str(line["group"]) for line in run.lines))
     rows = []
-    for head, lines in _searches(run).items():
+    for row_head, lines in _searches(run).items():
         cells = [
             Cell.of(estimate([_case(line, _within(line)) for line in lines if line["group"] == group], "share"))
             for group in groups
         ]
-        rows.append(Row(head, tuple(cells)))
+        rows.append(Row(row_head, tuple(cells)))
     return Table("groups", "CR by group", ("Generator", "System"), tuple(groups), tuple(rows), METHODS)
 
 
 def traffic_table(run: Run) -> Table | None:
-    """Systems in natural traffic and among Adv.PPO's adversaries by town, the paper's rows below."""
+    """Return systems in natural traffic and among Adv.PPO's adversaries by town, the paper's rows below."""
     rows = []
     for (generator, system), lines in _searches(run).items():
         natural = [line for line in lines if line["spec"].get("scenario", {}).get("type") == "NaturalJunction"]
         if generator != ADVERSARIES:
             continue
         for town in dict.fromkeys(str(line["spec"]["scenario"]["town"]) for line in natural):
-            here = [line for line in natural if line["spec"]["scenario"]["town"] == town]
-            without = {str(line["key"]): _case(line, 1.0 - _metric(line, "survived")) for line in here}
-            among = {str(line["key"]): _case(line, max(1.0 - _metric(line, "survived"), _found(line))) for line in here}
-            more = paired_difference(among, without, kind="share")
-            for traffic, cases, difference in (("natural", without, None), ("Adv.PPO", among, more)):
+            town_lines = [line for line in natural if line["spec"]["scenario"]["town"] == town]
+            natural_cases = {str(line["key"]): _case(line, 1.0 - _metric(line, "survived")) for line in town_lines}
+            adversarial_cases = {
+                str(line["key"]): _case(line, max(1.0 - _metric(line, "survived"), _found(line))) for line in town_lines
+            }
+            increase = paired_difference(adversarial_cases, natural_cases, kind="share")
+            for traffic, cases, difference in (
+                ("natural", natural_cases, None),
+                ("Adv.PPO", adversarial_cases, increase),
+            ):
                 cells = (
                     Cell.of(estimate(cases.values(), "share")),
                     Cell.of(difference) if difference else Cell(math.nan),
@@ -192,8 +199,8 @@ def traffic_table(run: Run) -> Table | None:
         return None
     for (system, traffic), by_town in NATURAL.items():
         for town, (rate, _, _) in by_town.items():
-            known = "natural" if traffic == "Autopilot" else traffic
-            rows.append(Row((system, known, town), (Cell(rate), Cell(math.nan)), published=True))
+            traffic_name = "natural" if traffic == "Autopilot" else traffic
+            rows.append(Row((system, traffic_name, town), (Cell(rate), Cell(math.nan)), published=True))
     note = (
         "Any collision with an adversary counts, wherever the adversary is. Where a system collides in natural traffic "
         f"no adversary was tried; it counts as colliding among them, too. Shaded rows: {SOURCE}. {METHODS}"
@@ -204,40 +211,40 @@ def traffic_table(run: Run) -> Table | None:
 
 
 def _found(line: Line) -> float:
-    """Whether any collision with an adversary was found; 0 where none was tried, NaN where the cell failed."""
+    """Return whether any collision with an adversary was found; 0 where none was tried, NaN where the cell failed."""
     if line["status"] != "ok":
         return math.nan
     return float(bool((line["metrics"] or {}).get("CR_any")))
 
 
 def views(run: Run) -> list[dict[str, str]]:
-    """Found scenarios from above, one of each generator and group in turn: data URI, caption, command."""
-    found: dict[tuple[str, str, str], Line] = {}
+    """Return collisions from above, one of each generator and group in turn: data URI, caption, command."""
+    lines_by_group: dict[tuple[str, str, str], Line] = {}
     for line in run.lines:
         if "trace" in (line.get("artefacts") or {}):
-            found.setdefault((str(line["generator"]), str(line["system"]), str(line["group"])), line)
-    shown = []
-    for (generator, system, _), line in list(found.items())[:VIEWS]:
+            lines_by_group.setdefault((str(line["generator"]), str(line["system"]), str(line["group"])), line)
+    entries = []
+    for (generator, system, _), line in list(lines_by_group.items())[:VIEWS]:
         try:
             trace = load_trace(run.folder / line["artefacts"]["trace"])
             graph = load_graph(run.folder / "towns" / town_file(trace.town))
         except SSADError:
             continue  # named on the page as missing or damaged
-        picture = found_view(trace, graph, [int(a) for a in line["adversaries"]])
-        data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
+        picture = found_view(trace, graph, [int(agent) for agent in line["adversaries"]])
+        encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
         caption = f"{generator} against {system} in {line['cluster']}"
         command = f"ssad run quick --set scenarios={run.folder / line['artefacts']['scenarios']} --set systems={system}"
-        uri = f"data:image/png;base64,{base64.b64encode(data).decode()}"
-        shown.append({"data": uri, "caption": caption, "command": command})
-    return shown
+        uri = f"data:image/png;base64,{base64.b64encode(encoded).decode()}"
+        entries.append({"data": uri, "caption": caption, "command": command})
+    return entries
 
 
 def _searches(run: Run) -> dict[tuple[str, str], list[Line]]:
-    """Lines by generator and system."""
-    found: dict[tuple[str, str], list[Line]] = {}
+    """Return the lines by generator and system."""
+    searches: dict[tuple[str, str], list[Line]] = {}
     for line in run.lines:
-        found.setdefault((str(line["generator"]), str(line["system"])), []).append(line)
-    return found
+        searches.setdefault((str(line["generator"]), str(line["system"])), []).append(line)
+    return searches
 
 
 def _within(line: Line, most: float = math.inf) -> float:
@@ -249,11 +256,11 @@ def _within(line: Line, most: float = math.inf) -> float:
 
 
 def _metric(line: Line, name: str) -> float:
-    """A metric of a line; NaN if it was not measured."""
+    """Return a metric of a line; NaN if it was not measured."""
     value = (line.get("metrics") or {}).get(name)
     return math.nan if value is None else float(value)
 
 
 def _case(line: Line, value: float) -> CaseValue:
-    """A search as a case of its base scenario."""
+    """Return a search as a case of its base scenario."""
     return CaseValue(value, str(line["cluster"]), str(line["key"]), failed=line["status"] != "ok")

@@ -11,26 +11,34 @@ def verdict(run: Run) -> list[str]:
 
     Searches that failed count, as in the tables.
     """
-    found = []
+    sentences = []
     for system, lines in lines_by(run, "system", failed=True).items():
         counts: dict[str, tuple[int, int, int]] = {}
         for generator in dict.fromkeys(str(line.get("generator") or "") for line in lines):
-            own = [line for line in lines if line.get("generator") == generator]
-            alive = sum(metric_of(line, "survived") == 1.0 for line in own)
-            if alive:
-                failed = sum(line["status"] != "ok" for line in own)
-                counts[generator] = sum(metric_of(line, "CR") == 1.0 for line in own), alive + failed, failed
+            search_lines = [line for line in lines if line.get("generator") == generator]
+            survivors = sum(metric_of(line, "survived") == 1.0 for line in search_lines)
+            if survivors:
+                failures = sum(line["status"] != "ok" for line in search_lines)
+                counts[generator] = (
+                    sum(metric_of(line, "CR") == 1.0 for line in search_lines),
+                    survivors + failures,
+                    failures,
+                )
         if not counts:
             if any(line["status"] == "ok" for line in lines):
-                found.append(f"{system} survives none of its scenarios unchanged: there is nothing to find.")
+                sentences.append(f"{system} survives none of its scenarios unchanged: there is nothing to find.")
             continue
-        best = sorted(counts, key=lambda name: -counts[name][0] / counts[name][1])
-        shown = list(counts) if len(best) <= 4 else [*best[:3], *(["random"] if "random" in best[3:] else [])]
-        said = ", ".join(_found_in(name, *counts[name]) for name in shown)
-        more = f" (the best three of {len(best)}{', and random search' * (len(shown) > 3)})" if len(best) > 4 else ""
-        what = f"{system} is made to collide" if counts[best[0]][0] else f"No generator makes {system} collide"
-        found.append(f"{what} in scenarios that it survives unchanged: {said}{more}.")
-    return found
+        ranking = sorted(counts, key=lambda name: -counts[name][0] / counts[name][1])
+        listed = list(counts) if len(ranking) <= 4 else [*ranking[:3], *(["random"] if "random" in ranking[3:] else [])]
+        summaries = ", ".join(_found_in(name, *counts[name]) for name in listed)
+        remark = (
+            f" (the best three of {len(ranking)}{', and random search' * (len(listed) > 3)})"
+            if len(ranking) > 4
+            else ""
+        )
+        subject = f"{system} is made to collide" if counts[ranking[0]][0] else f"No generator makes {system} collide"
+        sentences.append(f"{subject} in scenarios that it survives unchanged: {summaries}{remark}.")
+    return sentences
 
 
 def _found_in(generator: str, hits: int, tried: int, failed: int) -> str:

@@ -1,4 +1,4 @@
-"""The tables of a driving run: ours, with the paper's numbers beside them."""
+"""Tables of a driving run, with the paper's numbers beside them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,21 @@ AVERAGE = FAMILIES["pre-crash"]
 
 def precrash_table(run: DrivingRun) -> Table | None:
     """Metric x system rows, the eight scenarios and their average: the form of the paper's table, its rows below."""
-    systems = [s for s in run.systems if (s, AVERAGE) in run.numbers]
+    systems = [name for name in run.systems if (name, AVERAGE) in run.numbers]
     if not systems:
         return None
     rows = []
     for symbol in SHOWN:
         for system in systems:
-            found = [run.numbers.get((system, group)) for group in (*SCENARIOS, AVERAGE)]
-            rows.append(Row((symbol, system), tuple(Cell.of(v[symbol]) if v else Cell(math.nan) for v in found)))
+            estimates_by_group = [run.numbers.get((system, group)) for group in (*SCENARIOS, AVERAGE)]
+            rows.append(
+                Row(
+                    (symbol, system),
+                    tuple(Cell.of(value[symbol]) if value else Cell(math.nan) for value in estimates_by_group),
+                )
+            )
         for system, values in PRECRASH[symbol].items():
-            rows.append(Row((symbol, system), tuple(Cell(v) for v in values), published=True))
+            rows.append(Row((symbol, system), tuple(Cell(value) for value in values), published=True))
     note = (
         f"Shaded rows: {SOURCE}. Avg. is the mean of the scenarios' values. {METHODS} A failed episode counts in the "
         f"denominator. {_counts(run, systems)}"
@@ -43,21 +48,23 @@ def precrash_table(run: DrivingRun) -> Table | None:
 
 
 def _counts(run: DrivingRun, systems: list[str]) -> str:
-    """How many episodes and scenarios are behind the numbers, in a sentence."""
+    """Return in a sentence how many episodes and scenarios are behind the numbers."""
     parts = []
     for system in systems:
-        cells = [v["CR"] for group in SCENARIOS if (v := run.numbers.get((system, group)))]
-        told = [
+        cells = [estimates["CR"] for group in SCENARIOS if (estimates := run.numbers.get((system, group)))]
+        ranges = [
             str(low) if low == high else f"{low} to {high}"
-            for low, high in ((min(ns), max(ns)) for ns in ([c.n for c in cells], [c.clusters for c in cells]))
+            for low, high in (
+                (min(counts), max(counts)) for counts in ([cell.n for cell in cells], [cell.clusters for cell in cells])
+            )
         ]
-        parts.append(f"{system} {told[0]} in {told[1]} clusters")
+        parts.append(f"{system} {ranges[0]} in {ranges[1]} clusters")
     return f"Episodes in a cell: {', '.join(parts)}."
 
 
 def natural_table(run: DrivingRun) -> Table | None:
-    """System x town: CR, OR, DR, RC among random traffic, the paper's rows below."""
-    towns = {r.group: r.town for r in run.records if r.outcome.family == "natural"}
+    """Return system x town: CR, OR, DR, RC among random traffic, the paper's rows below."""
+    towns = {record.group: record.town for record in run.records if record.outcome.family == "natural"}
     if not towns:
         return None
     rows = []
@@ -67,10 +74,12 @@ def natural_table(run: DrivingRun) -> Table | None:
             if values:
                 traffic = f"Autopilot, {Cell.of(values['CR']).count.split(',')[0]}"
                 head = (system, traffic, towns.get(group, "mean of the towns"))
-                rows.append(Row(head, tuple(Cell.of(values[s]) for s in SHOWN)))
+                rows.append(Row(head, tuple(Cell.of(values[symbol]) for symbol in SHOWN)))
     for (system, traffic), by_town in NATURAL.items():
         for town, numbers in by_town.items():
-            rows.append(Row((system, traffic, town), (*(Cell(v) for v in numbers), Cell(math.nan)), published=True))
+            rows.append(
+                Row((system, traffic, town), (*(Cell(number) for number in numbers), Cell(math.nan)), published=True)
+            )
     note = (
         f"Shaded rows: {SOURCE}. Their DR fits SafeBench's normalised scale (DR / 5 m); ours here is in metres, and "
         f"includes up to half a metre of spacing between route points. See also the normalised table. {METHODS}"
@@ -80,20 +89,20 @@ def natural_table(run: DrivingRun) -> Table | None:
 
 
 def full_table(run: DrivingRun) -> Table:
-    """Every metric for every system and group."""
-    shown = tuple(s for s in METRICS if s != "LC" or run.measures(s))
+    """Return every metric for every system and group."""
+    symbols = tuple(symbol for symbol in METRICS if symbol != "LC" or run.measures(symbol))
     rows = [
-        Row((system, run.headings[group]), tuple(Cell.of(values[s]) for s in shown))
+        Row((system, run.headings[group]), tuple(Cell.of(values[symbol]) for symbol in symbols))
         for (system, group), values in run.numbers.items()
     ]
     note = f"Avg. is the mean of the eight pre-crash scenarios' values. {METHODS}"
     if not run.measures("SS"):
         note += " SS is not measured, since no town of this run has stop signs; the driving score is without them."
-    return Table("metrics", "All metrics", ("System", "Group"), shown, tuple(rows), note)
+    return Table("metrics", "All metrics", ("System", "Group"), symbols, tuple(rows), note)
 
 
 def normalised_table(run: DrivingRun) -> Table:
-    """The terms of SafeBench's overall score, each 0 (best) to 1 (worst), and the two scores made of them."""
+    """Return the terms of SafeBench's overall score, each 0 (best) to 1 (worst), and the two scores made of them."""
     columns = (
         "CR",
         f"OR / {DIVISORS['OR']:g} m",
@@ -106,7 +115,7 @@ def normalised_table(run: DrivingRun) -> Table:
     rows = []
     for (system, group), values in run.numbers.items():
         score = values["OS"]
-        shown = (
+        estimates = (
             values["CR"],
             _scaled("OR", values["OR"]),
             _scaled("DR", values["DR"]),
@@ -115,21 +124,24 @@ def normalised_table(run: DrivingRun) -> Table:
             score,
             score.scaled(-1.0, 1.0),
         )
-        rows.append(Row((system, run.headings[group]), tuple(Cell.of(e) for e in shown)))
+        rows.append(Row((system, run.headings[group]), tuple(Cell.of(estimate) for estimate in estimates)))
     note = f"SafeBench's score weighs CR 0.4, OR 0.1, DR 0.1, 1 - RC 0.3, TS 0.1; FREA's is one minus it. {METHODS}"
     title = "Normalised metrics and overall scores"
     return Table("normalised", title, ("System", "Group"), columns, tuple(rows), note)
 
 
 def _scaled(name: str, estimate: Estimate) -> Estimate:
-    """A raw metric over its divisor, cut at 1."""
-    ends = (v if math.isnan(v) else normalised(name, v) for v in (estimate.mean, estimate.low, estimate.high))
-    mean, low, high = ends
+    """Return a raw metric over its divisor, cut at 1."""
+    scaled_values = (
+        value if math.isnan(value) else normalised(name, value)
+        for value in (estimate.mean, estimate.low, estimate.high)
+    )
+    mean, low, high = scaled_values
     return replace(estimate, mean=mean, low=low, high=high)
 
 
 def summary_table(run: DrivingRun) -> Table:
-    """Scenario x system: the main metrics, the averages last; for the terminal."""
+    """Return scenario x system with the main metrics, the averages last, for the terminal."""
     rows = [
         Row((heading, system), tuple(Cell.of(values[symbol]) for symbol in SHOWN))
         for group, heading in run.headings.items()
@@ -144,6 +156,6 @@ def summary_table(run: DrivingRun) -> Table:
 
 
 def driving_tables(run: DrivingRun) -> list[Table]:
-    """All tables of a run."""
-    found = (precrash_table(run), natural_table(run), normalised_table(run), full_table(run))
-    return [t for t in found if t is not None]
+    """Return all tables of a run."""
+    candidates = (precrash_table(run), natural_table(run), normalised_table(run), full_table(run))
+    return [table for table in candidates if table is not None]

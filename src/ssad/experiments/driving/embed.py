@@ -26,9 +26,9 @@ NEAR = 80.0  # m around the episodes in which lanes are kept
 
 
 def pack(columns: npt.NDArray[np.int16]) -> str:
-    """int16 [C, T] -> text: differences along T, little-endian, zlib, base64."""
-    wide = np.diff(columns.astype(np.int32), axis=1, prepend=0)
-    return base64.b64encode(zlib.compress(wide.astype("<i2").tobytes(), 9)).decode()
+    """Encode int16 [C, T] as text: differences along T, little-endian, zlib, base64."""
+    differences = np.diff(columns.astype(np.int32), axis=1, prepend=0)
+    return base64.b64encode(zlib.compress(differences.astype("<i2").tobytes(), 9)).decode()
 
 
 def _i16(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
@@ -36,9 +36,9 @@ def _i16(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
 
 
 def origin(graph: LaneGraph) -> tuple[float, float]:
-    """Centre of the town's extent, m: what coordinates are relative to."""
-    middle = 0.5 * (graph.xy.min(axis=0).astype(np.float64) + graph.xy.max(axis=0))
-    return float(np.round(middle[0], 1)), float(np.round(middle[1], 1))
+    """Return the centre of the town's extent, m: the origin of all coordinates."""
+    centre = 0.5 * (graph.xy.min(axis=0).astype(np.float64) + graph.xy.max(axis=0))
+    return float(np.round(centre[0], 1)), float(np.round(centre[1], 1))
 
 
 def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
@@ -52,17 +52,17 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
         The agents' bodies; the packed motion: [3 A + 1 rows of T] x, y, yaw per agent, then presence (bits of 15 agents
         a row); the packed record of the ego; its route; and the events.
     """
-    ox, oy = origin(graph)
-    agents = len(trace.names)
+    origin_x, origin_y = origin(graph)
+    agent_count = len(trace.names)
     rows = []
-    for a in range(agents):
-        rows += [(trace.x[:, a] - ox) / SCALE, (trace.y[:, a] - oy) / SCALE]
-        rows.append(np.arctan2(np.sin(trace.yaw[:, a]), np.cos(trace.yaw[:, a])) / np.pi * 32767)
+    for agent in range(agent_count):
+        rows += [(trace.x[:, agent] - origin_x) / SCALE, (trace.y[:, agent] - origin_y) / SCALE]
+        rows.append(np.arctan2(np.sin(trace.yaw[:, agent]), np.cos(trace.yaw[:, agent])) / np.pi * 32767)
     # presence as bits of 15 agents a row
-    words = []
-    for first in range(0, agents, 15):
-        bits = 1 << np.arange(min(15, agents - first))
-        words.append(trace.active[:, first : first + 15].astype(np.int64) @ bits)
+    presence = []
+    for first_agent in range(0, agent_count, 15):
+        bits = 1 << np.arange(min(15, agent_count - first_agent))
+        presence.append(trace.active[:, first_agent : first_agent + 15].astype(np.int64) @ bits)
     record = [
         trace.speed[:, 0] / SPEED,
         trace.throttle * SHARE,
@@ -72,19 +72,19 @@ def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
         _gap(trace) / SPEED,
         trace.off_road.astype(np.float64),
     ]
-    hits = [[int(t), int(trace.contact_agent[t])] for t in np.flatnonzero(trace.contact)]
+    contacts = [[int(step), int(trace.contact_agent[step])] for step in np.flatnonzero(trace.contact)]
     return {
         "dt": trace.dt,
         "steps": len(trace.accel),
         "names": list(trace.names),
         "kinds": trace.kind.tolist(),
         "size": np.round(np.stack([trace.length, trace.width], 1), 2).tolist(),
-        "motion": pack(np.stack([_i16(np.asarray(r)) for r in [*rows, *words]])),
-        "record": pack(np.stack([_i16(r) for r in record])),
-        "route": pack(_i16((thin(trace.route.astype(np.float64)) - [ox, oy]) / SCALE).T),
-        "hits": hits,
+        "motion": pack(np.stack([_i16(np.asarray(row)) for row in [*rows, *presence]])),
+        "record": pack(np.stack([_i16(row) for row in record])),
+        "route": pack(_i16((thin(trace.route.astype(np.float64)) - [origin_x, origin_y]) / SCALE).T),
+        "hits": contacts,
         "red": np.flatnonzero(trace.red_light).tolist(),
-        "signals": [_changes(trace.signal[:, s], int(i)) for s, i in enumerate(trace.signal_ids)],
+        "signals": [_changes(trace.signal[:, column], int(signal)) for column, signal in enumerate(trace.signal_ids)],
         "end": trace.end,
     }
 
@@ -93,60 +93,69 @@ def _gap(trace: EpisodeTrace) -> npt.NDArray[np.float64]:
     """Rough free distance to the nearest other agent, m (centres less half lengths): for the read-out only."""
     if len(trace.names) < 2:
         return np.full(len(trace.accel), 300.0)
-    d = np.hypot(trace.x[:, 1:] - trace.x[:, :1], trace.y[:, 1:] - trace.y[:, :1])
-    d = d - 0.5 * (trace.length[1:] + trace.length[0])
-    least = np.where(trace.active[:, 1:], d, np.inf).min(axis=1)
-    out: npt.NDArray[np.float64] = np.clip(np.nan_to_num(least.astype(np.float64), posinf=300.0), 0.0, 300.0)
-    return out
+    distances = np.hypot(trace.x[:, 1:] - trace.x[:, :1], trace.y[:, 1:] - trace.y[:, :1])
+    distances = distances - 0.5 * (trace.length[1:] + trace.length[0])
+    nearest = np.where(trace.active[:, 1:], distances, np.inf).min(axis=1)
+    clipped: npt.NDArray[np.float64] = np.clip(np.nan_to_num(nearest.astype(np.float64), posinf=300.0), 0.0, 300.0)
+    return clipped
 
 
 def _changes(states: npt.NDArray[np.uint8], index: int) -> list[Any]:
-    """[signal, [[step, state], ...]]: only where the state changes."""
-    at = np.flatnonzero(np.diff(states.astype(np.int16), prepend=-1))
-    return [index, [[int(t), int(states[t])] for t in at]]
+    """Return [signal, [[step, state], ...]]: only where the state changes."""
+    change_steps = np.flatnonzero(np.diff(states.astype(np.int16), prepend=-1))
+    return [index, [[int(step), int(states[step])] for step in change_steps]]
 
 
 def town_data(graph: LaneGraph, traces: Iterable[EpisodeTrace]) -> dict[str, Any]:
-    """Lanes within `NEAR` m of the episodes' routes as strips and edge lines, and the signals."""
-    places = np.concatenate([t.route[::10] for t in traces]).astype(np.float64)
-    cells = {tuple(c) for c in np.floor(places / NEAR).astype(int)}
-    near = {(x + i, y + j) for x, y in cells for i in (-1, 0, 1) for j in (-1, 0, 1)}
-    ox, oy = origin(graph)
-    drawn: list[list[Any]] = []
+    """Return lanes within `NEAR` m of the episodes' routes as strips and edge lines, and the signals."""
+    route_points = np.concatenate([trace.route[::10] for trace in traces]).astype(np.float64)
+    cells = {tuple(cell) for cell in np.floor(route_points / NEAR).astype(int)}
+    # Cells of the grid next to those with a route: every lane within one cell's width is kept.
+    near_cells = {(x + i, y + j) for x, y in cells for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    origin_x, origin_y = origin(graph)
+    shapes: list[list[Any]] = []
     lanes = strips(graph)
     for area in junction_areas(graph, lanes):
-        if any(tuple(c) in near for c in np.floor(area / NEAR).astype(int)):
-            drawn.append([LAYERS[LaneType.DRIVING], 1, [0, 0], len(area), _flat(area, ox, oy)])
+        if any(tuple(cell) in near_cells for cell in np.floor(area / NEAR).astype(int)):
+            shapes.append([LAYERS[LaneType.DRIVING], 1, [0, 0], len(area), _flat(area, origin_x, origin_y)])
     for strip in lanes:
-        middle = 0.5 * (strip.left[[0, -1]] + strip.right[[0, -1]])
-        both = np.concatenate([strip.ring, middle])
-        if any(tuple(c) in near for c in np.floor(both / NEAR).astype(int)):
+        end_centres = 0.5 * (strip.left[[0, -1]] + strip.right[[0, -1]])
+        # A long straight strip may have no corner near the route: its ends are tested by their centres too.
+        test_points = np.concatenate([strip.ring, end_centres])
+        if any(tuple(cell) in near_cells for cell in np.floor(test_points / NEAR).astype(int)):
             lines = _lines(graph, strip.lane)
-            drawn.append([strip.layer, int(strip.junction), lines, len(strip.left), _flat(strip.ring, ox, oy)])
-    signals = [[round(float(x) - ox, 2), round(float(y) - oy, 2)] for x, y in graph.signal_xy]
-    return {"origin": [ox, oy], "strips": drawn, "signals": signals, "crosswalks": _crosswalks(graph, ox, oy)}
+            shapes.append(
+                [strip.layer, int(strip.junction), lines, len(strip.left), _flat(strip.ring, origin_x, origin_y)]
+            )
+    signals = [[round(float(x) - origin_x, 2), round(float(y) - origin_y, 2)] for x, y in graph.signal_xy]
+    return {
+        "origin": [origin_x, origin_y],
+        "strips": shapes,
+        "signals": signals,
+        "crosswalks": _crosswalks(graph, origin_x, origin_y),
+    }
 
 
 def _lines(graph: LaneGraph, lane: int) -> list[int]:
-    """How the left and right edge are drawn: 0 nothing, 1 broken, 2 solid, 3 double (between opposing lanes)."""
-    out = []
+    """Return line codes of the left and right edge: 0 none, 1 broken, 2 solid, 3 double (between opposing lanes)."""
+    line_codes = []
     for side in (graph.left, graph.right):
-        other = int(side[lane])
+        neighbour = int(side[lane])
         if graph.junction[lane] >= 0 or graph.kind[lane] != LaneType.DRIVING:
-            out.append(0)
-        elif other < 0 or graph.kind[other] != LaneType.DRIVING:
-            out.append(2)
-        elif np.sign(graph.lane_id[other]) == np.sign(graph.lane_id[lane]):
-            out.append(1)
+            line_codes.append(0)
+        elif neighbour < 0 or graph.kind[neighbour] != LaneType.DRIVING:
+            line_codes.append(2)
+        elif np.sign(graph.lane_id[neighbour]) == np.sign(graph.lane_id[lane]):
+            line_codes.append(1)
         else:
-            out.append(3)
-    return out
+            line_codes.append(3)
+    return line_codes
 
 
 def _flat(xy: npt.NDArray[np.float64], ox: float, oy: float) -> list[float]:
-    return [round(float(v), 2) for v in (xy - [ox, oy]).reshape(-1)]
+    return [round(float(value), 2) for value in (xy - [ox, oy]).reshape(-1)]
 
 
 def _crosswalks(graph: LaneGraph, ox: float, oy: float) -> list[list[float]]:
     ends: Sequence[int] = graph.crosswalk_offset.tolist()
-    return [_flat(graph.crosswalk_xy[a:b].astype(np.float64), ox, oy) for a, b in itertools.pairwise(ends)]
+    return [_flat(graph.crosswalk_xy[first:end].astype(np.float64), ox, oy) for first, end in itertools.pairwise(ends)]

@@ -1,4 +1,4 @@
-"""The records of a driving run, and the numbers that its page shows, each computed once."""
+"""Records of a driving run, and the numbers of its page, each computed once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FAMILY_TITLES = {"pre-crash": "pre-crash", "natural": "natural traffic", "other"
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """One finished episode: what its line of results.jsonl says, and why it ended."""
+    """One finished episode: its line of results.jsonl, and why it ended."""
 
     key: str
     system: str
@@ -39,7 +39,7 @@ class EpisodeRecord:
 
     @property
     def heading(self) -> str:
-        """What the episode is shown under: the paper's name of its scenario, or its type and group."""
+        """Heading of the episode: the paper's name of its scenario, or its type and group."""
         if self.group in SCENARIOS:
             return SCENARIOS[self.group]
         return self.group if self.group in ("", self.type) else f"{TYPES.get(self.type, self.type)}: {self.group}"
@@ -54,44 +54,47 @@ class DrivingRun:
 
     @property
     def folder(self) -> Path:
-        """Where the run lies."""
+        """Folder of the run."""
         return self.run.folder
 
     @cached_property
     def systems(self) -> list[str]:
         """Systems in the order of the suite."""
-        return list(dict.fromkeys(r.system for r in self.records))
+        return list(dict.fromkeys(record.system for record in self.records))
 
     @cached_property
     def headings(self) -> dict[str, str]:
-        """Group, or average of a family -> what it is called; in the order of the suite, the averages last."""
-        return {r.group: r.heading for r in self.records} | {name: name for name in FAMILIES.values()}
+        """Group, or average of a family -> heading; in the order of the suite, the averages last."""
+        return {record.group: record.heading for record in self.records} | {name: name for name in FAMILIES.values()}
 
     @cached_property
     def numbers(self) -> dict[tuple[str, str], dict[str, Estimate]]:
         """(system, group or average of a family) -> symbol -> estimate: the source of every number on the page."""
         return {
-            (row.system, row.group): row.values for row in aggregate_groups((r.system, r.outcome) for r in self.records)
+            (row.system, row.group): row.values
+            for row in aggregate_groups((record.system, record.outcome) for record in self.records)
         }
 
     def average(self, system: str, family: str) -> dict[str, Estimate] | None:
-        """The average of a family's groups, or its only group; None if the system has none."""
-        groups = [r.group for r in self.records if r.system == system and r.outcome.family == family]
+        """Return the average of a family's groups, or its only group; None if the system has none."""
+        groups = [
+            record.group for record in self.records if record.system == system and record.outcome.family == family
+        ]
         return self.numbers.get((system, FAMILIES[family])) or (self.numbers[system, groups[0]] if groups else None)
 
     def measures(self, symbol: str) -> bool:
-        """Whether any episode measured a metric."""
+        """Return whether any episode measured a metric."""
         return any(values[symbol].n for values in self.numbers.values())
 
 
 def load_episodes(run: Run) -> DrivingRun:
-    """The episodes of a driving run."""
+    """Return the episodes of a driving run."""
     return DrivingRun(run, tuple(_record(line, run.episodes.get(line["key"], {})) for line in run.lines))
 
 
 def _record(line: Mapping[str, Any], episode: Mapping[str, Any]) -> EpisodeRecord:
     scenario = line["spec"]["scenario"]
-    ok = line["status"] == "ok"
+    succeeded = line["status"] == "ok"
     return EpisodeRecord(
         key=line["key"],
         system=line["system"],
@@ -104,5 +107,5 @@ def _record(line: Mapping[str, Any], episode: Mapping[str, Any]) -> EpisodeRecor
         end=episode.get("end", ""),
         outcome=Outcome.from_record(line, episode.get("trace_hash", "")),
         witness=line.get("witness"),
-        trace=line.get("artefacts", {}).get("trace", "") if ok else "",
+        trace=line.get("artefacts", {}).get("trace", "") if succeeded else "",
     )

@@ -19,14 +19,18 @@ def interval_plot(run: DrivingRun, symbol: str = "CR") -> str:
     parts: list[str] = []
     y = 8.0
     for group, name in run.headings.items():
-        found = [(s, Cell.of(run.numbers[s, group][symbol])) for s in run.systems if (s, group) in run.numbers]
-        if not found:
+        system_cells = [
+            (candidate, Cell.of(run.numbers[candidate, group][symbol]))
+            for candidate in run.systems
+            if (candidate, group) in run.numbers
+        ]
+        if not system_cells:
             continue
-        middle = y + STEP * len(found) / 2
-        parts.append(f'<text x="{LABEL}%" y="{middle + 4:.1f}" text-anchor="end">{escape(name)}</text>')
-        for system, cell in found:
+        group_y = y + STEP * len(system_cells) / 2
+        parts.append(f'<text x="{LABEL}%" y="{group_y + 4:.1f}" text-anchor="end">{escape(name)}</text>')
+        for system, cell in system_cells:
             colour = COLOURS[run.systems.index(system) % len(COLOURS)]
-            at = y + STEP / 2
+            row_y = y + STEP / 2
             if cell.interval:
                 low, high = LEFT + WIDTH * cell.low, LEFT + WIDTH * cell.high
                 style = (
@@ -34,21 +38,23 @@ def interval_plot(run: DrivingRun, symbol: str = "CR") -> str:
                     if cell.method == "range"
                     else 'stroke-width="3" stroke-linecap="round" opacity=".45"'
                 )
-                parts.append(f'<line x1="{low:.2f}%" x2="{high:.2f}%" y1="{at}" y2="{at}" stroke="{colour}" {style}/>')
+                parts.append(
+                    f'<line x1="{low:.2f}%" x2="{high:.2f}%" y1="{row_y}" y2="{row_y}" stroke="{colour}" {style}/>'
+                )
             if not math.isnan(cell.mean):
                 parts.append(
-                    f'<circle cx="{LEFT + WIDTH * cell.mean:.2f}%" cy="{at}" r="5" fill="{colour}">'
+                    f'<circle cx="{LEFT + WIDTH * cell.mean:.2f}%" cy="{row_y}" r="5" fill="{colour}">'
                     f"<title>{escape(f'{system}: {cell.text}, {cell.tip}')}</title></circle>"
                 )
             y += STEP
         y += GAP
     height = y + 22
-    grid = "".join(
-        f'<line x1="{LEFT + WIDTH * k / 4}%" x2="{LEFT + WIDTH * k / 4}%" y1="2" y2="{y - 6:.1f}" '
-        f'class="grid"/><text x="{LEFT + WIDTH * k / 4}%" y="{y + 12:.1f}" text-anchor="middle">{k / 4:g}</text>'
-        for k in range(5)
+    grid_lines = "".join(
+        f'<line x1="{LEFT + WIDTH * tick / 4}%" x2="{LEFT + WIDTH * tick / 4}%" y1="2" y2="{y - 6:.1f}" '
+        f'class="grid"/><text x="{LEFT + WIDTH * tick / 4}%" y="{y + 12:.1f}" text-anchor="middle">{tick / 4:g}</text>'
+        for tick in range(5)
     )
     return (
         f'<svg height="{height:.0f}" role="img" '
-        f'aria-label="collision rate with 95 % intervals">{grid}{"".join(parts)}</svg>'
+        f'aria-label="collision rate with 95 % intervals">{grid_lines}{"".join(parts)}</svg>'
     )

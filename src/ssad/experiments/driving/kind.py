@@ -63,7 +63,7 @@ class DrivingSuite(ScenarioSuite):
 
 
 class Driving(ScenarioKind):
-    """See the module."""
+    """Kind `driving`: one episode for each system, scenario and repetition."""
 
     name = "driving"
     suite = DrivingSuite
@@ -71,16 +71,16 @@ class Driving(ScenarioKind):
     factors = ("system", "group")
 
     def plan(self, suite: DrivingSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Systems, scenarios and towns are looked up; with `check`, each scenario is built once."""
+        """Look up systems, scenarios and towns; with `check`, build each scenario once."""
         check_distinct(suite, "systems", suite.systems)
         systems = {name: system_version(name) for name in suite.systems}
         scenarios, towns = described(suite)
-        away: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
-        if away:
+        remote_spec: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
+        if remote_spec:
             from ssad.simulators.carla.server import Server, probe
 
             server = Server.of(suite.simulator)
-            if any(one.scenario.type == HIGHWAY_TYPE for one in scenarios):
+            if any(scenario.scenario.type == HIGHWAY_TYPE for scenario in scenarios):
                 raise ConfigError(f"suite {suite.name}: scenarios of highway-env do not run in {server}")
             if check:
                 probe(server)
@@ -88,79 +88,84 @@ class Driving(ScenarioKind):
         cells = tuple(
             self.scenario_cell(
                 suite,
-                one,
+                scenario,
                 systems[system],
                 system=system,
                 chance=("episode", repetition),
-                title=f"{system}/{one.scenario.name}{f'#{repetition}' if repetition else ''}",
+                title=f"{system}/{scenario.scenario.name}{f'#{repetition}' if repetition else ''}",
                 repetition=repetition,
                 spread=suite.spread if repetition else 0.0,
-                **away,
+                **remote_spec,
             )
             for system in suite.systems
-            for one in scenarios
+            for scenario in scenarios
             for repetition in range(suite.repetitions)
         )
         if check:
+            # Cells of the first system, one a scenario: systems meet the same episodes.
             for cell in cells[: len(scenarios) * suite.repetitions : suite.repetitions]:
                 _check(cell)
         return Plan(self, suite, device, cells, {"towns": towns, "systems": systems})
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """See `ScenarioKind`. ConfigError: a CARLA server on a cluster."""
+        """Store the towns as `ScenarioKind` does.
+
+        Raises:
+            ConfigError: A CARLA server on a cluster.
+        """
         super().prepare(plan, folder, resources)
         if resources.ray and plan.suite.simulator != EMBEDDED:
             raise ConfigError(f"suite {plan.suite.name}: one worker drives {plan.suite.simulator}; leave out --ray")
         return {"witness": plan.suite.witness}
 
     def workers(self, plan: Plan, asked: int | None) -> int | None:
-        """A CARLA server runs one world: one worker drives it."""
+        """Return one worker for a CARLA server, which runs one world."""
         return asked if asked == 0 or plan.suite.simulator == EMBEDDED else 1
 
     def alike(self, cell: Cell) -> Hashable:
-        """Cells of a system in one simulator; CARLA drives one at a time."""
+        """Return system and simulator; CARLA drives one cell at a time."""
         return cell.key if "simulator" in cell.spec else (cell.system, in_highway(cell))
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
-        """Drives the episodes as one batch of the world, measures them, writes their traces."""
-        began = time.perf_counter()
+        """Drive the episodes as one batch of the world, measure them, write their traces."""
+        start_time = time.perf_counter()
         episodes, traces, measured = drive(cells, device=job.device)
-        shared = (time.perf_counter() - began) / len(cells)
+        shared_seconds = (time.perf_counter() - start_time) / len(cells)
         results: dict[str, dict[str, Any]] = {}
         for cell, episode, trace in zip(cells, episodes, traces, strict=True):
-            began = time.perf_counter()
+            start_time = time.perf_counter()
             result = drive_record(cell, episode, trace, job.folder)
             if measured:
                 result["metrics"]["lane_crossings"] = measured["lane_crossings"]
                 result["measured"] = plain(measured)
             if job.settings["witness"] and trace.end == "collision" and embedded(cell):
-                found = grade_of(episode, trace, job.device)
-                result["metrics"] |= found.metrics()
-                result["witness"] = plain(found.as_dict())
-            results[cell.key] = result | {"wall_s": shared + time.perf_counter() - began}
+                grade = grade_of(episode, trace, job.device)
+                result["metrics"] |= grade.metrics()
+                result["witness"] = plain(grade.as_dict())
+            results[cell.key] = result | {"wall_s": shared_seconds + time.perf_counter() - start_time}
         return results
 
     def drive_again(self, plan: Plan, cell: Cell, record: Mapping[str, Any]) -> EpisodeTrace:
-        """See `ScenarioKind`."""
+        """Drive a cell again and return its trace."""
         _, (trace,), _ = drive([cell], device=plan.device)
         return trace
 
     def finish(self, plan: Plan, folder: Path) -> None:
-        """The pictures that the suite asks for, made once beside its results."""
+        """Write the pictures that the suite requests, once, beside its results."""
         from ssad.experiments.driving.run_images import write_pictures
 
         write_pictures(plan.suite.pictures, folder)
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
-        """Page of a run and its tables."""
+        """Return the page of a run and its tables."""
         return page.section(run, self.verdict(run))
 
     def summary(self, run: Run) -> Table:
-        """Main table of a run."""
+        """Return the main table of a run."""
         return page.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences."""
+        """Return the findings of a run in sentences."""
         return verdict(run)
 
 

@@ -1,4 +1,4 @@
-"""The page of a driving run: cards, the paper's tables beside ours, replays, what could have avoided the collisions."""
+"""Page of a driving run: cards, the paper's tables beside ours, replays, and which drivers avoid the collisions."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ PICTURES = {
 
 
 def summary(found: Run) -> Table:
-    """The table that is shown on the terminal."""
+    """Return the table for the terminal."""
     return summary_table(load_episodes(found))
 
 
 def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
-    """The page of a driving run and its tables."""
+    """Return the page of a driving run and its tables."""
     run = load_episodes(found)
     tables = driving_tables(run)
-    named = {table.name: table for table in tables}
+    tables_by_name = {table.name: table for table in tables}
     replay = replay_data(run)
     gallery = _pictures(found)
     if gallery:
@@ -52,15 +52,15 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
         found,
         verdict=verdict,
         tiles=[_tile(run, system) for system in run.systems],
-        precrash=named.get("precrash"),
-        natural=named.get("natural"),
-        full=named["metrics"],
-        normalised=named["normalised"],
+        precrash=tables_by_name.get("precrash"),
+        natural=tables_by_name.get("natural"),
+        full=tables_by_name["metrics"],
+        normalised=tables_by_name["normalised"],
         plot=interval_plot(run),
         matrix=_matrix(run),
-        failures=[r for r in run.records if r.status != "ok"],
+        failures=[record for record in run.records if record.status != "ok"],
         witness=_witness(run),
-        metrics={name: metric for name, metric in METRICS.items() if name in named["metrics"].columns},
+        metrics={name: metric for name, metric in METRICS.items() if name in tables_by_name["metrics"].columns},
         stop_signs=run.measures("SS"),
         # "</" would end the script element that holds the data
         replay=safeio.dump_json(replay).replace("</", "<\\/"),
@@ -71,57 +71,66 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
 
 
 def _pictures(run: Run) -> list[dict[str, Any]]:
-    """The pictures of the run, grouped by the start of their names."""
-    every = pictures(run.folder)
+    """Return the pictures of the run, grouped by the start of their names."""
+    all_pictures = pictures(run.folder)
     groups = []
     for name, (title, note, command) in PICTURES.items():
-        own = [p for p in every if p["file"].startswith(name)]
-        if own:
-            groups.append({"name": name, "title": title, "note": note, "command": command, "pictures": own})
+        group_pictures = [picture for picture in all_pictures if picture["file"].startswith(name)]
+        if group_pictures:
+            groups.append({"name": name, "title": title, "note": note, "command": command, "pictures": group_pictures})
     return groups
 
 
 def _tile(run: DrivingRun, system: str) -> dict[str, Any]:
-    """Headline numbers of one system: those of the tables' averages."""
+    """Return the headline numbers of one system: those of the tables' averages."""
     parts = []
     for family, title in FAMILY_TITLES.items():
         values = run.average(system, family)
         if values:
-            shown = {symbol: Cell.of(values[symbol]) for symbol in ("CR", "RC", "DS")}
-            several = len({r.group for r in run.records if r.system == system and r.outcome.family == family}) > 1
-            name = f"{title}, mean of the groups" if several else title
-            parts.append({"name": name, "count": shown["CR"].count} | shown)
+            cells = {symbol: Cell.of(values[symbol]) for symbol in ("CR", "RC", "DS")}
+            has_several = (
+                len(
+                    {
+                        record.group
+                        for record in run.records
+                        if record.system == system and record.outcome.family == family
+                    }
+                )
+                > 1
+            )
+            name = f"{title}, mean of the groups" if has_several else title
+            parts.append({"name": name, "count": cells["CR"].count} | cells)
     return {
         "system": system,
         "parts": parts,
-        "failed": sum(r.system == system and r.status != "ok" for r in run.records),
+        "failed": sum(record.system == system and record.status != "ok" for record in run.records),
     }
 
 
 def _matrix(run: DrivingRun) -> list[dict[str, Any]]:
-    """Groups of episodes, one row per system."""
+    """Return groups of episodes, one row per system."""
     groups: dict[str, dict[str, list[dict[str, str]]]] = {}
-    for r in run.records:
-        why = r.reason or r.end.replace("_", " ")
-        mark = {"key": r.key, "outcome": outcome_class(r), "scenario": r.scenario, "why": why}
-        groups.setdefault(r.heading, {}).setdefault(r.system, []).append(mark)
+    for record in run.records:
+        reason = record.reason or record.end.replace("_", " ")
+        mark = {"key": record.key, "outcome": outcome_class(record), "scenario": record.scenario, "why": reason}
+        groups.setdefault(record.heading, {}).setdefault(record.system, []).append(mark)
     return [{"group": name, "systems": systems} for name, systems in groups.items()]
 
 
 def _witness(run: DrivingRun) -> dict[str, Any] | None:
     """For each system and group: of how many collisions, how many each careful driver avoids, and anybody."""
     rows: dict[tuple[str, str], Counter[str]] = {}
-    for r in run.records:
-        if r.witness and "avoids" in r.witness:
-            row = rows.setdefault((r.system, r.heading), Counter())
+    for record in run.records:
+        if record.witness and "avoids" in record.witness:
+            row = rows.setdefault((record.system, record.heading), Counter())
             row["n"] += 1
-            row.update({name: int(fine) for name, fine in r.witness["avoids"].items()})
-            row["limit"] += r.witness["verdict"] != "unavoidable"
+            row.update({name: int(avoids) for name, avoids in record.witness["avoids"].items()})
+            row["limit"] += record.witness["verdict"] != "unavoidable"
     if not rows:
         return None
     for system in run.systems:
-        own = [row for (name, _), row in rows.items() if name == system]
-        if len(own) > 1:
-            rows[system, "all"] = sum(own, Counter())
+        system_rows = [row for (name, _), row in rows.items() if name == system]
+        if len(system_rows) > 1:
+            rows[system, "all"] = sum(system_rows, Counter())
     order = sorted(rows, key=lambda key: run.systems.index(key[0]))
     return {"rows": {key: rows[key] for key in order}, "columns": {**MODELS, "limit": "any manoeuvre tried"}}

@@ -1,4 +1,4 @@
-"""The replays of a driving page: every episode's data, and what became of it in words."""
+"""Replays of a driving page: every episode's data, and its outcome in words."""
 
 from __future__ import annotations
 
@@ -23,50 +23,57 @@ MODELS = {
 
 
 def outcome_class(record: EpisodeRecord) -> str:
-    """Class of an episode in the matrix."""
+    """Return the class of an episode in the matrix."""
     if record.status != "ok":
         return "failed"
     return record.end if record.end in ("collision", "complete") else "cut"
 
 
 def _graph(run: DrivingRun, town: str) -> LaneGraph:
-    """The town as the run saw it. StoreError: the folder has lost it."""
-    own = run.folder / "towns" / town_file(town)
-    if own.is_file():
-        return load_graph(own)
-    raise StoreError(f"towns/{own.name} is missing: this run folder is not complete")
+    """Return the town as stored with the run.
+
+    Raises:
+        StoreError: The folder has lost it.
+    """
+    town_path = run.folder / "towns" / town_file(town)
+    if town_path.is_file():
+        return load_graph(town_path)
+    raise StoreError(f"towns/{town_path.name} is missing: this run folder is not complete")
 
 
 def replay_data(run: DrivingRun) -> dict[str, Any]:
-    """All that the page's replay needs, keyed by cell and town, and which replays are missing and why."""
+    """Return all data of the page's replay, keyed by cell and town, and which replays are missing and why."""
     traces: dict[str, EpisodeTrace] = {}
     missing: dict[str, str] = {}
-    for r in run.records:
-        if r.trace:
+    for record in run.records:
+        if record.trace:
             try:
-                traces[r.key] = load_trace(run.folder / r.trace)
+                traces[record.key] = load_trace(run.folder / record.trace)
             except SSADError as error:
-                missing[r.key] = str(error)
+                missing[record.key] = str(error)
     graphs: dict[str, LaneGraph] = {}
-    for town in sorted({t.town for t in traces.values()}):
+    for town in sorted({episode_trace.town for episode_trace in traces.values()}):
         try:
             graphs[town] = _graph(run, town)
         except SSADError as error:
-            missing |= {key: str(error) for key, t in traces.items() if t.town == town}
+            missing |= {key: str(error) for key, episode_trace in traces.items() if episode_trace.town == town}
     episodes = {}
-    for r in run.records:
-        trace = traces.get(r.key)
+    for record in run.records:
+        trace = traces.get(record.key)
         if trace is None or trace.town not in graphs:
             continue
-        episodes[r.key] = episode_data(trace, graphs[trace.town]) | {
+        episodes[record.key] = episode_data(trace, graphs[trace.town]) | {
             "town": trace.town,
-            "system": r.system,
-            "group": SCENARIOS.get(r.group, r.group),
-            "scenario": r.scenario,
-            "outcome": outcome_class(r),
-            "witness": _witness_words(r.witness),
+            "system": record.system,
+            "group": SCENARIOS.get(record.group, record.group),
+            "scenario": record.scenario,
+            "outcome": outcome_class(record),
+            "witness": _witness_words(record.witness),
         }
-    towns = {name: town_data(graph, [t for t in traces.values() if t.town == name]) for name, graph in graphs.items()}
+    towns = {
+        name: town_data(graph, [episode_trace for episode_trace in traces.values() if episode_trace.town == name])
+        for name, graph in graphs.items()
+    }
     return {
         "scale": SCALE,
         "speed": SPEED,
@@ -78,19 +85,25 @@ def replay_data(run: DrivingRun) -> dict[str, Any]:
 
 
 def _witness_words(witness: Mapping[str, Any] | None) -> str:
-    """What the grade of a collision says, in a sentence."""
+    """Return the grade of a collision in a sentence."""
     if not witness or "avoids" not in witness:
         return ""
-    good = [name for key, name in MODELS.items() if witness["avoids"].get(key)]
-    words = f"avoided by {', '.join(good)}" if good else "avoided by no careful driver"
-    limit, m = witness["limit"], witness["limit"]["manoeuvre"]
-    if not m:
+    avoiding_models = [name for key, name in MODELS.items() if witness["avoids"].get(key)]
+    words = f"avoided by {', '.join(avoiding_models)}" if avoiding_models else "avoided by no careful driver"
+    limit, manoeuvre = witness["limit"], witness["limit"]["manoeuvre"]
+    if not manoeuvre:
         return f"{words}; none of {limit['tried']} manoeuvres stays clear"
-    does = (
+    action = (
         "keep the speed"
-        if not m["accel"]
-        else f"{'brake' if m['accel'] < 0 else 'speed up'} {abs(m['accel']):.1f} m/s²"
+        if not manoeuvre["accel"]
+        else f"{'brake' if manoeuvre['accel'] < 0 else 'speed up'} {abs(manoeuvre['accel']):.1f} m/s²"
     )
-    side = "" if not m["aside"] else f", {abs(m['aside']):.1f} m to the {'left' if m['aside'] > 0 else 'right'}"
-    until = f"the last of {limit['clear']} manoeuvres that stay clear begins {limit['latest']:.1f} s before the contact"
-    return f"{words}; {until}, the gentlest: from {m['start']:.1f} s on {does}{side}"
+    side = (
+        ""
+        if not manoeuvre["aside"]
+        else f", {abs(manoeuvre['aside']):.1f} m to the {'left' if manoeuvre['aside'] > 0 else 'right'}"
+    )
+    timing = (
+        f"the last of {limit['clear']} manoeuvres that stay clear begins {limit['latest']:.1f} s before the contact"
+    )
+    return f"{words}; {timing}, the gentlest: from {manoeuvre['start']:.1f} s on {action}{side}"

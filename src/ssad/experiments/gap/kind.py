@@ -1,6 +1,6 @@
 """Kind `gap`: perceiving systems x scenarios x perturbations of their cameras x severities; an episode a cell.
 
-The same drive gives metrics of the component, on the very pictures that the driver got, and metrics of the system.
+The same drive gives metrics of the component, on the images of the driver itself, and metrics of the system.
 """
 
 from __future__ import annotations
@@ -55,14 +55,15 @@ class GapSuite(ScenarioSuite):
     """Systems x scenarios x perturbations.
 
     Attributes:
-        systems: perceiving systems; names must differ.
-        ceilings: systems that are told the truth, without perturbations (`ssad list systems`).
-        perturbations: names (docs/gap.md); "none" always runs.
+        systems: Perceiving systems; names must differ.
+        ceilings: Systems that receive the ground truth, without perturbations (`ssad list systems`).
+        perturbations: Names (docs/gap.md); "none" always runs.
         severities: 1 to 5.
-        repetitions, spread: as in suites of kind driving.
-        sheets: pictures of so many drives, collisions first.
-        repair: whether drives that end in a collision are driven again with the object that was hit found where it is,
-            which tells whether this error alone is to blame.
+        repetitions: As in suites of kind driving.
+        spread: As in suites of kind driving.
+        sheets: Number of drives with pictures, collisions first.
+        repair: Whether drives that end in a collision are repeated with the hit object detected at its true place,
+            to tell whether this error alone causes the collision.
     """
 
     kind: Literal["gap"] = "gap"
@@ -79,7 +80,7 @@ class GapSuite(ScenarioSuite):
 
 
 class Gap(ScenarioKind):
-    """See the module."""
+    """Kind `gap`: component and system metrics of the same drive under a perturbation."""
 
     name = "gap"
     suite = GapSuite
@@ -117,31 +118,31 @@ class Gap(ScenarioKind):
     factors = ("system", "perturbation", "severity")
 
     def plan(self, suite: GapSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Names are looked up, detectors are built once; with `check`, each scenario is built once."""
-        check_distinct(suite, "systems", [one.name for one in suite.systems] + suite.ceilings)
+        """Look up names and build detectors once; with `check`, build each scenario once."""
+        check_distinct(suite, "systems", [entry.name for entry in suite.systems] + suite.ceilings)
         for name in suite.perturbations:
             family_of(name)
         if any(severity not in range(1, 6) for severity in suite.severities):
             raise ConfigError(f"suite {suite.name}: severities are 1 to 5, not {suite.severities}")
         for system in suite.systems:
             system.check()
-        versions = {one.name: one.version for one in suite.systems}
+        versions = {entry.name: entry.version for entry in suite.systems}
         versions |= {name: system_version(name) for name in suite.ceilings}
         scenarios, towns = described(suite)
         conditions = _conditions(suite)
-        wearers: dict[tuple[str, str], int | None] = {}
-        on_somebody = [name for name in suite.perturbations if is_worn(name)]
-        if check or on_somebody:
-            for one in scenarios:
-                episode = episode_of(self._cell(suite, one, conditions[0], 0, ""))
-                for name in on_somebody:
-                    wearers[name, one.scenario.name] = wearer(name, episode, town(one.scenario.town))
+        targets: dict[tuple[str, str], int | None] = {}
+        worn_perturbations = [name for name in suite.perturbations if is_worn(name)]
+        if check or worn_perturbations:
+            for entry in scenarios:
+                episode = episode_of(self._cell(suite, entry, conditions[0], 0, ""))
+                for name in worn_perturbations:
+                    targets[name, entry.scenario.name] = wearer(name, episode, town(entry.scenario.town))
         cells = [
-            self._cell(suite, one, condition, repetition, versions[_name(condition[0])], worn_by)
+            self._cell(suite, entry, condition, repetition, versions[_name(condition[0])], target)
             for condition in conditions
-            for one in scenarios
-            for worn_by in [wearers.get((condition[1], one.scenario.name))]
-            if worn_by is not None or not is_worn(condition[1])
+            for entry in scenarios
+            for target in [targets.get((condition[1], entry.scenario.name))]
+            if target is not None or not is_worn(condition[1])
             for repetition in range(suite.repetitions)
         ]
         return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
@@ -155,10 +156,13 @@ class Gap(ScenarioKind):
         version: str,
         worn_by: int | None = None,
     ) -> Cell:
-        """The seed depends on the scenario and the repetition alone, so that all conditions meet the same drives."""
+        """Return a cell.
+
+        Its seed depends on the scenario and the repetition alone, so that all conditions meet the same drives.
+        """
         system, perturbation, severity = condition
-        own = None if isinstance(system, str) else system.model_dump(mode="json")
-        under = f"{perturbation}-{severity}/" if perturbation != NONE else ""
+        system_settings = None if isinstance(system, str) else system.model_dump(mode="json")
+        condition_text = f"{perturbation}-{severity}/" if perturbation != NONE else ""
         family = family_of(perturbation)
         texture = texture_version(perturbation) if family in (TEXTURE, LIGHT) else ""
         return self.scenario_cell(
@@ -169,86 +173,102 @@ class Gap(ScenarioKind):
             texture,
             system=_name(system),
             chance=("episode", repetition),
-            title=f"{_name(system)}/{under}{one.scenario.name}{f'#{repetition}' if repetition else ''}",
+            title=f"{_name(system)}/{condition_text}{one.scenario.name}{f'#{repetition}' if repetition else ''}",
             fields={"perturbation": perturbation, "severity": severity, "family": family},
             repetition=repetition,
             spread=suite.spread if repetition else 0.0,
-            settings=own,
+            settings=system_settings,
             perturbation=perturbation,
             severity=severity,
-            repair=suite.repair and own is not None,
+            repair=suite.repair and system_settings is not None,
             **({"wearer": worn_by} if is_worn(perturbation) else {}),
         )
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """See `ScenarioKind`."""
+        """Store the towns as `ScenarioKind` does, and return the seed and whether sheets are made."""
         super().prepare(plan, folder, resources)
         return {"seed": plan.suite.seed, "sheets": plan.suite.sheets > 0}
 
     def alike(self, cell: Cell) -> Hashable:
-        """Cells of one condition; a batch is of one town, whose street is then built once."""
+        """Return town and condition: the street of a batch is then built once."""
         spec = cell.spec
         return spec["scenario"]["town"], cell.system, spec["perturbation"], spec["severity"], spec.get("wearer")
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
-        """Drives the episodes as one batch, and measures component and system."""
+        """Drive the episodes as one batch, and measure component and system."""
         seed = job.settings["seed"]
-        episodes, traces, seen = drive_perceiving(
+        episodes, traces, perception = drive_perceiving(
             cells, device=job.device, seed=seed, every=0.5 if job.settings["sheets"] else None
         )
         repair = cells[0].spec["repair"]
         repaired = drive_repaired(cells, traces, device=job.device, seed=seed) if repair else {}
         results: dict[str, dict[str, Any]] = {}
-        for k, (cell, episode, trace) in enumerate(zip(cells, episodes, traces, strict=True)):
+        for index, (cell, episode, trace) in enumerate(zip(cells, episodes, traces, strict=True)):
             result = drive_record(cell, episode, trace, job.folder)
             metrics = result["metrics"] | {"impact_speed": impact_speed(trace), "hard_braking": hard_braking(trace)}
-            about: dict[str, Any] = {name: result["episode"][name] for name in ("end", "trace_hash", "town")}
-            if seen is not None:
-                own, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), seen.perceived(k)
-                metrics |= component_metrics(trace, perceived, sure=own.tracking.high)
+            record_fields: dict[str, Any] = {name: result["episode"][name] for name in ("end", "trace_hash", "town")}
+            if perception is not None:
+                system, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), perception.perceived(index)
+                metrics |= component_metrics(trace, perceived, sure=system.tracking.high)
                 metrics |= sign_metrics(trace, perceived, signs_of_route(town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
-                about["cause"] = cause_of_collision(trace, perceived)
-                if job.settings["sheets"] and (shots := seen.shots(k)):
+                record_fields["cause"] = cause_of_collision(trace, perceived)
+                if job.settings["sheets"] and (sheet_images := perception.shots(index)):
                     result["artefacts"]["sheet"] = f"sheets/{cell.key}.jpg"
                     safeio.make_folder(job.folder / "sheets")
-                    picture = drive_sheet(trace, perceived, shots, town(trace.town))
+                    picture = drive_sheet(trace, perceived, sheet_images, town(trace.town))
                     save_picture(job.folder / result["artefacts"]["sheet"], picture)
             metrics = {name: round(value, 6) if isinstance(value, float) else value for name, value in metrics.items()}
-            about |= {"repaired": repaired[k]} if k in repaired else {}
-            episode_line = result["episode"] | about | {"metrics": metrics}
-            results[cell.key] = result | about | {"metrics": metrics, "episode": episode_line}
+            record_fields |= {"repaired": repaired[index]} if index in repaired else {}
+            episode_line = result["episode"] | record_fields | {"metrics": metrics}
+            results[cell.key] = result | record_fields | {"metrics": metrics, "episode": episode_line}
         return results
 
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
-        """Drives the episode again and compares every bit of its trace; films it beside the clean drive."""
+        """Drive the episode again and compare every bit of its trace; film it beside the clean drive."""
         quiet_warp()
         recorded = load_trace(folder / record["artefacts"]["trace"])
         spec, graph = cell.spec, town(recorded.town)
-        clean = replace(cell, spec={k: v for k, v in spec.items() if k != "wearer"} | {"perturbation": NONE})
-        drives, again = [], []
-        for one in [cell] if spec["perturbation"] == NONE else [clean, cell]:
-            _, (trace,), seen = drive_perceiving([one], device=plan.device, seed=plan.suite.seed, every=EVERY)
-            again.append(trace)
-            if seen is not None:
-                shots = seen.shots(0)
-                title = f"{spec['perturbation']} {spec['severity']}" if one is cell and spec["severity"] else "clean"
-                drives.append(Seen(title, trace, seen.perceived(0), shots))
-        filmed = [drive for drive in drives if drive.shots]
-        film = (drive_film(filmed, graph, every=EVERY), EVERY) if filmed else None
-        own = drives[-1] if drives and drives[-1].trace is again[-1] else None
-        return Replay(cell, first_difference(recorded, again[-1]), again[-1], graph, film=film, seen=own)
+        # The clean drive shows what the perturbation alone changes.
+        clean = replace(
+            cell, spec={name: value for name, value in spec.items() if name != "wearer"} | {"perturbation": NONE}
+        )
+        drives, replayed_traces = [], []
+        for driven_cell in [cell] if spec["perturbation"] == NONE else [clean, cell]:
+            _, (trace,), perception = drive_perceiving(
+                [driven_cell], device=plan.device, seed=plan.suite.seed, every=EVERY
+            )
+            replayed_traces.append(trace)
+            if perception is not None:
+                images = perception.shots(0)
+                title = (
+                    f"{spec['perturbation']} {spec['severity']}"
+                    if driven_cell is cell and spec["severity"]
+                    else "clean"
+                )
+                drives.append(Seen(title, trace, perception.perceived(0), images))
+        filmed_drives = [drive for drive in drives if drive.shots]
+        film = (drive_film(filmed_drives, graph, every=EVERY), EVERY) if filmed_drives else None
+        driver_perception = drives[-1] if drives and drives[-1].trace is replayed_traces[-1] else None
+        return Replay(
+            cell,
+            first_difference(recorded, replayed_traces[-1]),
+            replayed_traces[-1],
+            graph,
+            film=film,
+            seen=driver_perception,
+        )
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
-        """Page of a run and its tables."""
+        """Return the page of a run and its tables."""
         return page.section(run, self.verdict(run))
 
     def summary(self, run: Run) -> Table:
-        """Main table of a run."""
+        """Return the main table of a run."""
         return page.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences."""
+        """Return the findings of a run in sentences."""
         return verdict(run)
 
 
@@ -257,13 +277,13 @@ def _name(system: str | PerceivingSystem) -> str:
 
 
 def _conditions(suite: GapSuite) -> list[tuple[str | PerceivingSystem, str, int]]:
-    """System, perturbation, severity; ceilings first, then each system clean and perturbed."""
-    found: list[tuple[str | PerceivingSystem, str, int]] = [(name, NONE, 0) for name in suite.ceilings]
+    """Return system, perturbation, severity; ceilings first, then each system clean and perturbed."""
+    conditions: list[tuple[str | PerceivingSystem, str, int]] = [(name, NONE, 0) for name in suite.ceilings]
     for system in suite.systems:
-        found.append((system, NONE, 0))
+        conditions.append((system, NONE, 0))
         if not system.perfect:
             names = [name for name in dict.fromkeys(suite.perturbations) if name != NONE]
             for name in names:
-                levels = dict.fromkeys(suite.severities) if has_severities(name) else [1]
-                found += [(system, name, severity) for severity in levels]
-    return found
+                severities = dict.fromkeys(suite.severities) if has_severities(name) else [1]
+                conditions += [(system, name, severity) for severity in severities]
+    return conditions

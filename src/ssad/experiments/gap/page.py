@@ -1,4 +1,4 @@
-"""The page of a gap run: component beside system, the damage to the one against that to the other, causes, pictures."""
+"""Page of a gap run: component beside system, the damage to one against that to the other, causes, pictures."""
 
 from __future__ import annotations
 
@@ -62,22 +62,22 @@ COLOURS = {
 
 
 def conditions(run: Run) -> dict[Condition, list[Line]]:
-    """System, perturbation and severity -> its lines, in the order of the suite."""
-    found: dict[Condition, list[Line]] = {}
+    """Return system, perturbation and severity -> its lines, in the order of the suite."""
+    lines_by_condition: dict[Condition, list[Line]] = {}
     for line in run.lines:
-        found.setdefault((line["system"], line["perturbation"], int(line["severity"])), []).append(line)
-    return found
+        lines_by_condition.setdefault((line["system"], line["perturbation"], int(line["severity"])), []).append(line)
+    return lines_by_condition
 
 
 def summary(run: Run) -> Table:
-    """The table that is shown on the terminal."""
+    """Return the table for the terminal."""
     return replace(main_table(run), note="")
 
 
 def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
-    """The page and its tables."""
+    """Return the page and its tables."""
     main, drop, rank, cause, signs = (
-        make(run) for make in (main_table, drop_table, rank_table, cause_table, sign_table)
+        build_table(run) for build_table in (main_table, drop_table, rank_table, cause_table, sign_table)
     )
     tables = [main, drop, rank, cause, *([signs] if signs.rows else [])]
     failures = [
@@ -96,17 +96,17 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
         plot=scatter(run),
         failures=failures,
         sheets=sheets(run),
-        systems=list(dict.fromkeys(c[0] for c in conditions(run))),
+        systems=list(dict.fromkeys(condition[0] for condition in conditions(run))),
     )
     return page, tables
 
 
 def main_table(run: Run) -> Table:
-    """Component and system, a row a condition."""
+    """Return component and system metrics, a row a condition."""
     rows = []
     for (system, perturbation, severity), lines in conditions(run).items():
-        head = (system, perturbation, str(severity) if severity else "")
-        rows.append(Row(head, tuple(_cell(lines, name) for name in MAIN)))
+        row_head = (system, perturbation, str(severity) if severity else "")
+        rows.append(Row(row_head, tuple(_cell(lines, name) for name in MAIN)))
     note = (
         "AP: all kinds of objects as one, the mean of those within 0.5, 1, 2 and 4 m, a drive at a time, on the "
         "pictures that the driver got in it. The object that matters is the one that the ego touches, else the one "
@@ -121,11 +121,11 @@ def main_table(run: Run) -> Table:
 
 
 def drop_table(run: Run) -> Table:
-    """What a perturbation changes against the same drives without it."""
+    """Return the changes of metrics under a perturbation against the same drives without it."""
     rows = [
         Row(
             (system, perturbation, str(severity)),
-            tuple(change(run, (system, perturbation, severity), n) for n in DROPS),
+            tuple(change(run, (system, perturbation, severity), metric) for metric in DROPS),
         )
         for system, perturbation, severity in conditions(run)
         if severity
@@ -139,19 +139,23 @@ def drop_table(run: Run) -> Table:
 
 
 def rank_table(run: Run) -> Table:
-    """Does damage to the component tell the damage to the system?"""
+    """Return the rank correlation of damage to the component with damage to the system."""
     rows = []
     perturbed = [condition for condition in conditions(run) if condition[2]]
     for system in dict.fromkeys(condition[0] for condition in perturbed):
-        own = [condition for condition in perturbed if condition[0] == system]
-        families = [STEPS.sub(r"\1", condition[1]) for condition in own]
-        for part in ("AP", "target_recall"):
-            lost = [-change(run, c, part).mean for c in own]
+        system_conditions = [condition for condition in perturbed if condition[0] == system]
+        families = [STEPS.sub(r"\1", condition[1]) for condition in system_conditions]
+        for component_metric in ("AP", "target_recall"):
+            component_losses = [-change(run, entry, component_metric).mean for entry in system_conditions]
             cells = []
-            for name, sign in (("collision", 1.0), ("route_completion", -1.0)):
-                harm = [sign * change(run, c, name).mean for c in own]
-                cells.append(Cell.of(family_correlation(lost, harm, families)))
-            rows.append(Row((system, DROPS[part], f"{len(own)} in {len(set(families))}"), tuple(cells)))
+            for system_metric, sign in (("collision", 1.0), ("route_completion", -1.0)):
+                system_losses = [sign * change(run, entry, system_metric).mean for entry in system_conditions]
+                cells.append(Cell.of(family_correlation(component_losses, system_losses, families)))
+            rows.append(
+                Row(
+                    (system, DROPS[component_metric], f"{len(system_conditions)} in {len(set(families))}"), tuple(cells)
+                )
+            )
     note = (
         "Spearman's rank correlation over perturbations of what the component loses and what the system loses; 95 % "
         "interval by a bootstrap over the families of perturbations (all severities of one are one family, and "
@@ -162,19 +166,21 @@ def rank_table(run: Run) -> Table:
 
 
 def cause_table(run: Run) -> Table:
-    """What the object that was hit was to the driver before."""
+    """Return how the driver perceived the object that it hit, before each collision."""
     rows = []
     for (system, perturbation, severity), lines in conditions(run).items():
-        found = [line["cause"] for line in lines if line.get("cause")]
-        if not found:
+        causes = [line["cause"] for line in lines if line.get("cause")]
+        if not causes:
             continue
-        counts = Counter(one["cause"] for one in found)
-        unknown = sorted(float(one["unknown_s"]) for one in found)
-        middle = unknown[len(unknown) // 2]
-        again = [line["repaired"] for line in lines if line.get("repaired")]
-        gone = Cell(sum(not one["same"] for one in again), digits=0) if again else Cell(math.nan)
-        numbers = [len(found), *(counts[name] for name in CAUSES)]
-        cells = (*(Cell(number, digits=0) for number in numbers), Cell(middle), gone)
+        counts = Counter(record["cause"] for record in causes)
+        unknown = sorted(float(record["unknown_s"]) for record in causes)
+        median = unknown[len(unknown) // 2]
+        repaired_drives = [line["repaired"] for line in lines if line.get("repaired")]
+        avoided = (
+            Cell(sum(not record["same"] for record in repaired_drives), digits=0) if repaired_drives else Cell(math.nan)
+        )
+        numbers = [len(causes), *(counts[name] for name in CAUSES)]
+        cells = (*(Cell(number, digits=0) for number in numbers), Cell(median), avoided)
         rows.append(Row((system, perturbation, str(severity) if severity else ""), cells))
     note = (
         "Collisions by what the object that was hit was in most of the steps from 3 s to 0.5 s before: out of view or "
@@ -190,7 +196,7 @@ def cause_table(run: Run) -> Table:
 
 
 def sign_table(run: Run) -> Table:
-    """Stop signs, where drivers read them: from how far, and how many were run."""
+    """Return how far stop signs were read, and how many were run."""
     rows = [
         Row(
             (system, perturbation, str(severity) if severity else ""),
@@ -213,122 +219,145 @@ def sign_table(run: Run) -> Table:
 
 def scatter(run: Run) -> str:
     """Fall of AP against rise of CR, a point a perturbation, with intervals; as SVG text, "" without perturbations."""
-    points = [(c, change(run, c, "AP"), change(run, c, "collision")) for c in conditions(run) if c[2]]
-    points = [(c, a, b) for c, a, b in points if not math.isnan(a.mean) and not math.isnan(b.mean)]
+    points = [
+        (condition, change(run, condition, "AP"), change(run, condition, "collision"))
+        for condition in conditions(run)
+        if condition[2]
+    ]
+    points = [
+        (condition, ap_change, cr_change)
+        for condition, ap_change, cr_change in points
+        if not math.isnan(ap_change.mean) and not math.isnan(cr_change.mean)
+    ]
     if not points:
         return ""
-    family = {line["perturbation"]: str(line.get("family", "")) for line in run.lines}
+    families = {line["perturbation"]: str(line.get("family", "")) for line in run.lines}
     left, right = _ends([-value for _, one, _ in points for value in (one.mean, one.low, one.high)])
-    low, top = _ends([value for *_, one in points for value in (one.mean, one.low, one.high)])
+    bottom, top = _ends([value for *_, one in points for value in (one.mean, one.low, one.high)])
 
     def x(value: float) -> float:
         return MARGIN + SIZE * (min(max(value, left), right) - left) / (right - left)
 
     def y(value: float) -> float:
-        return 10 + SIZE * (top - min(max(value, low), top)) / (top - low)
+        return 10 + SIZE * (top - min(max(value, bottom), top)) / (top - bottom)
 
-    parts = []
-    for share in _ticks(left, right):
-        strong = ' style="stroke-width:2"' if share == 0.0 else ""
-        parts.append(f'<line x1="{x(share):.1f}" x2="{x(share):.1f}" y1="10" y2="{SIZE + 10}" class="grid"{strong}/>')
-        parts.append(f'<text x="{x(share):.1f}" y="{SIZE + 26}" text-anchor="middle">{share:g}</text>')
-    for share in _ticks(low, top):
-        strong = ' style="stroke-width:2"' if share == 0.0 else ""
-        line = (
-            f'<line x1="{MARGIN}" x2="{MARGIN + SIZE}" y1="{y(share):.1f}" y2="{y(share):.1f}" class="grid"{strong}/>'
+    elements = []
+    for tick in _ticks(left, right):
+        emphasis = ' style="stroke-width:2"' if tick == 0.0 else ""
+        elements.append(
+            f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="10" y2="{SIZE + 10}" class="grid"{emphasis}/>'
         )
-        parts.append(f'{line}<text x="{MARGIN - 6}" y="{y(share) + 4:.1f}" text-anchor="end">{share:g}</text>')
-    named: list[tuple[float, float]] = []
-    # of many points those get names first that are farthest from where both parts are hurt alike
+        elements.append(f'<text x="{x(tick):.1f}" y="{SIZE + 26}" text-anchor="middle">{tick:g}</text>')
+    for tick in _ticks(bottom, top):
+        emphasis = ' style="stroke-width:2"' if tick == 0.0 else ""
+        line = (
+            f'<line x1="{MARGIN}" x2="{MARGIN + SIZE}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" class="grid"{emphasis}/>'
+        )
+        elements.append(f'{line}<text x="{MARGIN - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
+    label_positions: list[tuple[float, float]] = []
+    # points far from equal damage to both parts are labelled first; others are left without a label where it is crowded
     for (system, name, severity), fall, rise in sorted(points, key=lambda one: -abs(one[2].mean + one[1].mean)):
-        colour, at, up = COLOURS.get(family.get(name, ""), "var(--s3)"), x(-fall.mean), y(rise.mean)
-        for one, two in (((x(-fall.high), up), (x(-fall.low), up)), ((at, y(rise.low)), (at, y(rise.high)))):
-            if not any(math.isnan(v) for v in (*one, *two)):
+        colour, point_x, point_y = COLOURS.get(families.get(name, ""), "var(--s3)"), x(-fall.mean), y(rise.mean)
+        for one, line_end in (
+            ((x(-fall.high), point_y), (x(-fall.low), point_y)),
+            ((point_x, y(rise.low)), (point_x, y(rise.high))),
+        ):
+            if not any(math.isnan(coordinate) for coordinate in (*one, *line_end)):
                 style = 'stroke-dasharray="2 3"' if "range" in (fall.method, rise.method) else ""
-                parts.append(
-                    f'<line x1="{one[0]:.1f}" y1="{one[1]:.1f}" x2="{two[0]:.1f}" y2="{two[1]:.1f}" stroke="{colour}" '
+                elements.append(
+                    f'<line x1="{one[0]:.1f}" y1="{one[1]:.1f}" x2="{line_end[0]:.1f}" '
+                    f'y2="{line_end[1]:.1f}" stroke="{colour}" '
                     f'opacity=".5" {style}/>'
                 )
         tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
-        parts.append(f'<circle cx="{at:.1f}" cy="{up:.1f}" r="4" fill="{colour}"><title>{escape(tip)}</title></circle>')
-        if all(abs(at - other) > ROOM[0] or abs(up - above) > ROOM[1] for other, above in named):
-            named.append((at, up))
-            parts.append(f'<text x="{at + 7:.1f}" y="{up - 6:.1f}">{escape(f"{name} {severity}")}</text>')
-    for row, kind in enumerate(dict.fromkeys(family.get(c[1], "") for c, _, _ in points)):
-        place, colour = 22 + 16 * row, COLOURS.get(kind, "var(--s3)")
-        parts.append(f'<circle cx="{MARGIN + SIZE + 64}" cy="{place}" r="5" fill="{colour}"/>')
-        parts.append(f'<text x="{MARGIN + SIZE + 74}" y="{place + 4}">{escape(kind)}</text>')
-    parts.append(f'<text x="{MARGIN + SIZE / 2}" y="{SIZE + 44}" text-anchor="middle">AP lost</text>')
-    parts.append(
+        elements.append(
+            f'<circle cx="{point_x:.1f}" cy="{point_y:.1f}" r="4" fill="{colour}"><title>{escape(tip)}</title></circle>'
+        )
+        if all(
+            abs(point_x - label_x) > ROOM[0] or abs(point_y - label_y) > ROOM[1] for label_x, label_y in label_positions
+        ):
+            label_positions.append((point_x, point_y))
+            elements.append(f'<text x="{point_x + 7:.1f}" y="{point_y - 6:.1f}">{escape(f"{name} {severity}")}</text>')
+    for legend_row, kind in enumerate(dict.fromkeys(families.get(condition[1], "") for condition, _, _ in points)):
+        legend_y, colour = 22 + 16 * legend_row, COLOURS.get(kind, "var(--s3)")
+        elements.append(f'<circle cx="{MARGIN + SIZE + 64}" cy="{legend_y}" r="5" fill="{colour}"/>')
+        elements.append(f'<text x="{MARGIN + SIZE + 74}" y="{legend_y + 4}">{escape(kind)}</text>')
+    elements.append(f'<text x="{MARGIN + SIZE / 2}" y="{SIZE + 44}" text-anchor="middle">AP lost</text>')
+    elements.append(
         f'<text x="12" y="{SIZE / 2}" transform="rotate(-90 12 {SIZE / 2})" text-anchor="middle">CR gained</text>'
     )
     label = "AP lost against collision rate gained, a point a perturbation"
-    return (
-        f'<svg viewBox="0 0 {SIZE + MARGIN + 140} {SIZE + 52}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
-    )
+    size = f"{SIZE + MARGIN + 140} {SIZE + 52}"
+    return f'<svg viewBox="0 0 {size}" role="img" aria-label="{label}">{"".join(elements)}</svg>'
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:
-    """Ends of an axis in tenths, with 0 and some room; of intervals there may be none."""
-    known = [value for value in values if not math.isnan(value)]
-    low, high = max(min(*known, 0.0) - 0.05, -1.0), min(max(*known, 0.1) + 0.05, 1.0)
+    """Return the ends of an axis in tenths, with 0 and some room; intervals may be missing."""
+    finite_values = [value for value in values if not math.isnan(value)]
+    # Changes of shares lie in [-1, 1].
+    low, high = max(min(*finite_values, 0.0) - 0.05, -1.0), min(max(*finite_values, 0.1) + 0.05, 1.0)
     return math.floor(10.0 * low) / 10.0, math.ceil(10.0 * high) / 10.0
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Numbers along an axis, of which one is 0."""
+    """Return the numbers along an axis, one of which is 0."""
     step = 0.1 if high - low < 0.75 else 0.25
-    return [round(k * step, 2) for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+    return [round(index * step, 2) for index in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def sheets(run: Run) -> list[dict[str, str]]:
-    """Sheets of drives as the suite asks: collisions first, no condition twice before each has been shown."""
-    most = int(run.suite.get("sheets", 0))
-    shown: Counter[Condition] = Counter()
-    chosen: list[tuple[int, int, Line, str]] = []
+    """Return as many sheets of drives as the suite requests: collisions first, conditions in turn."""
+    sheet_limit = int(run.suite.get("sheets", 0))
+    sheets_by_condition: Counter[Condition] = Counter()
+    candidates: list[tuple[int, int, Line, str]] = []
     for line in sorted(run.lines, key=lambda line: not (line.get("metrics") or {}).get("collision")):
         path = (line.get("artefacts") or {}).get("sheet")
         if path and (run.folder / path).is_file():
             condition = (line["system"], line["perturbation"], int(line["severity"]))
-            shown[condition] += 1
-            chosen.append((shown[condition], len(chosen), line, path))
-    found = []
-    for _, _, line, path in sorted(chosen, key=lambda one: one[:2])[:most]:
-        data = base64.b64encode(safeio.read_bytes(run.folder / path)).decode()
+            sheets_by_condition[condition] += 1
+            candidates.append((sheets_by_condition[condition], len(candidates), line, path))
+    entries = []
+    for _, _, line, path in sorted(candidates, key=lambda candidate: candidate[:2])[:sheet_limit]:
+        encoded = base64.b64encode(safeio.read_bytes(run.folder / path)).decode()
         cause = (line.get("cause") or {}).get("cause", "")
-        under = f"{line['perturbation']} {line['severity']}" if line["severity"] else "clean"
-        end = str(line.get("end", "")).replace("_", " ")
-        caption = f"{line['system']}, {line['cluster']}, {under}: {end}{f' ({cause})' if cause else ''}"
-        found.append({"caption": caption, "data": f"data:image/jpeg;base64,{data}", "key": str(line["key"])})
-    return found
+        condition_text = f"{line['perturbation']} {line['severity']}" if line["severity"] else "clean"
+        outcome = str(line.get("end", "")).replace("_", " ")
+        caption = f"{line['system']}, {line['cluster']}, {condition_text}: {outcome}{f' ({cause})' if cause else ''}"
+        entries.append({"caption": caption, "data": f"data:image/jpeg;base64,{encoded}", "key": str(line["key"])})
+    return entries
 
 
 def values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
-    """A metric by drive: scenario and repetition."""
-    found = {}
+    """Return a metric by drive: scenario and repetition."""
+    cases = {}
     for line in lines:
         value = (line.get("metrics") or {}).get(name) if line["status"] == "ok" else None
         cluster = str(line.get("cluster") or line["key"])
         case = f"{line.get('case') or line['key']}"
         number = math.nan if value is None else float(value)
         key = f"{cluster}#{line['spec'].get('repetition', 0)}"
-        found[key] = CaseValue(number, cluster, case, failed=line["status"] != "ok")
-    return found
+        cases[key] = CaseValue(number, cluster, case, failed=line["status"] != "ok")
+    return cases
 
 
 def _cell(lines: Sequence[Line], name: str) -> Cell:
-    found = values(lines, name).values()
+    cases = values(lines, name).values()
     if name == "collision":
-        return Cell.of(estimate(found, "share"))
-    return Cell.of(estimate(found, "bounded" if name in BOUNDED else "mean"))
+        return Cell.of(estimate(cases, "share"))
+    return Cell.of(estimate(cases, "bounded" if name in BOUNDED else "mean"))
 
 
 def change(run: Run, condition: Condition, name: str) -> Cell:
-    """What a condition changes in a metric against the same drives without it.
+    """Return the change of a metric under a condition against the same drives without it.
 
     Drives that the condition does not have, such as those without a car that could wear a texture, do not count.
     """
-    every = conditions(run)
-    own, clean = values(every[condition], name), values(every.get((condition[0], "none", 0), []), name)
+    lines_by_condition = conditions(run)
+    perturbed, clean = (
+        values(lines_by_condition[condition], name),
+        values(lines_by_condition.get((condition[0], "none", 0), []), name),
+    )
     kind: Literal["share", "mean"] = "share" if name == "collision" else "mean"
-    return Cell.of(paired_difference(own, {drive: clean[drive] for drive in own if drive in clean}, kind=kind))
+    return Cell.of(
+        paired_difference(perturbed, {drive: clean[drive] for drive in perturbed if drive in clean}, kind=kind)
+    )

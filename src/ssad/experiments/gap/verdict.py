@@ -11,27 +11,35 @@ from ssad.report.verdict import mean_of, metric_of
 
 
 def verdict(run: Run) -> list[str]:
-    """Each perceiving system, and what its perturbations do to component and system: most to the system first."""
-    found: list[str] = []
-    every = gap.conditions(run)
-    systems = list(dict.fromkeys(system for system, *_ in every))
-    told: dict[str, list[tuple[float, str]]] = {system: [] for system in systems}
-    for system, perturbation, severity in every:
-        lines = every[system, perturbation, severity]
-        hits = sum(metric_of(line, "collision") == 1.0 for line in lines)
+    """Return the effect of each perturbation on component and system, the largest effect on the system first."""
+    sentences: list[str] = []
+    lines_by_condition = gap.conditions(run)
+    systems = list(dict.fromkeys(system for system, *_ in lines_by_condition))
+    sentences_by_system: dict[str, list[tuple[float, str]]] = {system: [] for system in systems}
+    for system, perturbation, severity in lines_by_condition:
+        lines = lines_by_condition[system, perturbation, severity]
+        collisions = sum(metric_of(line, "collision") == 1.0 for line in lines)
         if not severity:
-            part = mean_of(metric_of(line, "AP") for line in lines)
-            sees = "" if math.isnan(part) else f" It found objects with an AP of {part:.2f} on the way."
-            told[system].append((math.inf, f"{system} collided in {hits} of {len(lines)} drives.{sees}"))
+            precision = mean_of(metric_of(line, "AP") for line in lines)
+            precision_text = (
+                "" if math.isnan(precision) else f" It found objects with an AP of {precision:.2f} on the way."
+            )
+            sentences_by_system[system].append(
+                (math.inf, f"{system} collided in {collisions} of {len(lines)} drives.{precision_text}")
+            )
             continue
         fall, rise = (gap.change(run, (system, perturbation, severity), name) for name in ("AP", "collision"))
         if not math.isnan(fall.mean) and not math.isnan(rise.mean):
-            few = "" if _known(fall) or _known(rise) else ", too few for intervals"
-            said = f"{perturbation} {severity} changes the AP of {system} by {_sure(fall)} and its collision rate by "
-            told[system].append((abs(rise.mean), f"{said}{_sure(rise)}, in {rise.n} drives{few}."))
+            remark = "" if _known(fall) or _known(rise) else ", too few for intervals"
+            change_text = (
+                f"{perturbation} {severity} changes the AP of {system} by {_sure(fall)} and its collision rate by "
+            )
+            sentences_by_system[system].append(
+                (abs(rise.mean), f"{change_text}{_sure(rise)}, in {rise.n} drives{remark}.")
+            )
     for system in systems:
-        found += [sentence for _, sentence in sorted(told[system], key=lambda one: -one[0])]
-    return found
+        sentences += [sentence for _, sentence in sorted(sentences_by_system[system], key=lambda ranked: -ranked[0])]
+    return sentences
 
 
 def _known(change: Cell) -> bool:
@@ -39,5 +47,5 @@ def _known(change: Cell) -> bool:
 
 
 def _sure(change: Cell) -> str:
-    """A change with its interval, if there is one."""
+    """Return a change with its interval, if there is one."""
     return f"{change.mean:+.2f} {change.interval}" if _known(change) else f"{change.mean:+.2f}"

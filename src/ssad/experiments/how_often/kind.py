@@ -25,7 +25,7 @@ SETTINGS = ("episodes", "particles", "repeats", "components", "batch")  # of the
 
 
 class NoiseSuite(Schema):
-    """The chance in traffic: `ssad.world.noise.Noise`, in its own words."""
+    """Random behaviour of traffic: the parameters of `ssad.world.noise.Noise`."""
 
     accel: float = Field(default=0.0, ge=0.0, le=10.0)
     accel_time: float = Field(default=1.0, gt=0.0)
@@ -38,14 +38,14 @@ class HowOftenSuite(ScenarioSuite):
     """Failure probabilities: scenarios x systems x methods.
 
     Attributes:
-        systems: driving systems under test, such that remember nothing: the Autopilot, the blind one, learned policies.
-        noise: the chance in traffic.
-        methods: estimators; each gets cells of its own.
-        episodes: of Monte Carlo, and of importance sampling after it has learned.
-        particles: of each repeat of splitting, and of the splitting that a proposal is first learned from.
-        repeats: of splitting, independent of each other; at least 8 for an interval.
-        components: of the learned proposal.
-        batch: episodes side by side.
+        systems: Driving systems under test, without memory: the Autopilot, the blind one, learned policies.
+        noise: Random behaviour of traffic.
+        methods: Estimators; each gets cells of its own.
+        episodes: Episodes of Monte Carlo, and of importance sampling after it has learned.
+        particles: Particles of each repeat of splitting, and of the splitting that a proposal is first learned from.
+        repeats: Independent repeats of splitting; at least 8 for an interval.
+        components: Components of the learned proposal.
+        batch: Episodes side by side.
     """
 
     kind: Literal["how-often"] = "how-often"
@@ -60,7 +60,7 @@ class HowOftenSuite(ScenarioSuite):
 
 
 class HowOften(ScenarioKind):
-    """See the module."""
+    """Kind `how-often`: one estimate of a failure probability for each system, scenario and method."""
 
     name = "how-often"
     suite = HowOftenSuite
@@ -81,23 +81,23 @@ class HowOften(ScenarioKind):
     )
 
     def plan(self, suite: HowOftenSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Systems, scenarios and towns are looked up; with `check`, each is tried once."""
+        """Look up systems, scenarios and towns; with `check`, try each once."""
         systems = {name: system_version(name) for name in suite.systems}
         scenarios, towns = described(suite)
         settings = {"noise": suite.noise.model_dump()} | {name: getattr(suite, name) for name in SETTINGS}
         cells = tuple(
             self.scenario_cell(
                 suite,
-                one,
+                entry,
                 systems[system],
-                title=f"{method}/{system}/{one.scenario.name}",
+                title=f"{method}/{system}/{entry.scenario.name}",
                 system=system,
                 chance=("how often", method),
                 fields={"method": method},
                 method=method,
                 **settings,
             )
-            for system, one, method in product(suite.systems, scenarios, suite.methods)
+            for system, entry, method in product(suite.systems, scenarios, suite.methods)
         )
         if check:
             for cell in cells:
@@ -105,30 +105,34 @@ class HowOften(ScenarioKind):
         return Plan(self, suite, device, cells, {"towns": towns, "systems": systems})
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
-        """Estimates the probability; keeps the likeliest collision that was found."""
+        """Estimate the probability; keep the likeliest collision."""
         quiet_warp()
-        chance = chance_of(cell, job.device)
-        metrics, crash = chance.estimate(cell.spec["method"], **{name: cell.spec[name] for name in SETTINGS})
+        episode = chance_of(cell, job.device)
+        metrics, crash = episode.estimate(cell.spec["method"], **{name: cell.spec[name] for name in SETTINGS})
         result: dict[str, Any] = {"metrics": plain(metrics), "case": cell.key, "n": metrics["episodes"]}
         if crash is None:
             return result
         artefact = f"traces/{cell.key}.npz"
-        save_trace(job.folder / artefact, chance.run_again(crash))
+        save_trace(job.folder / artefact, episode.run_again(crash))
         return result | {"crash": crash, "artefacts": {"trace": artefact}}
 
     def drive_again(self, plan: Plan, cell: Cell, record: Mapping[str, Any]) -> EpisodeTrace:
-        """Drives the collision that was kept again. ConfigError: there is none."""
+        """Drive the stored collision again.
+
+        Raises:
+            ConfigError: There is none.
+        """
         if "crash" not in record:
             raise ConfigError(f"cell {cell.key} ({cell.name}) has found no collision to replay")
         return chance_of(cell, plan.device).run_again(record["crash"])
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences."""
+        """Return the findings of a run in sentences."""
         return verdict(run)
 
 
 def chance_of(cell: Cell, device: str) -> ChanceEpisode:
-    """The scenario of a cell, with its driver and its noise."""
+    """Return the scenario of a cell, with its driver and its noise."""
     from ssad.scenarios.dynamic import build_episode, scenario_from
 
     scenario = scenario_from(cell.spec["scenario"])

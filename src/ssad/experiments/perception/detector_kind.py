@@ -38,18 +38,18 @@ from ssad.scenarios.static.digital.defences import make_defence
 
 
 class DetectorSuite(SuiteBase, DetectorTable):
-    """What suites say that score 3D detectors.
+    """Keys of suites that score 3D detectors.
 
     Attributes:
-        replicates: of the bootstrap over scenes.
-        timeout_s: seconds that one scene under one condition, or one score, may take.
+        replicates: Replicates of the bootstrap over scenes.
+        timeout_s: Seconds that one scene under one condition, or one score, may take.
     """
 
     replicates: int = Field(default=100, ge=0, le=10_000)
 
 
 class DetectorKind(Kind):
-    """Cells are detectors under a condition; work is shared by scenes: a piece is a scene under a condition."""
+    """Kind whose cells are detectors under a condition; a shared piece of work is a scene under a condition."""
 
     columns: ClassVar[tuple[Column, ...]] = (
         Column("mAP", "mean average precision", "", "higher"),
@@ -60,18 +60,18 @@ class DetectorKind(Kind):
 
     @abstractmethod
     def scenes(self, cell: Cell, job: Job) -> Sequence[Condition]:
-        """The scenes of a cell, each under its condition."""
+        """Return the scenes of a cell, each under its condition."""
 
     @abstractmethod
     def condition(self, data: Any) -> Condition:
-        """A scene under its condition from the plain data of a piece."""
+        """Return a scene under its condition from the plain data of a piece."""
 
     @abstractmethod
     def settings(self, suite: Any) -> dict[str, Any]:
-        """What workers are told besides what all kinds that score detectors tell them."""
+        """Return the settings of workers beside those of all kinds that score detectors."""
 
     def about(self, scenes: Mapping[str, SceneData]) -> dict[str, Any]:
-        """What workers are told of the scenes besides their names."""
+        """Return further data of the scenes for the workers."""
         return {}
 
     @abstractmethod
@@ -85,17 +85,17 @@ class DetectorKind(Kind):
         """
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """Records the data set if none is given; which scenes there are."""
+        """Record the data set if none is given, and return its scenes and the settings of the workers."""
         suite: DetectorSuite = plan.suite
         root = Path(suite.data).expanduser()
         if suite.data == RECORDED:
             total = suite.recorded.scenes * len(suite.recorded.towns)
-            with Live("recording", total, 0, console=resources.console, unit="scenes") as live:
+            with Live("recording", total, 0, console=resources.console, unit="scenes") as progress:
                 root = record_nuscenes(
                     recording_of(suite, folder / "data"),
                     workers=resources.workers,
                     ray=resources.ray,
-                    progress=live.show,
+                    progress=progress.show,
                 )
         with NuScenes(root, suite.version) as data:
             version = data.version
@@ -118,27 +118,30 @@ class DetectorKind(Kind):
             **self.about(scenes),
         }
         job = Job(folder, plan.device, settings)
-        forget_failures([boxes_path(folder, c.system, one) for c in retry for one in self.scenes(c, job)])
+        # Stored failures of boxes would make the retried cells fail again at once.
+        forget_failures(
+            [boxes_path(folder, cell.system, condition) for cell in retry for condition in self.scenes(cell, job)]
+        )
         return settings
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
-        """Boxes of one scene under one condition."""
+        """Find the boxes of one scene under one condition."""
         find_boxes(_examination(job), self.condition(data), systems)
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
-        """Scores of a cell; boxes that could not be found together with others are looked for alone."""
+        """Return the scores of a cell; boxes that a shared piece failed to find are found alone."""
         examination, scenes = _examination(job), self.scenes(cell, job)
-        for one in scenes:
-            find_boxes(examination, one, [cell.system])
-        folders = sorted({str(boxes_path(Path(), cell.system, one).parent) for one in scenes})
+        for scene in scenes:
+            find_boxes(examination, scene, [cell.system])
+        folders = sorted({str(boxes_path(Path(), cell.system, scene).parent) for scene in scenes})
         return self.score(examination, cell, scenes, job) | {"artefacts": {"detections": folders}}
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
-        """The record of a cell whose boxes are there."""
+        """Return the record of a cell whose boxes are there."""
         return score_scenes(examination, cell.system, scenes, replicates=job.settings["replicates"])
 
     def finish(self, plan: Plan, folder: Path) -> None:
-        """What the first detector sees: DIR/pictures/detections.jpg."""
+        """Write the first detector's boxes to DIR/pictures/detections.jpg."""
         suite: DetectorSuite = plan.suite
         path = folder / "pictures" / "detections.jpg"
         root = folder / "data" if suite.data == RECORDED else Path(suite.data).expanduser()
@@ -146,56 +149,65 @@ class DetectorKind(Kind):
         if not path.is_file():
             with NuScenes(root, suite.version) as data:
                 version = data.version
-        first = next(iter(plan.details.items()))
+        first_detector = next(iter(plan.details.items()))
         settings = self.settings(suite)
         examination = Examination(
-            folder, root, version, (first,), suite.seed, plan.device, 1, settings.get("calibration", "physical")
+            folder,
+            root,
+            version,
+            (first_detector,),
+            suite.seed,
+            plan.device,
+            1,
+            settings.get("calibration", "physical"),
         )
-        picture, caption = self.sheet(examination, suite)
+        make_picture, caption = self.sheet(examination, suite)
         if not path.is_file():
             try:
-                save_picture(path, picture())
+                save_picture(path, make_picture())
             except FormatError:  # a picture that cannot be read has failed its cells, which say so
                 return
         safeio.write_atomic(path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n")
 
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
-        """Finds the boxes of the cell again, in an empty folder, and compares metrics and all else."""
-        quiet = Resources(device=plan.device, console=Console(quiet=True))
-        settings = self.prepare(plan, folder, quiet)  # the data are there, or are recorded again
+        """Find the boxes of the cell again, in an empty folder, and compare metrics and files."""
+        quiet_resources = Resources(device=plan.device, console=Console(quiet=True))
+        settings = self.prepare(plan, folder, quiet_resources)  # the data are there, or are recorded again
         with tempfile.TemporaryDirectory() as temporary:
             job = Job(Path(temporary), plan.device, settings)
             self.start(job)
             result = safeio.parse_json(safeio.dump_json(self.result(cell, job)))
-            files = hash_artefacts(job.folder, result["artefacts"]["detections"])
+            hashes = hash_artefacts(job.folder, result["artefacts"]["detections"])
         # last digits of boxes were seen to differ (the number of threads may be why); those of metrics are rounded
-        same = sum(record["hashes"].get(name) == value for name, value in files.items())
+        equal_files = sum(record["hashes"].get(name) == digest for name, digest in hashes.items())
         examination = replace(_examination(job), folder=folder)
         system = examination.defended.get(cell.system, (cell.system, None))[0]
         examination = replace(examination, detectors=((system, dict(examination.detectors)[system]),))
-        shown, _ = self.sheet(examination, plan.suite, cell)
+        make_picture, _ = self.sheet(examination, plan.suite, cell)
         return Replay(
             cell,
             difference(record, result),
-            picture=shown,
-            compared=f"{len(result['metrics'])} metrics, {same} of {len(files)} files of boxes the same to the bit",
+            picture=make_picture,
+            compared=(
+                f"{len(result['metrics'])} metrics, {equal_files} of {len(hashes)} files of boxes the same to the bit"
+            ),
         )
 
 
 def _examination(job: Job) -> Examination:
-    own = job.settings
+    settings = job.settings
     defended = {
         name: (detector, make_defence(kind, **options))
-        for name, (detector, kind, options) in own.get("defended", {}).items()
+        for name, (detector, kind, options) in settings.get("defended", {}).items()
     }
     return Examination(
         job.folder,
-        Path(own["root"]),
-        own["version"],
-        tuple(own["detectors"].items()),
-        own["seed"],
+        Path(settings["root"]),
+        settings["version"],
+        tuple(settings["detectors"].items()),
+        settings["seed"],
         job.device,
-        own["threads"],
-        own.get("calibration", "physical"),
+        settings["threads"],
+        settings.get("calibration", "physical"),
         defended,
     )

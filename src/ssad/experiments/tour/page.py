@@ -1,4 +1,4 @@
-"""The front page of a tour: what was tested, the verdict in plain words, the main table and the page of each part."""
+"""Front page of a tour: question, verdict, main table and page of each part."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ TEMPLATE = Path(__file__).with_name("page.html")
 
 
 def summary(run: Run) -> Table:
-    """The table that is shown on the terminal."""
+    """Return the table for the terminal."""
     return replace(result_table(run), note="")
 
 
 def section(run: Run) -> tuple[str, Sequence[Table]]:
-    """The page and its tables; writes the pages of the parts beside it."""
+    """Return the page and its tables; write the pages of the parts beside it."""
     reasons = {line["part"]: line["reason"] for line in run.failures}
     parts, tables = [], []
-    for one in run.suite["parts"]:
-        name = str(one["name"])
-        part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_about(one)}
-        found = _read(run.folder / name)
-        if found is not None:
-            write_report(found.folder)
-            kind = kind_of_run(found)
-            table = replace(kind.summary(found), name=name)
+    for part_settings in run.suite["parts"]:
+        name = str(part_settings["name"])
+        part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_about(part_settings)}
+        part_run = _read(run.folder / name)
+        if part_run is not None:
+            write_report(part_run.folder)
+            kind = kind_of_run(part_run)
+            table = replace(kind.summary(part_run), name=name)
             tables.append(table)
             part |= {
-                "title": str(found.suite.get("title") or name),
+                "title": str(part_run.suite.get("title") or name),
                 "table": table,
-                "verdict": complete_verdict(found, kind.verdict(found)),
-                "command": found.command,
+                "verdict": complete_verdict(part_run, kind.verdict(part_run)),
+                "command": part_run.command,
             }
-            part["cells"] = f"{len(found.lines)} of {found.planned} cells"
-            part["seconds"] = sum(float(line.get("wall_s") or 0.0) for line in found.lines)
+            part["cells"] = f"{len(part_run.lines)} of {part_run.planned} cells"
+            part["seconds"] = sum(float(line.get("wall_s") or 0.0) for line in part_run.lines)
         parts.append(part)
     return render(TEMPLATE, run, parts=parts, limits=run.suite.get("limits", [])), tables
 
@@ -53,7 +53,7 @@ def _about(part: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read(folder: Path) -> Run | None:
-    """The run of a part; None: it has no results."""
+    """Return the run of a part; None: it has no results."""
     try:
         return load_run(folder)
     except SSADError:

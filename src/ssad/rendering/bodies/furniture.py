@@ -208,7 +208,8 @@ def barrier(style: str, size: Point, *, generator: np.random.Generator, detail: 
             [(0.0, -half_width + 0.03, z * height), (0.0, half_width - 0.03, z * height)] for z in (0.16, 0.97)
         ]
         post_paths = [
-            [(0.0, s * (half_width - 0.03), 0.05), (0.0, s * (half_width - 0.03), 0.98 * height)] for s in (-1.0, 1.0)
+            [(0.0, side * (half_width - 0.03), 0.05), (0.0, side * (half_width - 0.03), 0.98 * height)]
+            for side in (-1.0, 1.0)
         ]
         bar_count = (5, 9, 15)[detail]
         bar_paths = [
@@ -238,8 +239,8 @@ def barrier(style: str, size: Point, *, generator: np.random.Generator, detail: 
                     (upper_edge[1], top * height),
                 ]
                 parts.append(sided(prism(stripe_outline, (-0.03, 0.03), axis=0, material=material, smooth=0.0), "face"))
-        for s in (-1.0, 1.0):
-            y = s * 0.82 * half_width
+        for side in (-1.0, 1.0):
+            y = side * 0.82 * half_width
             for end in (-1.0, 1.0):
                 leg_path = [(end * half_length * 0.9, y, 0.02), (end * 0.04, y, 0.98 * height)]
                 parts.append(tube(leg_path, 0.025, material=TRIM, segments=4))

@@ -285,8 +285,8 @@ def _flank(
 def _end(shell: Shell, size: Point, half: F64, kept: Sequence[int], *, front: bool) -> Mesh:
     """The front or the rear: a grid of points over the first or last section, bulging outwards."""
     section = half[0 if front else -1]
-    rows = [r for r, point in enumerate(kept) if B3 <= point <= U3]
-    rim_rows = [r for r, point in enumerate(kept) if point > kept[rows[-1]]]
+    rows = [row for row, point in enumerate(kept) if B3 <= point <= U3]
+    rim_rows = [row for row, point in enumerate(kept) if point > kept[rows[-1]]]
     top_edge = section[[rows[-1], *rim_rows]]
     if top_edge[-1, 1] > 1e-9:
         top_edge = np.concatenate([top_edge, [[top_edge[-1, 0], 0.0, top_edge[-1, 2]]]])
@@ -295,14 +295,14 @@ def _end(shell: Shell, size: Point, half: F64, kept: Sequence[int], *, front: bo
     shares = np.unique([0.0, 1.0, *(top_edge[1:, 1] / full_width), *([0.2, lamp_share] if len(kept) > 3 else [])])[::-1]
     depth = (shell.nose if front else -shell.tail) * size[0]
     point_rows: list[F64] = []
-    point_names = [kept[r] for r in rows]
+    point_names = [kept[row] for row in rows]
     # At detail 0 the end is one flat band.
     if len(kept) == 3:
         shares = np.array([1.0])
-    for r in rows:
-        row_points = np.repeat(section[r][None], len(shares), axis=0)
+    for row in rows:
+        row_points = np.repeat(section[row][None], len(shares), axis=0)
         row_points[:, 1] *= shares
-        row_points[:, 0] += depth * _bulge(shell, section[r][2], section, front=front) * (1.0 - shares**2)
+        row_points[:, 0] += depth * _bulge(shell, section[row][2], section, front=front) * (1.0 - shares**2)
         point_rows.append(row_points)
     if rim_rows and len(shares) > 1:
         widths = shares * full_width
@@ -324,16 +324,16 @@ def _end(shell: Shell, size: Point, half: F64, kept: Sequence[int], *, front: bo
     faces: list[tuple[int, int, int]] = []
     surfaces: list[tuple[Material, str | None]] = []
     columns = points.shape[1]
-    for r in range(len(points) - 1):
+    for row in range(len(points) - 1):
         for column in range(columns - 1):
-            corner, next_corner = r * columns + column, (r + 1) * columns + column
+            corner, next_corner = row * columns + column, (row + 1) * columns + column
             quad_faces = [(corner, next_corner, next_corner + 1), (corner, next_corner + 1, corner + 1)]
             faces += quad_faces if front else [(first, point, second) for first, second, point in quad_faces]
             surfaces += [
                 _face(
                     shell,
-                    point_names[r],
-                    point_names[r + 1],
+                    point_names[row],
+                    point_names[row + 1],
                     0.5 * abs(width_shares[column] + width_shares[column + 1]),
                     front=front,
                 )

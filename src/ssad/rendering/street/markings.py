@@ -161,8 +161,8 @@ def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, look: 
     """Arrows for the turns that a lane leads to, twice before the stop line."""
     directions = set()
     for successor in graph.successors(lane).tolist():
-        part = graph.points(successor)
-        turn_angle = float((graph.yaw[part.stop - 1] - graph.yaw[part.start] + np.pi) % (2 * np.pi) - np.pi)
+        points = graph.points(successor)
+        turn_angle = float((graph.yaw[points.stop - 1] - graph.yaw[points.start] + np.pi) % (2 * np.pi) - np.pi)
         directions.add("ahead" if abs(turn_angle) < 0.5 else "left" if turn_angle > 0 else "right")
     for distance in (9.0, 24.0):
         x, y, yaw, _ = graph.at(lane, s - distance)

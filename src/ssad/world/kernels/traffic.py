@@ -82,36 +82,41 @@ def lead_gap(
     metres that the route ahead leaves its straight line.
     """
     other_pose = seen.pose[b, j]
-    u = wp.clamp(lon, 0.0, SIGHT)
+    along = wp.clamp(lon, 0.0, SIGHT)
     lateral = float(0.0)
     residual = float(0.0)
     frame = wp.vec4(0.0, 0.0, 1.0, 0.0)
     for _ in range(4):
-        frame = way_frame(roads, route[0], route[1], shift, u0 + u)
+        frame = way_frame(roads, route[0], route[1], shift, u0 + along)
         rel_x = other_pose[0] - frame[0]
         rel_y = other_pose[1] - frame[1]
         residual = rel_x * frame[2] + rel_y * frame[3]
         lateral = rel_y * frame[2] - rel_x * frame[3]
         if wp.abs(residual) < 0.05:
             break
-        u = wp.clamp(u + residual, 0.0, SIGHT)
+        along = wp.clamp(along + residual, 0.0, SIGHT)
     cosine = heading[0] * frame[2] + heading[1] * frame[3]
     sine = wp.abs(heading[0] * frame[3] - heading[1] * frame[2])
     half_along = other[0] * wp.abs(cosine) + other[1] * sine
     half_across = other[0] * sine + other[1] * wp.abs(cosine)
     result = wp.vec2(FAR, 0.0)
     # in a bend the corners sweep wider than the body
-    route_point = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
+    route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
     sweep = wp.min(0.5 * wp.abs(roads.path[route_point][3]) * own[0] * own[0], 1.0)
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
-    if u > 0.0 and u < SIGHT and wp.abs(residual) < 1.0 and wp.abs(lateral) < own[1] + half_across + margin + sweep:
-        result = wp.vec2(u - own[0] - half_along, seen.speed[b, j] * cosine)
+    if (
+        along > 0.0
+        and along < SIGHT
+        and wp.abs(residual) < 1.0
+        and wp.abs(lateral) < own[1] + half_across + margin + sweep
+    ):
+        result = wp.vec2(along - own[0] - half_along, seen.speed[b, j] * cosine)
     if result[0] >= FAR and bend > 1.5 and lon < 20.0:
         # in a tight bend a projection need not converge, and a long body leaves its corridor: drive it along and see
         # 0.2 m of room to either side, checked every metre
         for metre in range(14):
-            u = float(metre + 1)
-            frame = way_frame(roads, route[0], route[1], shift, u0 + u)
+            along = float(metre + 1)
+            frame = way_frame(roads, route[0], route[1], shift, u0 + along)
             dx = other_pose[0] - frame[0]
             dy = other_pose[1] - frame[1]
             # a centimetre more than is asked, so that it never misses what the exact test finds
@@ -120,7 +125,7 @@ def lead_gap(
             ):
                 body = wp.vec3(frame[0], frame[1], wp.atan2(frame[3], frame[2]))
                 if boxes_touch(body, own[0], own[1] + 0.2, other_pose, other[0], other[1]):
-                    result = wp.vec2(u - 1.0, seen.speed[b, j] * (heading[0] * frame[2] + heading[1] * frame[3]))
+                    result = wp.vec2(along - 1.0, seen.speed[b, j] * (heading[0] * frame[2] + heading[1] * frame[3]))
                     break
     return result
 
@@ -251,7 +256,7 @@ def conflict_gap(
     conflict.
     """
     gap = FAR
-    u = float(0.0)
+    along = float(0.0)
     speed = v
     # Long enough that a fast, short agent does not skip from before the path to behind it.
     half_length = wp.max(other[0], 0.5 * STRIDE * wp.abs(seen.speed[b, j]) - own[1])
@@ -261,14 +266,14 @@ def conflict_gap(
     now = seen.forecast[b, j, 0]
     for step in range(HORIZON):
         # it slows down for bends as the route's speed profile says
-        route_point = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
+        route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
         next_speed = wp.min(
             speed + 2.0 * STRIDE,
             wp.min(wp.max(target, speed), wp.max(roads.rule[route_point][0], speed - 4.0 * STRIDE)),
         )
-        u = u + 0.5 * (speed + next_speed) * STRIDE
+        along = along + 0.5 * (speed + next_speed) * STRIDE
         speed = next_speed
-        frame = way_frame(roads, route[0], route[1], shift, u0 + u)
+        frame = way_frame(roads, route[0], route[1], shift, u0 + along)
         later = now
         if step + 1 < HORIZON:
             later = seen.forecast[b, j, step + 1]
@@ -293,7 +298,7 @@ def conflict_gap(
                     wp.abs(lateral) < own[1] + half_across + lat_margin
                     and wp.abs(longitudinal) < own[0] + half_along + 1.0
                 ):
-                    edge = u + longitudinal - half_along - own[0]
+                    edge = along + longitudinal - half_along - own[0]
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or longitudinal > 0.0:
                         gap = wp.min(gap, wp.max(edge, 0.0))

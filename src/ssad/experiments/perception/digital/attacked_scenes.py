@@ -269,8 +269,8 @@ class SceneAttacker:
                 self._inspect()
                 self._fit()
             # A batch is one tensor, so its images must be of one size.
-            for image_size in sorted({picture.shape[:2] for picture in images}):
-                rows = [row for row, picture in enumerate(images) if picture.shape[:2] == image_size]
+            for image_size in sorted({image.shape[:2] for image in images}):
+                rows = [row for row, image in enumerate(images) if image.shape[:2] == image_size]
                 for row, attacked_image in zip(
                     rows, self._all([frames[row] for row in rows], [images[row] for row in rows]), strict=True
                 ):

@@ -55,7 +55,7 @@ class DigitalSuite(DetectorSuite, AttackTable):
 
 
 class Digital(DetectorKind):
-    """See the module. A piece is a scene under an attack on one system, shown to all systems that need it."""
+    """Kind `digital`. A piece is a scene under an attack on one system, shown to all systems that need it."""
 
     name = "digital"
     suite = DigitalSuite
@@ -76,97 +76,106 @@ class Digital(DetectorKind):
     )
 
     def plan(self, suite: DigitalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Attacks, defences and detectors are built once, the data set is looked at."""
+        """Build attacks, defences and detectors once, and inspect the data set."""
         points = points_of(suite)
-        named = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
-        weights, detectors, tasks = detectors_of(suite, named, flat=True)
+        detector_names = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
+        weights, detectors, tasks = detectors_of(suite, detector_names, flat=True)
         if suite.transfer_detectors and not suite.transfer:
             raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
-        main, hard = ([split_weights(text)[0] for text in own] for own in (suite.detectors, suite.hardened))
+        main_detectors, hardened_detectors = (
+            [split_weights(text)[0] for text in entries] for entries in (suite.detectors, suite.hardened)
+        )
         data = data_of(suite)
         cells = []
         for detector in detectors:
-            others = [other for other in detectors if other not in (detector, *hard)]
-            moved = [replace(one, source=other) for one in transfers_of(suite) for other in others]
-            own = [*(points if detector in main else bystander_points(suite)), *moved]
-            for point in hardened_points(suite) if detector in hard else own:
+            transfer_sources = [
+                candidate for candidate in detectors if candidate not in (detector, *hardened_detectors)
+            ]
+            transferred_points = [
+                replace(one, source=candidate) for one in transfers_of(suite) for candidate in transfer_sources
+            ]
+            entries = [*(points if detector in main_detectors else bystander_points(suite)), *transferred_points]
+            for point in hardened_points(suite) if detector in hardened_detectors else entries:
                 system = system_name(detector, point.defence)
                 source = point.source or (system if point.aware or not point.defence else detector)
                 title = f"{system}/{point.attack}{f'@{source}' if point.specs and source != system else ''}"
                 title += f"/{point.scenes}" if point.scenes else ""
                 inputs: list[Any] = [weights[detector], safeio.dump_json(data), device, suite.replicates]
                 inputs += [weights[point.source]] if point.source else []
-                told = {"attacks": [one.row for one in point.specs], "source": source, "scenes": point.scenes}
+                cell_spec = {"attacks": [one.row for one in point.specs], "source": source, "scenes": point.scenes}
                 fields = {"detector": detector, **point.fields, "task": tasks[detector]}
-                cells.append(self.make_cell(title, system, suite.seed, fields, told, *inputs))
+                cells.append(self.make_cell(title, system, suite.seed, fields, cell_spec, *inputs))
         return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, {}, detectors)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """See `DetectorKind`; says how many gradients the suite takes."""
+        """Prepare as `DetectorKind` does, and print how many gradients the suite takes."""
         settings = super().prepare(plan, folder, resources, retry=retry)
         job, images = Job(folder, plan.device, settings), settings["images"]
-        passes: dict[str, Any] = {
-            f"{one.source}/{one.name}": one.spec.passes_in(images[one.scene])
+        passes_by_scene: dict[str, Any] = {
+            f"{scene.source}/{scene.name}": scene.spec.passes_in(images[scene.scene])
             for cell in plan.cells
-            for one in self.scenes(cell, job)
-            if isinstance(one, AttackedScene)
+            for scene in self.scenes(cell, job)
+            if isinstance(scene, AttackedScene)
         }
-        count = len(plan.details)
-        text = f"{sum(passes.values()):,} forward and backward passes for {count} detector{'s' if count != 1 else ''}"
+        detector_count = len(plan.details)
+        text = (
+            f"{sum(passes_by_scene.values()):,} forward and backward passes for {detector_count} "
+            f"detector{'s' if detector_count != 1 else ''}"
+        )
         resources.console.print(f"{text} in all", highlight=False)
         return settings
 
     def order(self, cell: Cell) -> float:
-        """Clean first, then the rows of the table, then the curves."""
+        """Return the priority of a cell: clean first, then the rows of the table, then the curves."""
         return 0 if not cell.spec["attacks"] else 1 if cell.fields["row"] else 2
 
     def scenes(self, cell: Cell, job: Job) -> list[Condition]:
-        """See `DetectorKind`; of an ensemble those of one member after another."""
+        """Return the scenes of a cell under its attack; of an ensemble those of one member after another."""
         towns: dict[str, list[str]] = {}
         for scene in job.settings["scenes"]:
             towns.setdefault(job.settings["towns"][scene], []).append(scene)
-        kept = {scene for own in towns.values() for scene in own[: cell.spec["scenes"] or None]}
-        scenes = [scene for scene in job.settings["scenes"] if scene in kept]
+        selected = {scene for town_scenes in towns.values() for scene in town_scenes[: cell.spec["scenes"] or None]}
+        scenes = [scene for scene in job.settings["scenes"] if scene in selected]
         if not cell.spec["attacks"]:
             return [ShiftedScene(None, 0, scene) for scene in scenes]
         batch, source = job.settings["batch"], cell.spec["source"]
-        specs = [AttackSpec.of_row(one) for one in cell.spec["attacks"]]
+        specs = [AttackSpec.of_row(row) for row in cell.spec["attacks"]]
         return [AttackedScene(spec, scene, batch, source) for spec in specs for scene in scenes]
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """See `Kind`: the scenes whose boxes are still to be found.
+        """Return the scenes whose boxes are still to be found.
 
-        Clean scenes, which every cell is compared with, are done for all systems at once; so are pictures that are made
+        Clean scenes, which every cell is compared with, are done for all systems at once; so are images that are made
         against one system and shown to several.
         """
         found: dict[str, Any] = {}
-        for one in self.scenes(cell, job):
-            clean = ShiftedScene(None, 0, one.scene)
+        for scene in self.scenes(cell, job):
+            clean = ShiftedScene(None, 0, scene.scene)
             if not boxes_path(job.folder, cell.system, clean).is_file():
-                found[clean.name] = {"scene": one.scene}
-            if isinstance(one, AttackedScene) and not boxes_path(job.folder, cell.system, one).is_file():
-                told = {"scene": one.scene, "batch": one.batch, "source": one.source, **one.spec.row}
-                found[f"{one.source}/{one.name}"] = told
+                found[clean.name] = {"scene": scene.scene}
+            if isinstance(scene, AttackedScene) and not boxes_path(job.folder, cell.system, scene).is_file():
+                piece = {"scene": scene.scene, "batch": scene.batch, "source": scene.source, **scene.spec.row}
+                found[f"{scene.source}/{scene.name}"] = piece
         return found
 
     def condition(self, data: Any) -> Condition:
-        """See `DetectorKind`."""
+        """Return the attacked or clean scene of a piece."""
         if "attack" not in data:
             return ShiftedScene(None, 0, data["scene"])
         return AttackedScene(AttackSpec.of_row(data), data["scene"], data["batch"], data["source"])
 
     def settings(self, suite: DigitalSuite) -> dict[str, Any]:
-        """See `DetectorKind`."""
+        """Return the batch size and the defended detectors."""
         defended = {
-            system_name(detector, guard): [detector, guard.name, dict(guard.options)]
+            system_name(detector, defence): [detector, defence.name, dict(defence.options)]
             for detector in (split_weights(text)[0] for text in suite.detectors)
-            for guard in dict.fromkeys(guard_of(suite, one) for one in suite.attacks if one.defence)
-            if guard
+            for defence in dict.fromkeys(guard_of(suite, attack) for attack in suite.attacks if attack.defence)
+            if defence
         }
         return {"batch": suite.batch, "defended": defended}
 
     def about(self, scenes: Mapping[str, SceneData]) -> dict[str, Any]:
-        """Towns, and numbers of camera images."""
+        """Return the towns, and the numbers of camera images."""
         return {
             "towns": {name: scene.log.location if scene.log else "" for name, scene in scenes.items()},
             "images": {
@@ -176,18 +185,18 @@ class Digital(DetectorKind):
         }
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
-        """Metrics, what the attack took, and which share of the system's clean mAP it took away."""
-        specs = [AttackSpec.of_row(one) for one in cell.spec["attacks"]]
+        """Return the metrics, the cost of the attack, and the share of the system's clean mAP that is lost."""
+        specs = [AttackSpec.of_row(row) for row in cell.spec["attacks"]]
         return attack_record(examination, cell.system, specs, scenes, replicates=job.settings["replicates"])
 
     def sheet(
         self, examination: Examination, suite: DigitalSuite, cell: Cell | None = None
     ) -> tuple[Callable[[], U8], str]:
-        """One moment under the attacks of the table."""
-        rows = [one.specs[0] for one in rows_of(suite) if one.row and len(one.specs) == 1]
-        if cell is not None:  # against the bare detector, also where the cell's pictures were made against another
-            rows = [AttackSpec.of_row(one) for one in cell.spec["attacks"]]
-        specs = [one for one in dict.fromkeys(rows) if not isinstance(one.make(), UniversalFit)]
+        """Return a picture of one moment under the attacks of the table, and its caption."""
+        rows = [entry.specs[0] for entry in rows_of(suite) if entry.row and len(entry.specs) == 1]
+        if cell is not None:  # against the bare detector, even if the cell's images were made against another one
+            rows = [AttackSpec.of_row(entry) for entry in cell.spec["attacks"]]
+        specs = [entry for entry in dict.fromkeys(rows) if not isinstance(entry.make(), UniversalFit)]
         caption = (
             f"What {examination.detectors[0][0]} is shown (left), what was changed (middle, magnified so that the "
             "largest change is black or white), what it finds (orange, score at least 0.3) and what is there (white)."
@@ -195,13 +204,13 @@ class Digital(DetectorKind):
         return lambda: attack_sheet(examination, suite.split, specs), caption
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
-        """Page of a run and its tables."""
+        """Return the page of a run and its tables."""
         return page.section(run, self.verdict(run))
 
     def summary(self, run: Run) -> Table:
-        """Main table of a run."""
+        """Return the main table of a run."""
         return page.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences."""
+        """Return the findings of a run in sentences."""
         return verdict(run)

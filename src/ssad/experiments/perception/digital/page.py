@@ -1,4 +1,4 @@
-"""The page of a digital run: 3D detectors under digital attacks, the paper's numbers beside ours, and the audit."""
+"""Page of a digital run: 3D detectors under digital attacks, the paper's numbers beside ours, and the audit."""
 
 from __future__ import annotations
 
@@ -48,32 +48,49 @@ EPSILON = 5.0
 
 
 def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], list[tuple[float, ...]]] | None:
-    """The paper's row beside one of ours: its name and budget, and the metrics of each detector; None: it has none."""
+    """Return the paper's row beside one of ours: name and budget, and each detector's metrics; None: it has none."""
     attack, loss, norm, radius, _, options = setting[:6]
-    told = PAPER.get((attack, loss))
+    published_attack = PAPER.get((attack, loss))
     options = " ".join(word for word in options.split() if not word.startswith("precision="))
-    if told is None or not run.suite.get("reference") or options or (attack and (norm, radius) != ("linf", EPSILON)):
+    if (
+        published_attack is None
+        or not run.suite.get("reference")
+        or options
+        or (attack and (norm, radius) != ("linf", EPSILON))
+    ):
         return None
-    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    names = [
+        next((title for prefix, title in DETECTORS.items() if detector.startswith(prefix)), "")
+        for detector in run.detectors
+    ]
     if not any(names):
         return None
-    size = size_of(Setting("told", "", "linf", EPSILON, DIGITAL_STEPS[told])) if told else ""
-    head = (told or title_of(setting), size)
+    budget = size_of(Setting("told", "", "linf", EPSILON, DIGITAL_STEPS[published_attack])) if published_attack else ""
+    row_head = (published_attack or title_of(setting), budget)
     pairs = zip(run.detectors, names, strict=True)
-    return head, [PUBLISHED[told].get(name, (math.nan, math.nan))[: len(run.metrics(d))] for d, name in pairs]
+    return row_head, [
+        PUBLISHED[published_attack].get(name, (math.nan, math.nan))[: len(run.metrics(detector))]
+        for detector, name in pairs
+    ]
 
 
 def main_table(run: DigitalRun) -> Table:
-    """Attack x detector: mAP and NDS, the paper's rows between ours."""
+    """Return attack x detector: mAP and NDS, the paper's rows between ours."""
     rows = []
     for setting in run.rows:
-        head = (title_of(setting), size_of(setting))
-        cells = [metric_cell(run.record(d, setting), metric) for d in run.detectors for metric in run.metrics(d)]
-        rows.append(Row(head, tuple(cells)))
-        told = published_row(run, setting)
-        if told:
-            rows.append(Row(told[0], tuple(Cell(v) for pair in told[1] for v in pair), published=True))
-    columns = tuple(f"{d} {metric}" for d in run.detectors for metric in run.metrics(d))
+        row_head = (title_of(setting), size_of(setting))
+        cells = [
+            metric_cell(run.record(detector, setting), metric)
+            for detector in run.detectors
+            for metric in run.metrics(detector)
+        ]
+        rows.append(Row(row_head, tuple(cells)))
+        published = published_row(run, setting)
+        if published:
+            rows.append(
+                Row(published[0], tuple(Cell(value) for scores in published[1] for value in scores), published=True)
+            )
+    columns = tuple(f"{detector} {metric}" for detector in run.detectors for metric in run.metrics(detector))
     note = f"Percent; each camera image is attacked by itself, its stored 8-bit picture is scored; {interval_note(run)}"
     note += run.about_flat
     if any(row.published for row in rows):
@@ -85,28 +102,30 @@ def main_table(run: DigitalRun) -> Table:
 
 
 def lost_table(run: DigitalRun) -> Table:
-    """Attack x detector: the share of the clean score that is lost, the paper's shares between ours."""
+    """Return attack x detector: the share of the clean score that is lost, the paper's shares between ours."""
     rows = []
     clean = published_row(run, Setting())
-    for setting in (s for s in run.rows if s[0]):
-        head = (title_of(setting), size_of(setting))
-        cells = [lost_cell(run, d, setting, metric) for d in run.detectors for metric in run.metrics(d)]
-        rows.append(Row(head, tuple(cells)))
-        told = published_row(run, setting)
-        if told and clean:
+    for setting in (entry for entry in run.rows if entry[0]):
+        row_head = (title_of(setting), size_of(setting))
+        cells = [
+            lost_cell(run, detector, setting, metric) for detector in run.detectors for metric in run.metrics(detector)
+        ]
+        rows.append(Row(row_head, tuple(cells)))
+        published = published_row(run, setting)
+        if published and clean:
             shares = [
-                100 * (1 - a / b)
-                for after, before in zip(told[1], clean[1], strict=True)
-                for a, b in zip(after, before, strict=True)
+                100 * (1 - attacked_score / clean_score)
+                for after, before in zip(published[1], clean[1], strict=True)
+                for attacked_score, clean_score in zip(after, before, strict=True)
             ]
-            rows.append(Row(told[0], tuple(Cell(share) for share in shares), published=True))
-    columns = tuple(f"{d} {metric}" for d in run.detectors for metric in run.metrics(d))
+            rows.append(Row(published[0], tuple(Cell(share) for share in shares), published=True))
+    columns = tuple(f"{detector} {metric}" for detector in run.detectors for metric in run.metrics(detector))
     note = "Percent of each detector's own clean score; more is a stronger attack."
     return Table("lost", "What an attack takes away", ("Attack", "Budget"), columns, tuple(rows), note, SOURCE)
 
 
 def effort_table(run: DigitalRun) -> Table:
-    """What each attack took, and what it did to the loss that it ascends."""
+    """Return the cost of each attack, and its effect on the loss that it ascends."""
     names = ("gradients", "queries", "loss_before", "loss_after", "used", "change_px", "idle", "gradient_error")
     columns = (
         "gradients an image",
@@ -126,14 +145,14 @@ def effort_table(run: DigitalRun) -> Table:
         values = [record.get(name) for name in (*names, "batch")]
         scaled = [
             Cell(
-                math.nan if v is None else float(v) * (100 if n in ("used", "gradient_error") else 1),
+                math.nan if value is None else float(value) * (100 if n in ("used", "gradient_error") else 1),
                 digits=0 if n in ("idle", "batch") else 2,
             )
-            for n, v in zip((*names, "batch"), values, strict=True)
+            for n, value in zip((*names, "batch"), values, strict=True)
         ]
         system = ", ".join(part for part in [detector, defence_of(setting)] if part)
-        head = (system, title_of(setting), size_of(setting), scenes_of(setting), record["access"])
-        rows.append(Row(head, tuple(scaled)))
+        row_head = (system, title_of(setting), size_of(setting), scenes_of(setting), record["access"])
+        rows.append(Row(row_head, tuple(scaled)))
     note = (
         "Means over the images. Idle images have no object for a loss that needs one and are left as they are. The "
         "error of the gradient is against finite differences, on the image with most objects of each scene."
@@ -145,43 +164,46 @@ def effort_table(run: DigitalRun) -> Table:
 
 
 def short_of(run: DigitalRun) -> str:
-    """Where memory did not suffice, that it did not; else ""."""
-    halved = sum(int(record.get("halved") or 0) for record in run.records.values())
-    if not halved:
+    """Return a remark if memory was too small for a batch; else ""."""
+    halvings = sum(int(record.get("halved") or 0) for record in run.records.values())
+    if not halvings:
         return ""
-    times = "once" if halved == 1 else f"{halved} times"
-    return f" Memory was short: batches were halved {times}; set a smaller batch to save this time."
+    count_text = "once" if halvings == 1 else f"{halvings} times"
+    return f" Memory was short: batches were halved {count_text}; set a smaller batch to save this time."
 
 
 def every_table(run: DigitalRun) -> Table:
-    """Every cell."""
+    """Return every cell."""
     rows = []
     for (detector, setting), record in run.records.items():
-        own = record if record["status"] == "ok" else None
-        cells = [metric_cell(own, metric) for metric in ("mAP", "NDS", "AP_car")]
+        valid_record = record if record["status"] == "ok" else None
+        cells = [metric_cell(valid_record, metric) for metric in ("mAP", "NDS", "AP_car")]
         lost = lost_cell(run, detector, setting, "mAP") if setting[0] else Cell(math.nan)
-        head = (detector, title_of(setting), size_of(setting), circumstances(setting), scenes_of(setting))
-        rows.append(Row(head, (*cells, lost)))
+        row_head = (detector, title_of(setting), size_of(setting), circumstances(setting), scenes_of(setting))
+        rows.append(Row(row_head, (*cells, lost)))
     columns = ("mAP", "NDS", "AP of cars", "mAP lost")
     heads = ("Detector", "Attack", "Budget", "Circumstances", "Scenes")
     return Table("cells", "Every attack", heads, columns, tuple(rows), "Percent.")
 
 
 def class_table(run: DigitalRun) -> Table:
-    """AP of each class under the attacks of the table."""
+    """Return the AP of each class under the attacks of the table."""
     rows = [
-        Row((d, title_of(s), size_of(s)), tuple(metric_cell(run.record(d, s), f"AP_{c}") for c in CLASSES))
-        for d in run.detectors
-        for s in run.rows
+        Row(
+            (detector, title_of(setting), size_of(setting)),
+            tuple(metric_cell(run.record(detector, setting), f"AP_{class_name}") for class_name in CLASSES),
+        )
+        for detector in run.detectors
+        for setting in run.rows
     ]
     note = "AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation."
-    columns = tuple(c.replace("_", " ") for c in CLASSES)
+    columns = tuple(class_name.replace("_", " ") for class_name in CLASSES)
     return Table("classes", "By class", ("Detector", "Attack", "Budget"), columns, tuple(rows), note)
 
 
 def attempts_of(run: DigitalRun) -> list[Attempt]:
-    """The cells of a run as the audit reads them."""
-    found = []
+    """Return the cells of a run in the form of the audit."""
+    attempts = []
     for (detector, setting), record in run.records.items():
         attack, loss, norm, radius, steps, options = setting[:6]
         clean = run.clean(detector, setting)
@@ -189,7 +211,7 @@ def attempts_of(run: DigitalRun) -> list[Attempt]:
             continue
         unaware = bool(setting.defence) and not setting.aware
         group = [defence_of(setting), setting.target, scenes_of(setting) if setting.subset else ""]
-        found.append(
+        attempts.append(
             Attempt(
                 detector,
                 attack,
@@ -212,11 +234,11 @@ def attempts_of(run: DigitalRun) -> list[Attempt]:
                 ", ".join(filter(None, group)),
             )
         )
-    return found
+    return attempts
 
 
 def published_attempts() -> list[Attempt]:
-    """The paper's own table as the audit reads it; which losses were ascended it does not say."""
+    """Return the paper's own table in the form of the audit; it does not state the losses."""
     return [
         Attempt(
             f"{detector} (paper)",
@@ -232,7 +254,7 @@ def published_attempts() -> list[Attempt]:
 
 
 def audit_table(verdict: Verdict) -> Table:
-    """How often each rule was applied, and how often it was broken."""
+    """Return how often each rule was applied, and how often it was broken."""
     rows = [
         Row(
             (text,),
@@ -248,11 +270,11 @@ def audit_table(verdict: Verdict) -> Table:
 
 
 def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP") -> str:
-    """A small plot for each attack that ran over several radii or step counts: the metric, a line a detector; as SVG.
+    """Plot a metric for each attack that ran over several radii or step counts, a line a detector; as SVG.
 
     Args:
         run: The run.
-        what: What is swept.
+        what: Swept parameter.
         metric: Name.
 
     Returns:
@@ -263,73 +285,78 @@ def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP
         value = setting[3] if what == "radius" else setting[4]
         if setting.plain and setting.attack not in ("", "noise", "ensemble") and (what == "steps" or value <= FURTHEST):
             groups.setdefault(_at(setting, what, 0), set()).add(value)
-    found = []
+    plots = []
     for group, values in groups.items():
         if len(values) < 2:
             continue
-        axis = [0.0, *sorted(values)]
+        axis_values = [0.0, *sorted(values)]
         lines = []
         for detector in run.detectors:
-            records = [run.record(detector, _at(group, what, v)) if v else run.clean(detector, group) for v in axis]
+            records = [
+                run.record(detector, _at(group, what, axis_value)) if axis_value else run.clean(detector, group)
+                for axis_value in axis_values
+            ]
             lines.append(
                 [
-                    Point(value / axis[-1], metric_cell(record, metric), f"{detector}, {what} {value:g}")
-                    for value, record in zip(axis, records, strict=True)
+                    Point(value / axis_values[-1], metric_cell(record, metric), f"{detector}, {what} {value:g}")
+                    for value, record in zip(axis_values, records, strict=True)
                 ]
             )
-        ticks = [(value / axis[-1], f"{value:g}") for value in _apart(axis)]
-        found.append(Panel(f"{title_of(group)}; {_rest(group, what)}", ticks, lines))
-    return panels(found, label=f"{metric} over {what}", columns=3) if found else ""
+        ticks = [(value / axis_values[-1], f"{value:g}") for value in _apart(axis_values)]
+        plots.append(Panel(f"{title_of(group)}; {_rest(group, what)}", ticks, lines))
+    return panels(plots, label=f"{metric} over {what}", columns=3) if plots else ""
 
 
 def _at(setting: Setting, what: Literal["radius", "steps"], value: float) -> Setting:
-    """A setting with another radius, or other steps."""
+    """Return a setting with another radius, or other steps."""
     return setting._replace(radius=float(value)) if what == "radius" else setting._replace(steps=int(value))
 
 
 def _rest(setting: Setting, what: str) -> str:
-    """What a curve holds fixed: steps, or radius; and on which scenes it ran."""
+    """Return the fixed parameters of a curve: steps, or radius; and its scenes."""
     steps = setting.steps
     fixed = f"{steps} step{'s' if steps != 1 else ''}" if what == "radius" else f"{setting.radius:g} px"
-    few = f"scenes: {scenes_of(setting)}" if setting.subset else ""
-    return ", ".join(part for part in [fixed, "L2" if setting.norm == "l2" else "", setting.options, few] if part)
+    scene_text = f"scenes: {scenes_of(setting)}" if setting.subset else ""
+    return ", ".join(
+        part for part in [fixed, "L2" if setting.norm == "l2" else "", setting.options, scene_text] if part
+    )
 
 
 def _apart(values: Sequence[float]) -> list[float]:
-    """Those of increasing values that can be written side by side along an axis, the last among them."""
-    kept: list[float] = []
+    """Return those of increasing values that can be written side by side along an axis, including the last."""
+    spaced: list[float] = []
     for value in values[:-1]:
-        if all(abs(value - other) >= 0.08 * values[-1] for other in [*kept, values[-1]]):
-            kept.append(value)
-    return [*kept, values[-1]]
+        if all(abs(value - neighbour) >= 0.08 * values[-1] for neighbour in [*spaced, values[-1]]):
+            spaced.append(value)
+    return [*spaced, values[-1]]
 
 
 def tiles(run: DigitalRun) -> list[dict[str, Any]]:
-    """Headline numbers of each detector: clean, and under the attack of the table that leaves least."""
-    found = []
+    """Return the headline numbers of each detector: clean, and under the strongest attack of the table."""
+    entries = []
     for detector in run.detectors:
-        ran = [
-            (r["metrics"]["mAP"], s)
-            for s in run.rows
-            if s.attack not in ("", "noise") and not s.target and (r := run.record(detector, s))
+        attack_scores = [
+            (record["metrics"]["mAP"], setting)
+            for setting in run.rows
+            if setting.attack not in ("", "noise") and not setting.target and (record := run.record(detector, setting))
         ]
-        worst = min(ran)[1] if ran else None
+        strongest = min(attack_scores)[1] if attack_scores else None
         clean = run.clean(detector)
-        found.append(
+        entries.append(
             {
                 "name": detector,
                 "mAP": metric_cell(clean, "mAP"),
                 "NDS": metric_cell(clean, "NDS"),
-                "worst": f"{title_of(worst)}; {size_of(worst)}" if worst else "no attack ran",
-                "left": metric_cell(run.record(detector, worst), "mAP") if worst else Cell(math.nan),
-                "lost": lost_cell(run, detector, worst, "mAP") if worst else Cell(math.nan),
+                "worst": f"{title_of(strongest)}; {size_of(strongest)}" if strongest else "no attack ran",
+                "left": metric_cell(run.record(detector, strongest), "mAP") if strongest else Cell(math.nan),
+                "lost": lost_cell(run, detector, strongest, "mAP") if strongest else Cell(math.nan),
             }
         )
-    return found
+    return entries
 
 
 def summary(found: Run) -> Table:
-    """The table that is shown on the terminal: percent, and the verdict of the audit."""
+    """Return the table for the terminal: percent, and the verdict of the audit."""
     run = load_digital_run(found)
     verdict = audit(attempts_of(run))
     lines = ["percent", verdict.text, *(f"{fault.detector}: {fault.text}" for fault in verdict.faults[:5])]
@@ -338,13 +365,13 @@ def summary(found: Run) -> Table:
 
 
 def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
-    """The page of a digital run and its tables."""
+    """Return the page of a digital run and its tables."""
     run = load_digital_run(found)
     verdict = audit(attempts_of(run))
-    main, lost, effort = main_table(run), lost_table(run), effort_table(run)
-    every, classes, checked = every_table(run), class_table(run), audit_table(verdict)
-    makers = (transfer_table, defence_table, hardened_table, black_box_table, target_table, halving_table)
-    others = [table for make in makers if (table := make(run)).rows]
+    main_rows, losses, effort = main_table(run), lost_table(run), effort_table(run)
+    all_cells, class_scores, audit_rows = every_table(run), class_table(run), audit_table(verdict)
+    table_builders = (transfer_table, defence_table, hardened_table, black_box_table, target_table, halving_table)
+    others = [table for build_table in table_builders if (table := build_table(run)).rows]
     distances = distance_table(run)
     page = render(
         TEMPLATE,
@@ -352,12 +379,12 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
         verdict=sentences,
         others=others,
         distances=distances,
-        main=main,
-        lost=lost,
+        main=main_rows,
+        lost=losses,
         effort=effort,
-        every=every,
-        classes=classes,
-        audit=checked,
+        every=all_cells,
+        classes=class_scores,
+        audit=audit_rows,
         audited=verdict,
         paper=audit(published_attempts()) if run.suite.get("reference") else None,
         tiles=tiles(run),
@@ -372,4 +399,4 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
             if record["status"] != "ok"
         ],
     )
-    return page, [main, lost, *others, checked, effort, every, classes, distances]
+    return page, [main_rows, losses, *others, audit_rows, effort, all_cells, class_scores, distances]

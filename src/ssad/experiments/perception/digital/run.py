@@ -1,4 +1,4 @@
-"""The records of a digital run, by detector and by what it was shown."""
+"""Records of a digital run, by detector and setting of the attack."""
 
 from __future__ import annotations
 
@@ -27,16 +27,20 @@ DEFENCES = {"jpeg": "JPEG", "bits": "bit depth", "blur": "blur", "resize": "rand
 
 
 class Setting(NamedTuple):
-    """What tells what a detector was shown.
+    """Setting of an attack: all that tells one input of a detector from another.
 
     Attributes:
-        attack: name; "": the clean data.
-        loss, norm, radius, steps, options: of the attack.
-        source: detector that the pictures were made against; "": the one that is shown them.
-        defence: before the detector; "": none.
-        aware: whether the attack knows it.
-        target: of a targeted attack.
-        subset: scenes of each town; 0: all.
+        attack: Name; "": the clean data.
+        loss: Loss of the attack.
+        norm: Norm of its budget.
+        radius: Radius of its budget.
+        steps: Its steps.
+        options: Its options.
+        source: Detector that the images were made against; "": the evaluated one.
+        defence: Defence before the detector; "": none.
+        aware: Whether the attack knows the defence.
+        target: Target of a targeted attack.
+        subset: Scenes of each town; 0: all.
     """
 
     attack: str = ""
@@ -53,12 +57,12 @@ class Setting(NamedTuple):
 
     @property
     def system(self) -> tuple[str, int]:
-        """What scores can be compared of: the defence before the detector, and the scenes."""
+        """Defence and scenes: scores are comparable where both are equal."""
         return self.defence, self.subset
 
     @property
     def plain(self) -> bool:
-        """Whether it is an attack on all objects of the bare detector that is shown the pictures."""
+        """True for an untargeted attack on the bare evaluated detector."""
         return not self.source and not self.defence and not self.target
 
 
@@ -76,39 +80,41 @@ class DigitalRun:
 
     @property
     def scenes(self) -> int:
-        """How many scenes were resampled for the intervals."""
+        """Number of scenes that were resampled for the intervals."""
         return max(int(record.get("scenes", 0)) for record in self.records.values())
 
     @property
     def detectors(self) -> list[str]:
-        """In the order of the suite."""
+        """Detectors in the order of the suite."""
         return [_called(text) for text in self.suite["detectors"]]
 
     @property
     def hardened(self) -> list[tuple[str, str]]:
-        """Detectors of adversarially trained weights, and of each the one that its name begins with ("": none)."""
+        """Detectors with adversarially trained weights, each with its ordinary counterpart ("": none)."""
         names = [split_weights(text)[0] for text in self.suite.get("hardened", [])]
         ordinary = sorted((split_weights(text)[0] for text in self.suite["detectors"]), key=len, reverse=True)
-        beside = (next((one for one in ordinary if name.startswith(one)), "") for name in names)
-        return [(_called(name), _called(one)) for name, one in zip(names, beside, strict=True)]
+        counterparts = (
+            next((counterpart for counterpart in ordinary if name.startswith(counterpart)), "") for name in names
+        )
+        return [(_called(name), _called(counterpart)) for name, counterpart in zip(names, counterparts, strict=True)]
 
     @property
     def everyone(self) -> list[str]:
-        """Those, and the detectors that take part in the transfer alone."""
-        others = [_called(text) for text in self.suite.get("transfer_detectors", [])]
-        return [*self.detectors, *others]
+        """Detectors of the table, and those that take part in the transfer alone."""
+        transfer_detectors = [_called(text) for text in self.suite.get("transfer_detectors", [])]
+        return [*self.detectors, *transfer_detectors]
 
     def flat(self, detector: str) -> bool:
-        """Whether a detector finds 2D boxes."""
+        """Return whether a detector finds 2D boxes."""
         return any(name == detector and record.get("task") == "2d" for (name, _), record in self.records.items())
 
     def metrics(self, detector: str) -> tuple[str, ...]:
-        """The headline metrics of a detector."""
+        """Return the headline metrics of a detector."""
         return ("mAP",) if self.flat(detector) else ("mAP", "NDS")
 
     @property
     def about_flat(self) -> str:
-        """What a note says about 2D detectors; "" where there is none."""
+        """Remark on 2D detectors for notes; "" where there is none."""
         names = [name for name in self.everyone if self.flat(name)]
         if not names:
             return ""
@@ -116,44 +122,44 @@ class DigitalRun:
 
     @property
     def settings(self) -> list[Setting]:
-        """Of all attacks, in the order of the suite, the clean data first."""
+        """Settings of all attacks, in the order of the suite, the clean data first."""
         return list(dict.fromkeys(setting for _, setting in self.records))
 
     @property
     def rows(self) -> list[Setting]:
-        """Those of the table, without those that only curves need."""
+        """Settings of the table, without those that only curves need."""
         return list(dict.fromkeys(setting for (_, setting), record in self.records.items() if record["row"]))
 
     def record(self, detector: str, setting: Setting) -> Mapping[str, Any] | None:
-        """A record that is there and not failed."""
-        found = self.records.get((detector, setting))
-        return found if found is not None and found["status"] == "ok" else None
+        """Return a record; None if it is absent or failed."""
+        candidate = self.records.get((detector, setting))
+        return candidate if candidate is not None and candidate["status"] == "ok" else None
 
     def clean(self, detector: str, like: Setting | None = None) -> Mapping[str, Any] | None:
-        """The record of the clean data, of the scenes and behind the defence of a setting."""
+        """Return the record of the clean data, of the scenes and behind the defence of a setting."""
         defence, subset = like.system if like else ("", 0)
         return self.record(detector, Setting(defence=defence, subset=subset))
 
 
 def _called(text: str) -> str:
-    """What records call a detector that a suite names."""
+    """Return the label in the records of a detector of the suite."""
     return label_of(split_weights(text)[0])
 
 
 @dataclass(frozen=True)
 class Resampling:
-    """How many scenes were resampled for one record: it may be of fewer than others."""
+    """Number of scenes that were resampled for one record: it may be fewer than for others."""
 
     scenes: int
 
 
 def load_digital_run(run: Run) -> DigitalRun:
-    """The records of a run folder."""
-    return DigitalRun(run, {(_called(r["detector"]), setting_of(r)): r for r in run.lines})
+    """Return the records of a run folder."""
+    return DigitalRun(run, {(_called(record["detector"]), setting_of(record)): record for record in run.lines})
 
 
 def setting_of(record: Mapping[str, Any]) -> Setting:
-    """What tells the attack of a record from others; records of older versions say less."""
+    """Return the setting of a record; records of older versions have fewer fields."""
     return Setting(
         record["attack"] or "",
         record["loss"] or "",
@@ -170,18 +176,18 @@ def setting_of(record: Mapping[str, Any]) -> Setting:
 
 
 def title_of(setting: Setting) -> str:
-    """What people call an attack: its name and loss."""
+    """Return the title of an attack: its name and loss."""
     attack, loss = setting[:2]
     if not attack:
         return "clean"
     if attack == "ensemble":
-        members = [one.split() for one in setting.options.removeprefix("of ").split(", ")]
-        return f"worst of {', '.join(' '.join([TITLES.get(name, name), *rest]) for name, *rest in members)}"
+        members = [text.split() for text in setting.options.removeprefix("of ").split(", ")]
+        return f"worst of {', '.join(' '.join([TITLES.get(name, name), *remainder]) for name, *remainder in members)}"
     return f"{TITLES.get(attack, attack)}{f', {loss} loss' if loss else ''}"
 
 
 def size_of(setting: Setting) -> str:
-    """Budget, steps and options in a few words."""
+    """Return budget, steps and options in a few words."""
     attack, _, norm, radius, steps, options = setting[:6]
     if not attack:
         return ""
@@ -194,52 +200,56 @@ def size_of(setting: Setting) -> str:
 
 
 def scenes_of(setting: Setting) -> str:
-    """Of which scenes the scores are, in words."""
+    """Return the scenes of the scores, in words."""
     return f"{setting.subset} of each town" if setting.subset else "all"
 
 
 def defence_of(setting: Setting) -> str:
-    """A defence in words."""
+    """Return a defence in words."""
     name, _, options = setting.defence.partition(" ")
     return ", ".join(part for part in [DEFENCES.get(name, name), options] if part) if name else ""
 
 
 def circumstances(setting: Setting) -> str:
-    """What besides attack and budget tells a setting, in words."""
-    known = ("known to the attack" if setting.aware else "unknown to the attack") if setting.attack else ""
+    """Return source and defence of a setting, in words."""
+    awareness = ("known to the attack" if setting.aware else "unknown to the attack") if setting.attack else ""
     parts = [f"made against {setting.source}" if setting.source else "", defence_of(setting)]
-    return ", ".join(part for part in [*parts, known if setting.defence else ""] if part)
+    return ", ".join(part for part in [*parts, awareness if setting.defence else ""] if part)
 
 
 def metric_cell(record: Mapping[str, Any] | None, metric: str) -> Cell:
-    """A metric in percent with its interval over the record's own scenes; n/a where there is none."""
+    """Return a metric in percent with its interval over the record's own scenes; n/a where there is none."""
     return Cell(math.nan) if record is None else cell_of(Resampling(int(record.get("scenes", 0))), record, metric)
 
 
 def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> Cell:
-    """Share of the clean score that an attack took away, percent; the interval from paired replicates.
+    """Return the share of the clean score that an attack removed, percent; the interval from paired replicates.
 
     A score that more than doubled has no interval.
     """
-    clean, own = run.clean(detector, setting), run.record(detector, setting)
-    if clean is None or own is None or not clean["metrics"].get(metric) or own["metrics"].get(metric) is None:
+    clean, attacked = run.clean(detector, setting), run.record(detector, setting)
+    if clean is None or attacked is None or not clean["metrics"].get(metric) or attacked["metrics"].get(metric) is None:
         return Cell(math.nan)
-    pairs = zip(replicates_of(clean, metric), replicates_of(own, metric), strict=True)
-    value = 1.0 - own["metrics"][metric] / clean["metrics"][metric]
+    pairs = zip(replicates_of(clean, metric), replicates_of(attacked, metric), strict=True)
+    value = 1.0 - attacked["metrics"][metric] / clean["metrics"][metric]
     if value < -1.0:  # else it lies in [-1, 1], as a difference of two scores does
         return Cell(100.0 * value)
-    return _difference(value, [1.0 - after / before for before, after in pairs if before > 0], own)
+    return _difference(value, [1.0 - after / before for before, after in pairs if before > 0], attacked)
 
 
 def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> Cell:
-    """How much higher the first of two detectors scores, in points; the interval from paired replicates."""
-    one, other = (run.record(name, setting) for name in detectors)
-    if one is None or other is None or one["metrics"].get(metric) is None or other["metrics"].get(metric) is None:
+    """Return how much higher the first of two detectors scores, in points; the interval from paired replicates."""
+    first, second = (run.record(name, setting) for name in detectors)
+    if first is None or second is None or first["metrics"].get(metric) is None or second["metrics"].get(metric) is None:
         return Cell(math.nan)
-    pairs = zip(replicates_of(one, metric), replicates_of(other, metric), strict=True)
-    return _difference(one["metrics"][metric] - other["metrics"][metric], [a - b for a, b in pairs], one)
+    pairs = zip(replicates_of(first, metric), replicates_of(second, metric), strict=True)
+    return _difference(
+        first["metrics"][metric] - second["metrics"][metric],
+        [first_score - second_score for first_score, second_score in pairs],
+        first,
+    )
 
 
 def _difference(value: float, replicates: Sequence[float], record: Mapping[str, Any]) -> Cell:
-    found = replicate_difference(value, replicates, n=record["n"], clusters=int(record.get("scenes", 0)))
-    return Cell.of(found.scaled(100.0))
+    interval = replicate_difference(value, replicates, n=record["n"], clusters=int(record.get("scenes", 0)))
+    return Cell.of(interval.scaled(100.0))

@@ -25,13 +25,16 @@ BANDS = {"0-20": "0 to 20 m", "20-40": "20 to 40 m", "40+": "beyond 40 m"}
 def transfer_table(run: DigitalRun) -> Table:
     """For each attack a matrix: mAP of the detector in the column under pictures made against that in the row."""
     rows = []
-    for own in dict.fromkeys(s._replace(source="") for s in run.settings if s.source):
-        clean = tuple(metric_cell(run.clean(d, own), "mAP") for d in run.everyone)
-        rows.append(Row((title_of(own), size_of(own), scenes_of(own), "nothing: clean"), clean))
+    for white_box in dict.fromkeys(entry._replace(source="") for entry in run.settings if entry.source):
+        clean = tuple(metric_cell(run.clean(detector, white_box), "mAP") for detector in run.everyone)
+        rows.append(Row((title_of(white_box), size_of(white_box), scenes_of(white_box), "nothing: clean"), clean))
         for source in run.everyone:
-            seen = [run.record(d, own if d == source else own._replace(source=source)) for d in run.everyone]
-            head = (title_of(own), size_of(own), scenes_of(own), source)
-            rows.append(Row(head, tuple(metric_cell(one, "mAP") for one in seen)))
+            records = [
+                run.record(detector, white_box if detector == source else white_box._replace(source=source))
+                for detector in run.everyone
+            ]
+            row_head = (title_of(white_box), size_of(white_box), scenes_of(white_box), source)
+            rows.append(Row(row_head, tuple(metric_cell(record, "mAP") for record in records)))
     note = (
         "mAP in percent. Where row and column are of one detector the attack is white-box; elsewhere nothing was asked "
         f"of the detector that is shown the pictures.{run.about_flat}"
@@ -41,21 +44,23 @@ def transfer_table(run: DigitalRun) -> Table:
 
 
 def defence_table(run: DigitalRun) -> Table:
-    """Detector x defence x attack: what the defence costs on clean pictures, and what it is worth."""
+    """Return detector x defence x attack: the cost of the defence on clean images, and its gain under attack."""
     rows = []
     for detector in run.detectors:
-        found: dict[tuple[str, Setting], dict[bool, Setting]] = {}
+        settings_by_defence: dict[tuple[str, Setting], dict[bool, Setting]] = {}
         for setting in run.settings:
             if setting.defence and setting.attack:
                 bare = setting._replace(defence="", aware=False, options=_without_draws(setting.options))
-                found.setdefault((setting.defence, bare), {})[setting.aware] = setting
-        for (_, bare), both in found.items():
-            one = next(iter(both.values()))
-            records = [run.clean(detector, bare), run.clean(detector, one)]
+                settings_by_defence.setdefault((setting.defence, bare), {})[setting.aware] = setting
+        for (_, bare), by_awareness in settings_by_defence.items():
+            defended = next(iter(by_awareness.values()))
+            records = [run.clean(detector, bare), run.clean(detector, defended)]
             records += [run.record(detector, bare)]
-            records += [run.record(detector, both[aware]) if aware in both else None for aware in (False, True)]
-            head = (detector, defence_of(one), title_of(bare), size_of(bare), scenes_of(bare))
-            rows.append(Row(head, tuple(metric_cell(record, "mAP") for record in records)))
+            records += [
+                run.record(detector, by_awareness[aware]) if aware in by_awareness else None for aware in (False, True)
+            ]
+            row_head = (detector, defence_of(defended), title_of(bare), size_of(bare), scenes_of(bare))
+            rows.append(Row(row_head, tuple(metric_cell(record, "mAP") for record in records)))
     note = (
         "mAP in percent. An attack that knows the defence follows gradients through it, of random resizing the mean "
         "over several draws; one that does not was made against the bare detector. What a defence is worth is what it "
@@ -71,13 +76,13 @@ def _without_draws(options: str) -> str:
 
 
 def hardened_table(run: DigitalRun) -> Table:
-    """Adversarially trained weights beside ordinary ones, on the same pictures: what they cost, and what they buy."""
+    """Return adversarially trained weights beside ordinary ones, on the same images: their cost and their gain."""
     rows = []
     for name, ordinary in run.hardened:
-        for setting in (s for s in run.settings if s.radius <= FURTHEST and run.record(name, s)):
-            pair = [metric_cell(run.record(one, setting), "mAP") for one in (ordinary, name)]
-            head = (name, title_of(setting), size_of(setting), scenes_of(setting))
-            rows.append(Row(head, (*pair, gained_cell(run, (name, ordinary), setting, "mAP"))))
+        for setting in (entry for entry in run.settings if entry.radius <= FURTHEST and run.record(name, entry)):
+            scores = [metric_cell(run.record(weights, setting), "mAP") for weights in (ordinary, name)]
+            row_head = (name, title_of(setting), size_of(setting), scenes_of(setting))
+            rows.append(Row(row_head, (*scores, gained_cell(run, (name, ordinary), setting, "mAP"))))
     note = (
         "mAP in percent, difference in points. Each is attacked by itself, white-box, on the same pictures. The clean "
         "rows say what adversarial training costs, the others what it buys."
@@ -88,7 +93,7 @@ def hardened_table(run: DigitalRun) -> Table:
 
 
 def black_box_table(run: DigitalRun) -> Table:
-    """What attacks do that follow no gradient of the pictures that they change, beside noise of the same size."""
+    """Return attacks that follow no gradient of the images that they change, beside noise of the same size."""
     rows = []
     for (detector, setting), record in run.records.items():
         if not setting.plain or setting.attack in ("", "noise") or record["status"] != "ok":
@@ -98,8 +103,8 @@ def black_box_table(run: DigitalRun) -> Table:
         noise = Setting("noise", norm=setting.norm, radius=setting.radius, subset=setting.subset)
         records = (run.clean(detector, setting), run.record(detector, noise), record)
         queries = Cell(float(record["queries"] or 0), digits=0)
-        head = (detector, title_of(setting), size_of(setting), scenes_of(setting))
-        rows.append(Row(head, (queries, *(metric_cell(one, "mAP") for one in records))))
+        row_head = (detector, title_of(setting), size_of(setting), scenes_of(setting))
+        rows.append(Row(row_head, (queries, *(metric_cell(entry, "mAP") for entry in records))))
     note = (
         "mAP in percent. Square and NES ask for losses; a universal change was fitted to other pictures (over=others) "
         "or to those of its own drive (over=drive), and asks nothing when it is added."
@@ -110,7 +115,7 @@ def black_box_table(run: DigitalRun) -> Table:
 
 
 def target_table(run: DigitalRun) -> Table:
-    """Targeted attacks: how often they reach their target."""
+    """Return how often targeted attacks reach their target."""
     rows = []
     for (detector, setting), record in run.records.items():
         if setting.target and record["status"] == "ok":
@@ -119,8 +124,8 @@ def target_table(run: DigitalRun) -> Table:
             shares = (metrics.get(name) for name in ("success", "kept"))
             cells = [Cell(math.nan if share is None else 100 * share) for share in shares]
             cells.insert(1, Cell(math.nan if count is None else count, digits=0))
-            head = (detector, title_of(setting), size_of(setting._replace(target="")), setting.target)
-            rows.append(Row((*head, scenes_of(setting)), (*cells, metric_cell(record, "mAP"))))
+            row_head = (detector, title_of(setting), size_of(setting._replace(target="")), setting.target)
+            rows.append(Row((*row_head, scenes_of(setting)), (*cells, metric_cell(record, "mAP"))))
     note = (
         "Success in percent of the objects that are found in the clean pictures, by the best box within 2 m with a "
         "score of at least 0.1: it is of the wanted class under the attack, or gone where no class is wanted. Others "
@@ -131,7 +136,7 @@ def target_table(run: DigitalRun) -> Table:
 
 
 def halving_table(run: DigitalRun) -> Table:
-    """For each curve over the budget: the radius that halves mAP, and what is left at 1 px."""
+    """Return for each curve over the budget the radius that halves mAP, and the mAP at 1 px."""
     groups: dict[Setting, set[float]] = {}
     for setting in run.settings:
         if setting.plain and setting.attack not in ("", "noise", "ensemble"):
@@ -146,11 +151,11 @@ def halving_table(run: DigitalRun) -> Table:
             records |= {radius: run.record(detector, group._replace(radius=radius)) for radius in sorted(radii)}
             curve = [(radius, record["metrics"]["mAP"]) for radius, record in records.items() if record]
             if len(curve) < len(records):
-                curve = []  # a line over a radius that has not run would say nothing
+                curve = []  # interpolation over a radius that has not run would mislead
             cells += [Cell(halving(curve)), metric_cell(records.get(1.0), "mAP")]
-        about = ", ".join(part for part in [f"{group.steps} steps", group.options] if part)
-        rows.append(Row((title_of(group), about, scenes_of(group)), tuple(cells)))
-    columns = tuple(f"{d} {what}" for d in run.detectors for what in ("half of mAP at (px)", "mAP at 1 px (%)"))
+        settings_text = ", ".join(part for part in [f"{group.steps} steps", group.options] if part)
+        rows.append(Row((title_of(group), settings_text, scenes_of(group)), tuple(cells)))
+    columns = tuple(f"{d} {quantity}" for d in run.detectors for quantity in ("half of mAP at (px)", "mAP at 1 px (%)"))
     note = "The radius that leaves half of the clean mAP, on straight lines between the radii that ran."
     return Table("halving", "Smallest budgets that hurt", ("Attack", "Settings", "Scenes"), columns, tuple(rows), note)
 
@@ -172,15 +177,18 @@ def halving(curve: Sequence[tuple[float, float]]) -> float:
 
 
 def distance_table(run: DigitalRun) -> Table:
-    """Scores of near and far objects under the attacks of the table."""
+    """Return scores of near and far objects under the attacks of the table."""
     names = [f"{metric}_{band}" for band in BANDS for metric in ("mAP", "recall")]
     rows = [
-        Row((d, title_of(s), size_of(s)), tuple(metric_cell(run.record(d, s), name) for name in names))
-        for d in run.detectors
-        if not run.flat(d)
-        for s in run.rows
+        Row(
+            (detector, title_of(setting), size_of(setting)),
+            tuple(metric_cell(run.record(detector, setting), name) for name in names),
+        )
+        for detector in run.detectors
+        if not run.flat(detector)
+        for setting in run.rows
     ]
-    columns = tuple(f"{metric}, {text}" for text in BANDS.values() for metric in ("mAP", "recall"))
+    columns = tuple(f"{metric}, {band_title}" for band_title in BANDS.values() for metric in ("mAP", "recall"))
     note = (
         "Percent, by distance from the ego, boxes and truth each by their own. mAP is the mean over the classes that "
         "are there; recall is the share of objects with a box of their class within 2 m, whatever its score."

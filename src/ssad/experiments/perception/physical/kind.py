@@ -38,8 +38,8 @@ class PhysicalSuite(SuiteBase, TargetTable):
     """One table: detectors x textures on a car, each trained on drives in one town and tested in another.
 
     Attributes:
-        floor: least AP50 of the clean pictures, below which no attack is reported.
-        replicates: of the bootstrap over drives.
+        floor: Minimum AP50 of the clean images, below which no attack is reported.
+        replicates: Replicates of the bootstrap over drives.
     """
 
     kind: Literal["physical"]
@@ -48,7 +48,7 @@ class PhysicalSuite(SuiteBase, TargetTable):
 
 
 class Physical(Kind):
-    """See the module. A piece is the training of a texture, which several cells show."""
+    """Kind `physical`. A piece is the training of a texture, which several cells use."""
 
     name = "physical"
     suite = PhysicalSuite
@@ -66,7 +66,7 @@ class Physical(Kind):
     factors = ("test", "view", "detector", "attack", "carrier", "source")
 
     def plan(self, suite: PhysicalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Detectors and carriers are built once, so that what is wrong ends here."""
+        """Build detectors and carriers once, so that errors show up here."""
         target = target_of(suite)
         weights = {}
         for name in [*suite.detectors, *suite.judges]:
@@ -87,12 +87,12 @@ class Physical(Kind):
         for town in (suite.grid.towns or ()) if suite.grid is not None else ():
             if town not in {pair.test for pair in suite.pairs}:
                 raise ConfigError(f"suite {suite.name}: grid: no pair is tested in {town}")
-        about = suite.target, suite.place, suite.size, suite.floor, suite.replicates, device
+        common_inputs = suite.target, suite.place, suite.size, suite.floor, suite.replicates, device
         cells: dict[str, Cell] = {}
         for row in rows_of(suite):
             detector, source = row.fields["detector"], row.spec.get("light", row.spec).get("source", "")
             grid = suite.grid.model_dump_json() if suite.grid and row.fields["view"] == GRID else ""
-            inputs = *about, grid, weights[detector], weights.get(source, "")
+            inputs = *common_inputs, grid, weights[detector], weights.get(source, "")
             cell = self.make_cell(row.title, detector, suite.seed, row.fields, row.spec, *inputs)
             cells.setdefault(cell.key, cell)
         suite.recordings(Path(), device)
@@ -100,20 +100,22 @@ class Physical(Kind):
 
     def order(self, cell: Cell) -> float:
         """From behind before from all around; clean first, then controls, then what is trained."""
-        shown = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
-        return shown + (3 if cell.fields["view"] == GRID else 0)
+        stage = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
+        return stage + (3 if cell.fields["view"] == GRID else 0)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """Records the pictures, and renders once what they see of each carrier."""
+        """Record the images, and render the visible surface of each carrier once."""
         suite: PhysicalSuite = plan.suite
         recordings = suite.recordings(folder, plan.device)
-        work: dict[str, Any] = {"workers": resources.workers, "ray": resources.ray}
-        with Live("recording", 1, 0, console=resources.console, unit="parts") as live:
-            record_all(recordings, **work, progress=live.show)
-        surfaces = list(dict.fromkeys(TextureSpec.of_row(c.spec).surface for c in plan.cells if c.spec["attack"]))
+        pool_options: dict[str, Any] = {"workers": resources.workers, "ray": resources.ray}
+        with Live("recording", 1, 0, console=resources.console, unit="parts") as progress:
+            record_all(recordings, **pool_options, progress=progress.show)
+        surfaces = list(
+            dict.fromkeys(TextureSpec.of_row(cell.spec).surface for cell in plan.cells if cell.spec["attack"])
+        )
         if surfaces:
-            with Live("rendering what wears textures", 1, 0, console=resources.console, unit="parts") as live:
-                see_all(recordings, suite.target, surfaces, **work, progress=live.show)
+            with Live("rendering what wears textures", 1, 0, console=resources.console, unit="parts") as progress:
+                see_all(recordings, suite.target, surfaces, **pool_options, progress=progress.show)
         return {
             "target": suite.target,
             "floor": suite.floor,
@@ -123,17 +125,17 @@ class Physical(Kind):
         }
 
     def start(self, job: Job) -> None:
-        """Memory for tensors is kept."""
+        """Keep the memory of tensors, and silence Warp."""
         keep_memory()
         quiet_warp()
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """The training of the cell's texture, or the search of its light, unless it is done."""
+        """Return the training of the cell's texture, or the search of its light, unless it is done."""
         attacks, light = attacks_of(job), cell.spec.get("light")
         if light:
-            searched = LightSpec.of_row(light) if light["source"] else None
-            missing = searched is not None and not attacks.lights.kept(searched).is_file()
-            return {f"light {searched.name}": dict(cell.spec)} if searched and missing else {}
+            searched_light = LightSpec.of_row(light) if light["source"] else None
+            missing = searched_light is not None and not attacks.lights.kept(searched_light).is_file()
+            return {f"light {searched_light.name}": dict(cell.spec)} if searched_light and missing else {}
         spec = TextureSpec.of_row(cell.spec) if cell.spec["attack"] is not None else None
         if spec is None or not spec.trained or attacks.textures.kept(spec).is_file():
             return {}
@@ -147,35 +149,40 @@ class Physical(Kind):
             attacks_of(job).texture(TextureSpec.of_row(data))
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
-        """Scores in the town of the test. CellError: the detector does not find the clean target."""
+        """Return the scores in the town of the test.
+
+        Raises:
+            CellError: The detector does not find the clean target.
+        """
         attacks, settings, detector = attacks_of(job), job.settings, cell.system
         light, grid, floor = cell.spec.get("light"), cell.fields["view"] == GRID, settings["floor"]
-        draws = {"replicates": settings["replicates"], "seed": settings["seed"]}
+        bootstrap_options = {"replicates": settings["replicates"], "seed": settings["seed"]}
         pair = (light or cell.spec)["pair"]
-        count = settings["grid"] if grid else pair["test_images"]
-        clips = attacks.clips(f"{pair['test']}{'-grid' if grid else ''}", count, detector)
-        lit = LitPictures.of(clips, light["hour"]) if light else None
-        clean = _clean_sightings(lit or clips, detector)
+        image_count = settings["grid"] if grid else pair["test_images"]
+        images = attacks.clips(f"{pair['test']}{'-grid' if grid else ''}", image_count, detector)
+        lit_images = LitPictures.of(images, light["hour"]) if light else None
+        clean_sightings = _clean_sightings(lit_images or images, detector)
         if cell.fields["attack"] == CLEAN:
-            found = target_scores(clean, **draws)
-            return found | (grid_scores(clips.rows(), clean, None, floor=floor) if grid else {})
-        have = round(precision(clean) or 0.0, 6)
-        if have < floor:
-            when = f" ({light['hour']})" if light else ""
-            noun = class_of_target(parse_target(settings["target"])).replace("_", " ")
-            found_at = f"{detector} finds the clean {noun}{when} with AP50 {have:.3f}"
-            raise CellError(f"{found_at}, which is less than the floor of {floor:g}")
-        if lit:
+            scores = target_scores(clean_sightings, **bootstrap_options)
+            return scores | (grid_scores(images.rows(), clean_sightings, None, floor=floor) if grid else {})
+        # An attack cannot hide a target that the detector does not find anyway.
+        clean_precision = round(precision(clean_sightings) or 0.0, 6)
+        if clean_precision < floor:
+            hour_text = f" ({light['hour']})" if light else ""
+            target_name = class_of_target(parse_target(settings["target"])).replace("_", " ")
+            finding = f"{detector} finds the clean {target_name}{hour_text} with AP50 {clean_precision:.3f}"
+            raise CellError(f"{finding}, which is less than the floor of {floor:g}")
+        if lit_images:
             spec = LightSpec.of_row(light or {})
-            shown, about = attacks.under(lit, spec), partial(attacks.about_light, spec)
+            attacked_images, attack_fields = attacks.under(lit_images, spec), partial(attacks.about_light, spec)
         else:
             texture = TextureSpec.of_row(cell.spec)
-            shown, about = attacks.worn(clips, texture), partial(attacks.about, texture)
-        attacked = list(sightings(attacks.detector(detector), shown))
-        found = target_scores(attacked, clean, **draws) | {"clean_AP50": have}
+            attacked_images, attack_fields = attacks.worn(images, texture), partial(attacks.about, texture)
+        attacked = list(sightings(attacks.detector(detector), attacked_images))
+        scores = target_scores(attacked, clean_sightings, **bootstrap_options) | {"clean_AP50": clean_precision}
         if grid:
-            found |= grid_scores(clips.rows(), clean, attacked, floor=floor)
-        return found | about()  # which may be trained or searched only now
+            scores |= grid_scores(images.rows(), clean_sightings, attacked, floor=floor)
+        return scores | attack_fields()  # which may be trained or searched only now
 
     def finish(self, plan: Plan, folder: Path) -> None:
         """Pictures of each test town under each texture, of the grid from four sides, and of lights: DIR/pictures."""
@@ -184,31 +191,31 @@ class Physical(Kind):
         write_sheets(attacks, suite, [(cell.fields, cell.spec) for cell in plan.cells])
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
-        """Page of a run and its tables."""
+        """Return the page of a run and its tables."""
         return page.section(run, self.verdict(run))
 
     def summary(self, run: Run) -> Table:
-        """Main table of a run."""
+        """Return the main table of a run."""
         return page.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences."""
+        """Return the findings of a run in sentences."""
         return verdict(run)
 
 
 def attacks_of(job: Job) -> TargetAttacks:
-    """The textures and lights of a run."""
+    """Return the textures and lights of a run."""
     return TargetAttacks(job.folder, job.settings["target"], job.settings["seed"], job.device)
 
 
 @lru_cache(maxsize=8)
 def _clean_sightings(pictures: TargetClips | LitPictures, detector: str) -> tuple[Sighting, ...]:
-    """What a detector finds in pictures as they were recorded; kept, since every cell needs it."""
+    """Return a detector's sightings in the images as recorded; cached, since every cell needs them."""
     return tuple(sightings(make_detector(detector, device=pictures.device), pictures.clean()))
 
 
 def shown_by(folder: Path, name: str) -> tuple[TargetAttacks, Cell]:
-    """A cell of a physical run, and where its textures and lights are.
+    """Return the textures and lights of a physical run, and one of its cells.
 
     Args:
         folder: Results folder of the run.

@@ -1,4 +1,4 @@
-"""The page of a physical run: textures on a car, the paper's two tables beside ours, controls, heat maps, pictures."""
+"""Page of a physical run: textures on a car, the paper's two tables beside ours, controls, heat maps, pictures."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ Shown = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class PhysicalRun:
-    """A physical run and its records, several of a control that was drawn several times."""
+    """A physical run and its records, several for a control that was drawn several times."""
 
     run: Run
 
     @cached_property
     def records(self) -> Mapping[tuple[str, str, str, Shown], list[Line]]:
-        """By town of the test, view, detector, and what it was shown."""
+        """Records by town of the test, view, detector, and attack."""
         found: dict[tuple[str, str, str, Shown], list[Line]] = {}
         for line in self.run.lines:
-            shown = (line["attack"], line["carrier"], line["source"])
-            found.setdefault((line["test"], line.get("view", "drive"), line["detector"], shown), []).append(line)
+            attack_key = (line["attack"], line["carrier"], line["source"])
+            found.setdefault((line["test"], line.get("view", "drive"), line["detector"], attack_key), []).append(line)
         return found
 
     @property
@@ -70,12 +70,12 @@ class PhysicalRun:
 
     @property
     def detectors(self) -> list[str]:
-        """Those that textures were trained against."""
+        """Detectors that textures were trained against."""
         return list(self.run.suite["detectors"])
 
     @property
     def judges(self) -> list[str]:
-        """All that were shown textures."""
+        """All evaluated detectors."""
         return list(dict.fromkeys(line["detector"] for line in self.run.lines))
 
     @property
@@ -87,22 +87,22 @@ class PhysicalRun:
         self, test: str, view: str, detector: str, attack: tuple[str, str], source: str | None = None
     ) -> list[Line]:
         """Records of an attack on a detector, of a texture that was trained against itself unless a source is said."""
-        for known in ((detector if source is None else source), ""):
-            found = self.records.get((test, view, detector, (*attack, known)))
-            if found:
-                return [line for line in found if line["status"] == "ok"]
+        for trained_against in ((detector if source is None else source), ""):
+            matches = self.records.get((test, view, detector, (*attack, trained_against)))
+            if matches:
+                return [line for line in matches if line["status"] == "ok"]
         return []
 
 
 def title_of(attack: tuple[str, str]) -> str:
-    """What people call an attack or control on a carrier."""
+    """Return the title of an attack or control on a carrier."""
     name, carrier = attack
-    first, _, rest = name.partition(" ")
+    prefix, _, remainder = name.partition(" ")
     if carrier.startswith(LIGHT):
         return f"{name}, {carrier.removeprefix(LIGHT)}"
     _, _, options = carrier.partition(", ")
-    if first == "shuffled":
-        title = f"shuffled {_attack(rest)}"
+    if prefix == "shuffled":
+        title = f"shuffled {_attack(remainder)}"
     elif name in CONTROLS:
         return f"{name} {carrier}"
     else:
@@ -111,51 +111,54 @@ def title_of(attack: tuple[str, str]) -> str:
 
 
 def _attack(name: str) -> str:
-    """The title of an attack's name, which may end in ", all sides"."""
-    first, comma, rest = name.partition(", ")
-    return f"{TITLES.get(first, first)}{comma}{rest}"
+    """Return the title of an attack's name, which may end in ", all sides"."""
+    prefix, separator, remainder = name.partition(", ")
+    return f"{TITLES.get(prefix, prefix)}{separator}{remainder}"
 
 
 def score(lines: Sequence[Line], metric: str) -> Cell:
-    """A metric in percent, the mean over draws of a control, and how sure it is.
+    """Return a metric in percent, the mean over draws of a control, with its interval.
 
     The interval is over drives; of several draws it goes from the lowest to the highest end of theirs, so that it
     covers drives and draws. Where a draw has none it is the range of the draws.
     """
-    own = [line for line in lines if line["metrics"].get(metric) is not None]
-    if not own:
+    measured = [line for line in lines if line["metrics"].get(metric) is not None]
+    if not measured:
         return Cell(math.nan)
-    known = [100.0 * float(line["metrics"][metric]) for line in own]
-    mean, n = math.fsum(known) / len(known), int(own[0]["n"])
-    limits = [ends for line in own if (ends := (line.get("intervals") or {}).get(metric))]
-    if len(limits) < len(own) > 1:
-        return Cell(mean, min(known), max(known), n, clusters=len(known), method="range")
-    low = 100.0 * min((float(ends[0]) for ends in limits), default=math.nan)
-    high = 100.0 * max((float(ends[1]) for ends in limits), default=math.nan)
-    return Cell(mean, low, high, n, clusters=int(own[0]["drives"]), method="given")
+    percentages = [100.0 * float(line["metrics"][metric]) for line in measured]
+    mean, count = math.fsum(percentages) / len(percentages), int(measured[0]["n"])
+    limits = [interval for line in measured if (interval := (line.get("intervals") or {}).get(metric))]
+    # A draw without an interval has too few drives: only the spread of the draws is known.
+    if len(limits) < len(measured) > 1:
+        return Cell(mean, min(percentages), max(percentages), count, clusters=len(percentages), method="range")
+    low = 100.0 * min((float(interval[0]) for interval in limits), default=math.nan)
+    high = 100.0 * max((float(interval[1]) for interval in limits), default=math.nan)
+    return Cell(mean, low, high, count, clusters=int(measured[0]["drives"]), method="given")
 
 
 def main_table(run: PhysicalRun, number: int) -> Table:
-    """Attack x detector in one pair of towns, as the paper's table, with its rows between ours."""
+    """Return attack x detector in one pair of towns, as the paper's table, with its rows between ours."""
     train, test = run.pairs[number]
-    told = BESIDE.get(test, dict(enumerate(PUBLISHED)).get(number)) if run.run.suite.get("reference") else None
-    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    published_town = (
+        BESIDE.get(test, dict(enumerate(PUBLISHED)).get(number)) if run.run.suite.get("reference") else None
+    )
+    names = [next((column for prefix, column in DETECTORS.items() if d.startswith(prefix)), "") for d in run.detectors]
     rows = []
-    known = {metric for line in run.run.lines for metric in line.get("metrics") or ()}
-    scores = {metric: title for metric, title in SCORES.items() if metric in known or metric != "ASR_any_25"}
+    measured = {metric for line in run.run.lines for metric in line.get("metrics") or ()}
+    scores = {metric: title for metric, title in SCORES.items() if metric in measured or metric != "ASR_any_25"}
     for attack in run.attacks:
         cells = [
             score(run.lines(test, "drive", detector, attack), metric) for detector in run.detectors for metric in scores
         ]
         rows.append(Row((title_of(attack),), tuple(cells)))
-        if told and attack in PAPER and any(names):
-            own = PUBLISHED[told][PAPER[attack]]
+        if published_town and attack in PAPER and any(names):
+            published = PUBLISHED[published_town][PAPER[attack]]
             cells = []
             for name in names:
-                precision, rate = own.get(name, (math.nan, None))
-                printed = {"AP50": precision, "ASR_25": math.nan if rate is None else rate}
-                cells += [Cell(printed.get(metric, math.nan)) for metric in scores]
-            rows.append(Row((f"{PAPER[attack]}, {told}",), tuple(cells), published=True))
+                precision, rate = published.get(name, (math.nan, None))
+                published_scores = {"AP50": precision, "ASR_25": math.nan if rate is None else rate}
+                cells += [Cell(published_scores.get(metric, math.nan)) for metric in scores]
+            rows.append(Row((f"{PAPER[attack]}, {published_town}",), tuple(cells), published=True))
     columns = tuple(f"{detector} {title}" for detector in run.detectors for title in scores.values())
     note = (
         f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
@@ -164,18 +167,19 @@ def main_table(run: PhysicalRun, number: int) -> Table:
         "interval over drives, of several draws of a control from the lowest to the highest end of theirs; a–b: the "
         "range over the draws, where drives are too few for intervals."
     )
-    if told:
+    if published_town:
         note += (
-            f" Shaded rows: {SOURCE}, {told}. Other towns, pictures and detectors: what can be compared is the order."
+            f" Shaded rows: {SOURCE}, {published_town}. "
+            "Other towns, pictures and detectors: what can be compared is the order."
         )
     title = f"Trained in {train}, tested in {test}"
     return Table(f"physical-{test.lower()}", title, ("Attack",), columns, tuple(rows), note, SOURCE)
 
 
 def _place(suite: Mapping[str, Any]) -> str:
-    """From where the pictures of a test are taken."""
+    """Return the camera positions of a test, in words."""
     kind = str(suite.get("target", "")).partition(":")[0]
-    distances = ", ".join(f"{one:g}" for one in suite.get("distances", ()))
+    distances = ", ".join(f"{distance:g}" for distance in suite.get("distances", ()))
     if kind == "stop_sign":
         return f"{distances} m before it, as cars see it"
     if kind == "pedestrian":
@@ -184,22 +188,28 @@ def _place(suite: Mapping[str, Any]) -> str:
 
 
 def margin_table(run: PhysicalRun) -> Table:
-    """Each trained texture against that draw of a control of its carrier which comes nearest to it."""
+    """Return each trained texture against the draw of a control of its carrier that comes nearest to it."""
     rows = []
-    for (_, test), detector in ((pair, d) for pair in run.pairs for d in run.detectors):
+    for (_, test), detector in ((pair, victim) for pair in run.pairs for victim in run.detectors):
         for attack in run.attacks:
             name, carrier = attack
-            own = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
-            controls = [other for other in run.attacks if other[1] == carrier and learns_nothing(other[0], name)]
-            gaps = [
-                (paired_gap(draw, line), other)
-                for other, line in product(controls, own)
-                for draw in run.lines(test, "drive", detector, other)
+            attack_lines = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
+            controls = [
+                control for control in run.attacks if control[1] == carrier and learns_nothing(control[0], name)
             ]
-            if gaps:
-                gap, best = min(gaps, key=lambda one: lower(one[0]))
-                cells = score(own, "AP50"), score(run.lines(test, "drive", detector, best), "AP50"), gap
-                rows.append(Row((test, detector, title_of(attack), title_of(best)), cells))
+            differences = [
+                (paired_gap(draw, line), control)
+                for control, line in product(controls, attack_lines)
+                for draw in run.lines(test, "drive", detector, control)
+            ]
+            if differences:
+                difference, nearest = min(differences, key=lambda candidate: lower(candidate[0]))
+                cells = (
+                    score(attack_lines, "AP50"),
+                    score(run.lines(test, "drive", detector, nearest), "AP50"),
+                    difference,
+                )
+                rows.append(Row((test, detector, title_of(attack), title_of(nearest)), cells))
     note = (
         "AP50 in percent. The difference is what a control leaves less what the attack leaves in the same pictures; "
         "its interval is of paired replicates of the bootstrap over drives. Of all controls and all their draws it is "
@@ -210,40 +220,43 @@ def margin_table(run: PhysicalRun) -> Table:
 
 
 def is_control(name: str) -> bool:
-    """Whether a row such as "shuffled das" or "random laser" has learned nothing."""
+    """Return whether a row such as "shuffled das" or "random laser" is a control, without training."""
     return name.split(maxsplit=1)[0] in CONTROLS
 
 
 def learns_nothing(control: str, attack: str) -> bool:
-    """Whether it is a control of an attack; of a light ("random laser") only of its own kind ("laser, searches 4")."""
-    first, _, rest = control.partition(" ")
-    return first in CONTROLS and (first != "random" or rest in ("", attack.partition(", ")[0]))
+    """Return whether it is a control of an attack.
+
+    The control of a light ("random laser") counts only for its own kind ("laser, searches 4").
+    """
+    prefix, _, remainder = control.partition(" ")
+    return prefix in CONTROLS and (prefix != "random" or remainder in ("", attack.partition(", ")[0]))
 
 
 def lower(cell: Cell) -> float:
-    """The lower end of a cell's interval, or its number."""
+    """Return the lower end of a cell's interval, or its number."""
     return cell.mean if math.isnan(cell.low) else cell.low
 
 
 def transfer_table(run: PhysicalRun) -> Table:
-    """Textures trained against one detector, shown to all; beside them the clean target and controls."""
-    sources = list(dict.fromkeys(["", *run.detectors, *(shown[2] for *_, shown in run.records)]))
+    """Return textures trained against one detector, shown to all; beside them the clean target and controls."""
+    sources = list(dict.fromkeys(["", *run.detectors, *(attack_key[2] for *_, attack_key in run.records)]))
     rows = []
     for _, test in run.pairs:
-        own = []
+        town_rows = []
         for attack, source in product(run.attacks, sources):
-            found = [run.records.get((test, "drive", d, (*attack, source))) for d in run.judges]
-            if sum(bool(lines) for lines in found) >= 2:
-                cells = [score([one for one in lines or () if one["status"] == "ok"], "AP50") for lines in found]
-                own.append(Row((test, title_of(attack), source), tuple(cells)))
-        rows += own if any(row.head[2] for row in own) else []
+            records = [run.records.get((test, "drive", judge, (*attack, source))) for judge in run.judges]
+            if sum(bool(lines) for lines in records) >= 2:
+                cells = [score([line for line in lines or () if line["status"] == "ok"], "AP50") for lines in records]
+                town_rows.append(Row((test, title_of(attack), source), tuple(cells)))
+        rows += town_rows if any(row.head[2] for row in town_rows) else []
     note = "AP50 in percent of the target; n/a where the detector does not find the clean target often enough."
     heads = ("Town", "Attack", "Trained against")
     return Table("transfer", "Transfer between detectors", heads, tuple(run.judges), tuple(rows), note)
 
 
 def others_table(run: PhysicalRun) -> Table:
-    """The other scores: at a higher confidence, and of its whole class."""
+    """Return the other scores: at a higher confidence, and of the whole class."""
     rows = []
     for _, test in run.pairs:
         for detector in run.judges:
@@ -261,23 +274,38 @@ def others_table(run: PhysicalRun) -> Table:
 
 
 def _difference(lines: Sequence[Line]) -> Cell:
-    """How far the colours of a texture are from what it covers, the mean over draws of a control."""
-    known = [float(line["delta_e"]) for line in lines if line.get("delta_e") is not None]
-    return Cell(math.fsum(known) / len(known)) if known else Cell(math.nan)
+    """Return the colour difference of a texture to the paint that it covers, the mean over draws of a control."""
+    differences = [float(line["delta_e"]) for line in lines if line.get("delta_e") is not None]
+    return Cell(math.fsum(differences) / len(differences)) if differences else Cell(math.nan)
 
 
 def grid_table(run: PhysicalRun) -> Table:
-    """All views of the grid together, and the cell in which an attack does least."""
+    """Return the scores over all views of the grid, and the cell in which an attack does least."""
     rows = []
-    for (test, view, detector, shown), lines in run.records.items():
-        good = [line for line in lines if line["status"] == "ok"]
-        if view != "grid" or not good:
+    for (test, view, detector, attack_key), lines in run.records.items():
+        finished = [line for line in lines if line["status"] == "ok"]
+        if view != "grid" or not finished:
             continue
-        worst = [line["worst"] for line in good if line["worst"]]
-        cell = max(worst, key=lambda one: one[2]) if worst else None
-        where = f"{cell[0]:g} m, {cell[1]:g}°" if cell else ""
-        head = (test, detector, title_of(shown[:2]), shown[2] if shown[2] != detector else "", where)
-        rows.append(Row(head, (score(good, "AP50"), score(good, "ASR_25"), Cell(100 * cell[2] if cell else math.nan))))
+        worst_cells = [line["worst"] for line in finished if line["worst"]]
+        worst_cell = max(worst_cells, key=lambda candidate: candidate[2]) if worst_cells else None
+        position = f"{worst_cell[0]:g} m, {worst_cell[1]:g}°" if worst_cell else ""
+        row_head = (
+            test,
+            detector,
+            title_of(attack_key[:2]),
+            attack_key[2] if attack_key[2] != detector else "",
+            position,
+        )
+        rows.append(
+            Row(
+                row_head,
+                (
+                    score(finished, "AP50"),
+                    score(finished, "ASR_25"),
+                    Cell(100 * worst_cell[2] if worst_cell else math.nan),
+                ),
+            )
+        )
     note = (
         "Percent. The worst cell of distance and azimuth (0° is the front, 90° the left) is the one in which the "
         "attack does least; of the clean pictures the one in which the detector does."
@@ -291,17 +319,27 @@ def comparison_table(run: PhysicalRun) -> Table:
     rows = []
     carriers = list(dict.fromkeys(carrier for _, carrier in run.attacks))
     for (_, test), view, detector, carrier in product(run.pairs, ("drive", "grid"), run.detectors, carriers):
-        own = {}
+        attack_lines = {}
         for attack in run.attacks:
             lines = [] if is_control(attack[0]) else run.lines(test, view, detector, attack)
             if attack[1] == carrier and lines and lines[0]["source"] and lines[0].get("replicates"):
-                own[attack] = lines[0]
-        best = min(own, key=lambda attack: own[attack]["metrics"]["AP50"], default=("", ""))
-        for attack, line in own.items():
-            if attack != best:
-                cells = score([own[best]], "AP50"), score([line], "AP50"), paired_gap(line, own[best])
-                head = (test, "all around" if view == "grid" else "behind", detector, title_of(best), title_of(attack))
-                rows.append(Row(head, cells))
+                attack_lines[attack] = lines[0]
+        strongest = min(attack_lines, key=lambda attack: attack_lines[attack]["metrics"]["AP50"], default=("", ""))
+        for attack, line in attack_lines.items():
+            if attack != strongest:
+                cells = (
+                    score([attack_lines[strongest]], "AP50"),
+                    score([line], "AP50"),
+                    paired_gap(line, attack_lines[strongest]),
+                )
+                row_head = (
+                    test,
+                    "all around" if view == "grid" else "behind",
+                    detector,
+                    title_of(strongest),
+                    title_of(attack),
+                )
+                rows.append(Row(row_head, cells))
     note = (
         "AP50 in percent. The difference is what the other leaves less what the strongest leaves in the same pictures. "
         "Its interval is of paired replicates of the bootstrap over drives, so it can exclude zero where the two "
@@ -312,22 +350,26 @@ def comparison_table(run: PhysicalRun) -> Table:
 
 
 def paired_gap(more: Line, less: Line) -> Cell:
-    """Difference of the AP50 of two records in percent; its interval where both are of the same pictures."""
-    gap, n, drives = more["metrics"]["AP50"] - less["metrics"]["AP50"], int(more["n"]), int(more["drives"])
-    if (n, drives) != (less["n"], less["drives"]) or not (more.get("replicates") and less.get("replicates")):
-        return Cell(100.0 * gap)
+    """Return the difference of the AP50 of two records in percent; its interval where both are of the same images."""
+    difference, count, drives = more["metrics"]["AP50"] - less["metrics"]["AP50"], int(more["n"]), int(more["drives"])
+    if (count, drives) != (less["n"], less["drives"]) or not (more.get("replicates") and less.get("replicates")):
+        return Cell(100.0 * difference)
     pairs = zip(*(line["replicates"]["AP50"] for line in (more, less)), strict=False)
-    return Cell.of(replicate_difference(gap, [a - b for a, b in pairs], n=n, clusters=drives).scaled(100.0))
+    return Cell.of(
+        replicate_difference(difference, [first - second for first, second in pairs], n=count, clusters=drives).scaled(
+            100.0
+        )
+    )
 
 
 def effort_table(run: PhysicalRun) -> Table:
-    """How the textures were trained."""
+    """Return how the textures were trained."""
     rows = {}
     for line in run.run.lines:
         if line["status"] == "ok" and "epochs" in line and line["attack"].split()[0] not in CONTROLS:
-            head = (line["train"], line["source"], title_of((line["attack"], line["carrier"])))
+            row_head = (line["train"], line["source"], title_of((line["attack"], line["carrier"])))
             names = ("epochs", "loss_before", "loss_after")
-            rows[head] = Row(head, tuple(Cell(float(line[name])) for name in names))
+            rows[row_head] = Row(row_head, tuple(Cell(float(line[name])) for name in names))
     note = "The loss is ascended; means over the first and the last epoch, each picture with its own print and noise."
     columns = ("epochs", "loss in the first epoch", "in the last")
     return Table("effort", "Training", ("Town", "Detector", "Attack"), columns, tuple(rows.values()), note)
@@ -339,56 +381,61 @@ def maps(run: PhysicalRun) -> list[tuple[str, str]]:
 
 
 def weather_maps(run: PhysicalRun) -> list[tuple[str, str]]:
-    """The same by elevation and weather: shares of the views in which the target is found above 0.25."""
+    """Return the same by elevation and weather: shares of the views in which the target is found above 0.25."""
     return _drawn(run, _weather_map, "share of views in which the target is found, by elevation and weather")
 
 
 def _drawn(run: PhysicalRun, draw: Callable[..., HeatMap], label: str) -> list[tuple[str, str]]:
-    """For each town and detector: a title, and the maps of the attacks that were seen on the grid."""
-    found = []
+    """Return for each town and detector a title, and the maps of the attacks that were tested on the grid."""
+    entries = []
     for _, test in run.pairs:
         for detector in run.detectors:
-            seen = [(attack, run.lines(test, "grid", detector, attack)) for attack in run.attacks]
-            drawn = [draw(lines[0], title_of(attack), clean=attack[0] == "clean") for attack, lines in seen if lines]
-            if drawn:
-                found.append((f"{detector}, {test}", heat_maps(drawn, label=f"{label}, {detector} in {test}")))
-    return found
+            grid_lines = [(attack, run.lines(test, "grid", detector, attack)) for attack in run.attacks]
+            heat_map_list = [
+                draw(lines[0], title_of(attack), clean=attack[0] == "clean") for attack, lines in grid_lines if lines
+            ]
+            if heat_map_list:
+                entries.append(
+                    (f"{detector}, {test}", heat_maps(heat_map_list, label=f"{label}, {detector} in {test}"))
+                )
+    return entries
 
 
 def _weather_map(line: Line, title: str, *, clean: bool) -> HeatMap:
-    """The map of a record by elevation and weather."""
-    sums: dict[tuple[str, str], list[bool]] = {}
+    """Return the map of a record by elevation and weather."""
+    hits: dict[tuple[str, str], list[bool]] = {}
     for _, _, elevation, weather, before, after in line["views"]:
-        sums.setdefault((f"{elevation:g}°", weather), []).append((before if clean else after) > 0.25)
-    rows, columns = (list(dict.fromkeys(place[k] for place in sums)) for k in (0, 1))
-    values = {place: sum(own) / len(own) for place, own in sums.items()}
-    tips = {place: f"{title}: {sum(own)} of {len(own)} views" for place, own in sums.items()}
+        hits.setdefault((f"{elevation:g}°", weather), []).append((before if clean else after) > 0.25)
+    rows, columns = (list(dict.fromkeys(position[axis] for position in hits)) for axis in (0, 1))
+    values = {position: sum(views) / len(views) for position, views in hits.items()}
+    tips = {position: f"{title}: {sum(views)} of {len(views)} views" for position, views in hits.items()}
     rows.sort(key=lambda text: float(text[:-1]))
     return HeatMap(title, rows, sorted(columns), values, None, tips)
 
 
 def _map(line: Line, title: str, *, clean: bool) -> HeatMap:
-    """The map of a record."""
+    """Return the map of a record by distance and azimuth."""
     values: dict[tuple[str, str], float | None] = {}
     tips = {}
     for distance, azimuth, count, before, after in line["cells"]:
-        place = (f"{distance:g} m", f"{azimuth:g}°")
-        values[place] = before if clean else after
-        left = "n/a" if after is None else f"{100 * after:.1f}"
-        was = "n/a" if before is None else f"{100 * before:.1f}"
-        tips[place] = (
-            f"{title}, {place[0]}, {place[1]}: AP50 clean {was}{'' if clean else f', attacked {left}'}, {count} views"
+        position = (f"{distance:g} m", f"{azimuth:g}°")
+        values[position] = before if clean else after
+        attacked_text = "n/a" if after is None else f"{100 * after:.1f}"
+        clean_text = "n/a" if before is None else f"{100 * before:.1f}"
+        tips[position] = (
+            f"{title}, {position[0]}, {position[1]}: AP50 clean "
+            f"{clean_text}{'' if clean else f', attacked {attacked_text}'}, {count} views"
         )
-    rows, columns = (list(dict.fromkeys(place[k] for place in values)) for k in (0, 1))
-    worst = line["worst"]
-    marked = (f"{worst[0]:g} m", f"{worst[1]:g}°") if worst else None
+    rows, columns = (list(dict.fromkeys(position[axis] for position in values)) for axis in (0, 1))
+    worst_cell = line["worst"]
+    marked = (f"{worst_cell[0]:g} m", f"{worst_cell[1]:g}°") if worst_cell else None
     return HeatMap(title, rows, columns, values, marked, tips)
 
 
 def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
-    """For each detector that is attacked: the clean AP50 and the strongest attack, in the first town."""
+    """Return for each attacked detector the clean AP50 and the strongest attack, in the first town."""
     _, test = run.pairs[0]
-    found = []
+    entries = []
     for detector in run.detectors:
         scores = {attack: score(run.lines(test, "drive", detector, attack), "AP50") for attack in run.attacks}
         trained = {
@@ -396,43 +443,47 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
             for attack, cell in scores.items()
             if attack[0] != "clean" and attack[0].split()[0] not in CONTROLS and not math.isnan(cell.mean)
         }
-        worst = min(trained, key=lambda attack: trained[attack].mean, default=None)
-        carrier = worst[1] if worst else ""
-        # of lights the clean pictures of their hour
+        strongest = min(trained, key=lambda attack: trained[attack].mean, default=None)
+        carrier = strongest[1] if strongest else ""
+        # lights are compared with the clean images of their hour
         clean = next(
-            (cell for (name, own), cell in scores.items() if name == "clean" and f"{carrier}, ".startswith(f"{own}, ")),
+            (
+                cell
+                for (name, clean_carrier), cell in scores.items()
+                if name == "clean" and f"{carrier}, ".startswith(f"{clean_carrier}, ")
+            ),
             next((cell for (name, _), cell in scores.items() if name == "clean"), Cell(math.nan)),
         )
-        found.append(
+        entries.append(
             {
                 "name": detector,
                 "town": test,
                 "clean": clean,
-                "worst": title_of(worst) if worst else "none has run",
-                "left": trained[worst] if worst else Cell(math.nan),
+                "worst": title_of(strongest) if strongest else "none has run",
+                "left": trained[strongest] if strongest else Cell(math.nan),
             }
         )
-    return found
+    return entries
 
 
 def summary(found: Run) -> Table:
-    """The table that is shown on the terminal."""
+    """Return the table for the terminal."""
     return replace(main_table(PhysicalRun(found), 0), note="percent, of the target alone")
 
 
 def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
-    """The page of a physical run and its tables."""
+    """Return the page of a physical run and its tables."""
     run = PhysicalRun(found)
-    main = [main_table(run, number) for number in range(len(run.pairs))]
-    margins, others, effort = margin_table(run), others_table(run), effort_table(run)
-    further = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
+    main_tables = [main_table(run, number) for number in range(len(run.pairs))]
+    margin_rows, others, effort = margin_table(run), others_table(run), effort_table(run)
+    further_tables = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
     page = render(
         TEMPLATE,
         found,
         verdict=verdict,
-        main=main,
-        margins=margins,
-        further=further,
+        main=main_tables,
+        margins=margin_rows,
+        further=further_tables,
         others=others,
         effort=effort,
         tiles=tiles(run),
@@ -451,4 +502,4 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
             for line in found.failures
         ],
     )
-    return page, [*main, margins, *further, others, effort]
+    return page, [*main_tables, margin_rows, *further_tables, others, effort]

@@ -10,26 +10,30 @@ from ssad.report.verdict import Line, lines_by, metric_of
 
 
 def verdict(run: Run) -> list[str]:
-    """Share of the targets that the best attack hides as they drive, and the best control of its carrier there."""
-    found = []
-    for detector, every in lines_by(run, "detector").items():
-        lines = [line for line in every if line.get("view", "drive") == "drive" and not math.isnan(_hidden(line))]
+    """Return the share of targets that the strongest attack hides, and that of the best control of its carrier."""
+    sentences = []
+    for detector, detector_lines in lines_by(run, "detector").items():
+        lines = [
+            line for line in detector_lines if line.get("view", "drive") == "drive" and not math.isnan(_hidden(line))
+        ]
         attacks = [line for line in lines if not physical.is_control(line["attack"])]
         if not attacks:
             continue
-        best = max(attacks, key=_hidden)
-        town = f" in {best['test']}" if len({line["test"] for line in lines}) > 1 else ""
-        found.append(f"{best['attack']} hides {_hidden(best):.0%} of the targets from {detector}{town}.")
-        alike = [
+        strongest = max(attacks, key=_hidden)
+        town_text = f" in {strongest['test']}" if len({line["test"] for line in lines}) > 1 else ""
+        sentences.append(
+            f"{strongest['attack']} hides {_hidden(strongest):.0%} of the targets from {detector}{town_text}."
+        )
+        controls = [
             line
             for line in lines
-            if all(line[key] == best[key] for key in ("test", "carrier"))
-            and physical.learns_nothing(line["attack"], best["attack"])
+            if all(line[key] == strongest[key] for key in ("test", "carrier"))
+            and physical.learns_nothing(line["attack"], strongest["attack"])
         ]
-        if alike:
-            control = max(alike, key=_hidden)
-            found.append(f"The strongest control ({control['attack']}) hides {_hidden(control):.0%}.")
-    return found
+        if controls:
+            control = max(controls, key=_hidden)
+            sentences.append(f"The strongest control ({control['attack']}) hides {_hidden(control):.0%}.")
+    return sentences
 
 
 def _hidden(line: Line) -> float:

@@ -29,13 +29,13 @@ Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
 
 
 class DetectionSuite(DetectorSuite):
-    """One table: 3D detectors x shifts x severities, beside the clean data; the first detector is the baseline of mCE.
+    """One table: 3D detectors x shifts x severities, beside clean data; the first detector is the baseline of mCE.
 
     Attributes:
-        shifts: names.
-        severities: 1 to 5, or random (dealt to the scenes, all as often, give or take one; drawn by sample in the
-            calibration of the paper).
-        calibration: of the shifts.
+        shifts: Names.
+        severities: 1 to 5, or random (dealt to the scenes in equal shares; drawn by sample in the calibration of the
+            paper).
+        calibration: Calibration of the shifts.
     """
 
     kind: Literal["detection"]
@@ -52,18 +52,18 @@ class Detection(DetectorKind):
     factors = ("detector", "shift", "severity")
 
     def plan(self, suite: DetectionSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Detectors are built once, the data set is looked at."""
+        """Build detectors once, and inspect the data set."""
         lists: dict[str, Sequence[object]] = {"shift": suite.shifts, "severity": suite.severities}
-        for what, values in lists.items():
+        for key, values in lists.items():
             if len(set(values)) != len(values):
-                raise ConfigError(f"suite {suite.name}: a {what} appears twice")
-        for known in suite.shifts:
-            ShiftSpec(known, calibration=suite.calibration)
+                raise ConfigError(f"suite {suite.name}: a {key} appears twice")
+        for name in suite.shifts:
+            ShiftSpec(name, calibration=suite.calibration)
         weights, detectors, _ = detectors_of(suite)
         data = data_of(suite)
         conditions: list[tuple[str | None, int | str]] = [
             (None, 0),
-            *((shift, s) for shift in suite.shifts for s in suite.severities),
+            *((shift, level) for shift in suite.shifts for level in suite.severities),
         ]
         cells = []
         for detector in detectors:
@@ -85,38 +85,43 @@ class Detection(DetectorKind):
         return 1 if isinstance(severity, str) else 2 + abs(severity - 3)
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """Scenes whose boxes are still to be found."""
+        """Return the scenes whose boxes are still to be found."""
         scenes = self.scenes(cell, job)
-        missing = [one for one in scenes if not boxes_path(job.folder, cell.system, one).is_file()]
-        return {one.name: [one.shift, one.severity, one.scene] for one in missing}
+        missing = [scene for scene in scenes if not boxes_path(job.folder, cell.system, scene).is_file()]
+        return {scene.name: [scene.shift, scene.severity, scene.scene] for scene in missing}
 
     def scenes(self, cell: Cell, job: Job) -> list[ShiftedScene]:
-        """See `DetectorKind`. A severity dealt to a scene is one of the five: nothing runs twice."""
+        """Return the scenes of a cell under its shift.
+
+        A severity dealt to a scene is one of the five: its boxes are shared with that cell.
+        """
         tokens: Mapping[str, str] = job.settings["scenes"]
         shift, severity = cell.fields["shift"], cell.fields["severity"]
         if shift is None or severity != "random" or cell.spec["calibration"] == "paper":
             return [ShiftedScene(shift, severity, scene) for scene in tokens]
         spec = ShiftSpec(shift, seed=cell.seed, calibration=cell.spec["calibration"])
-        dealt = dealt_severities(spec, tokens.values())
-        return [ShiftedScene(shift, dealt[token], scene) for scene, token in tokens.items()]
+        severity_by_token = dealt_severities(spec, tokens.values())
+        return [ShiftedScene(shift, severity_by_token[token], scene) for scene, token in tokens.items()]
 
     def condition(self, data: Any) -> ShiftedScene:
-        """See `DetectorKind`."""
+        """Return the shifted scene of a piece."""
         return ShiftedScene(*data)
 
     def settings(self, suite: DetectionSuite) -> dict[str, Any]:
-        """See `DetectorKind`."""
+        """Return the calibration of the shifts."""
         return {"calibration": suite.calibration}
 
     def sheet(
         self, examination: Examination, suite: DetectionSuite, cell: Cell | None = None
     ) -> tuple[Callable[[], U8], str]:
-        """One moment under each shift."""
+        """Return a picture of one moment under each shift, and its caption."""
         shifts, severities = suite.shifts, suite.severities
         if cell is not None:
             shifts = [cell.fields["shift"]] if cell.fields["shift"] else []
             severities = [cell.fields["severity"]]
-        severity = min([s for s in severities if isinstance(s, int)] or [STRONG], key=lambda s: abs(s - STRONG))
+        severity = min(
+            [level for level in severities if isinstance(level, int)] or [STRONG], key=lambda level: abs(level - STRONG)
+        )
         caption = (
             f"What {examination.detectors[0][0]} finds (orange, score at least 0.3) and what is there (white), clean "
             f"and under each shift at severity {severity}."
@@ -124,13 +129,13 @@ class Detection(DetectorKind):
         return lambda: detection_sheet(examination, suite.split, shifts, severity), caption
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
-        """Page of a run and its tables."""
+        """Return the page of a run and its tables."""
         return page.section(run, self.verdict(run))
 
     def summary(self, run: Run) -> Table:
-        """Main table of a run."""
+        """Return the main table of a run."""
         return page.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Findings of a run in sentences."""
+        """Return the findings of a run in sentences."""
         return verdict(run)

@@ -1,4 +1,4 @@
-"""The page of a detection run: 3D detectors under shifts, the paper's numbers beside ours."""
+"""Page of a detection run: 3D detectors under shifts, the paper's numbers beside ours."""
 
 from __future__ import annotations
 
@@ -55,40 +55,40 @@ class DetectionRun:
 
     @property
     def scenes(self) -> int:
-        """How many scenes were resampled for the intervals."""
-        return max(int(r.get("scenes", 0)) for r in self.records.values())
+        """Number of scenes that were resampled for the intervals."""
+        return max(int(record.get("scenes", 0)) for record in self.records.values())
 
     @property
     def detectors(self) -> list[str]:
-        """In the order of the suite."""
+        """Detectors in the order of the suite."""
         return [split_weights(text)[0] for text in self.suite["detectors"]]
 
     @property
     def shifts(self) -> list[str]:
-        """In the order of the suite, without the clean data."""
+        """Shifts in the order of the suite, without the clean data."""
         return list(self.suite["shifts"])
 
     @property
     def numbers(self) -> list[str]:
         """Severities that are numbers, in order."""
-        return sorted(str(s) for s in self.suite["severities"] if s != "random")
+        return sorted(str(severity) for severity in self.suite["severities"] if severity != "random")
 
     def record(self, detector: str, shift: str, severity: str) -> Mapping[str, Any] | None:
-        """A record that is there and not failed; the clean one has no severity."""
-        found = self.records.get((detector, shift, severity if shift else "0"))
-        return found if found is not None and found["status"] == "ok" else None
+        """Return a record, None if it is absent or failed; the clean one has no severity."""
+        candidate = self.records.get((detector, shift, severity if shift else "0"))
+        return candidate if candidate is not None and candidate["status"] == "ok" else None
 
     def family(self, shift: str) -> str:
-        """Title of the family of a shift."""
-        own = next((r for (_, s, _), r in self.records.items() if s == shift), None)
-        return FAMILIES[own["family"]] if own else ""
+        """Return the title of the family of a shift."""
+        first_record = next((record for (_, name, _), record in self.records.items() if name == shift), None)
+        return FAMILIES[first_record["family"]] if first_record else ""
 
 
 class Resampled(Protocol):
     """A run whose scenes were resampled for the intervals.
 
     Attributes:
-        scenes: how many.
+        scenes: Number of scenes.
     """
 
     @property
@@ -97,90 +97,101 @@ class Resampled(Protocol):
 
 
 def load_detection_run(run: Run) -> DetectionRun:
-    """The records of a run folder."""
-    records = {(r["detector"], r["shift"] or "", str(r["severity"])): r for r in run.lines}
+    """Return the records of a run folder."""
+    records = {(record["detector"], record["shift"] or "", str(record["severity"])): record for record in run.lines}
     return DetectionRun(run, records)
 
 
 def score_cell(run: Resampled, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> Cell:
-    """A score in percent with its interval: the one place where intervals of this page come from."""
+    """Return a score in percent with its interval; all intervals of this page are made here."""
     return Cell.of(replicate_estimate(value, replicates, n=n, clusters=run.scenes, bounded=bounded).scaled(100.0))
 
 
 def cell_of(run: Resampled, record: Mapping[str, Any] | None, metric: str) -> Cell:
-    """A metric in percent with its interval; n/a where there is none."""
+    """Return a metric in percent with its interval; n/a where there is none."""
     value = None if record is None else record["metrics"].get(metric)
     if record is None or value is None:
         return Cell(math.nan)
-    replicates, given = replicates_of(record, metric), (record.get("intervals") or {}).get(metric)
-    if not replicates and given:
-        return Cell(100 * value, 100 * given[0], 100 * given[1], record["n"], method="given")
+    replicates, interval = replicates_of(record, metric), (record.get("intervals") or {}).get(metric)
+    if not replicates and interval:
+        return Cell(100 * value, 100 * interval[0], 100 * interval[1], record["n"], method="given")
     return score_cell(run, value, replicates, record["n"])
 
 
 def replicates_of(record: Mapping[str, Any], metric: str) -> list[float]:
-    """A metric's bootstrap replicates; empty if the record has none."""
+    """Return a metric's bootstrap replicates; empty if the record has none."""
     return (record.get("replicates") or {}).get(metric) or []
 
 
 def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
-    """A shift's number: at the random severity if that ran, else the mean over severities."""
+    """Return a shift's number: at the random severity if that ran, else the mean over severities."""
     if not shift or run.record(detector, shift, "random") is not None:
         return cell_of(run, run.record(detector, shift, "random"), metric)
-    found = [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
-    if not found or len(found) < len(run.numbers) or any(r["metrics"].get(metric) is None for r in found):
+    records = [record for severity in run.numbers if (record := run.record(detector, shift, severity)) is not None]
+    if (
+        not records
+        or len(records) < len(run.numbers)
+        or any(record["metrics"].get(metric) is None for record in records)
+    ):
         return Cell(math.nan)
-    mean = math.fsum(r["metrics"][metric] for r in found) / len(found)
-    draws = [replicates_of(r, metric) for r in found]
-    means = [math.fsum(row) / len(row) for row in zip(*draws, strict=True)] if all(draws) else []
-    return score_cell(run, mean, means, found[0]["n"])
+    mean = math.fsum(record["metrics"][metric] for record in records) / len(records)
+    replicates = [replicates_of(record, metric) for record in records]
+    means = [math.fsum(draw) / len(draw) for draw in zip(*replicates, strict=True)] if all(replicates) else []
+    return score_cell(run, mean, means, records[0]["n"])
 
 
 def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
     """Share of the clean score that is left under a shift, percent; the interval from paired replicates."""
-    clean, own = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
-    if clean is None or math.isnan(own.mean) or not clean["metrics"].get(metric):
+    clean, shifted = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
+    if clean is None or math.isnan(shifted.mean) or not clean["metrics"].get(metric):
         return Cell(math.nan)
-    drawn = run.record(detector, shift, "random")
-    found = [drawn] if drawn else [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
-    rows = zip(*(replicates_of(r, metric) for r in (clean, *found)), strict=True)
-    shares = [math.fsum(row[1:]) / len(found) / row[0] for row in rows if row[0] > 0]
-    return score_cell(run, own.mean / 100.0 / clean["metrics"][metric], shares, own.n, bounded=False)
+    random_record = run.record(detector, shift, "random")
+    records = (
+        [random_record]
+        if random_record
+        else [record for severity in run.numbers if (record := run.record(detector, shift, severity)) is not None]
+    )
+    draws = zip(*(replicates_of(record, metric) for record in (clean, *records)), strict=True)
+    shares = [math.fsum(draw[1:]) / len(records) / draw[0] for draw in draws if draw[0] > 0]
+    return score_cell(run, shifted.mean / 100.0 / clean["metrics"][metric], shares, shifted.n, bounded=False)
 
 
 def interval_note(run: Resampled) -> str:
-    """How the intervals of the page are made, in a sentence."""
+    """Return in a sentence how the intervals of the page are made."""
     if run.scenes < MIN_CLUSTERS:
-        few = "one scene is" if run.scenes == 1 else f"{run.scenes} scenes are"
-        return f"no intervals, since {few} too few (five are the least)."
+        subject = "one scene is" if run.scenes == 1 else f"{run.scenes} scenes are"
+        return f"no intervals, since {subject} too few (five are the least)."
     limits = "beta limits; Student's t for ratios that may exceed 1"
     return f"95 % intervals by the bootstrap over {run.scenes} scenes ({limits})."
 
 
 def title_of(shift: str) -> str:
-    """What people call a shift."""
+    """Return the title of a shift."""
     return TITLES.get(shift, shift.replace("_", " "))
 
 
 def published_names(run: DetectionRun) -> list[str]:
-    """The paper's column for each detector; "": none, or the suite does not ask for them."""
+    """Return the paper's column for each detector; "": none, or the suite does not show the paper."""
     if not run.suite.get("reference"):
         return [""] * len(run.detectors)
-    return [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    return [
+        next((column for prefix, column in DETECTORS.items() if detector.startswith(prefix)), "")
+        for detector in run.detectors
+    ]
 
 
 def main_table(run: DetectionRun) -> Table:
-    """Shift x detector: mAP and NDS, the paper's rows between ours."""
+    """Return shift x detector: mAP and NDS, the paper's rows between ours."""
     rows = []
-    columns = [f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS")]
+    columns = [f"{detector} {metric}" for detector in run.detectors for metric in ("mAP", "NDS")]
     names = published_names(run)
     for shift in ["", *run.shifts]:
-        head = (run.family(shift), title_of(shift))
-        cells = [summary_cell(run, d, shift, metric) for d in run.detectors for metric in ("mAP", "NDS")]
-        rows.append(Row(head, tuple(cells)))
+        row_head = (run.family(shift), title_of(shift))
+        cells = [summary_cell(run, detector, shift, metric) for detector in run.detectors for metric in ("mAP", "NDS")]
+        rows.append(Row(row_head, tuple(cells)))
         if shift in PUBLISHED and any(names):
-            told = [PUBLISHED[shift].get(name, (math.nan, math.nan)) for name in names]
-            rows.append(Row(head, tuple(Cell(v) for pair in told for v in pair), published=True))
+            published = [PUBLISHED[shift].get(name, (math.nan, math.nan)) for name in names]
+            rows.append(Row(row_head, tuple(Cell(value) for scores in published for value in scores), published=True))
     if "random" not in run.suite["severities"]:
         strength = f"mean over severities {', '.join(run.numbers)}"
     elif run.suite["calibration"] == "paper":
@@ -200,20 +211,27 @@ def main_table(run: DetectionRun) -> Table:
 
 
 def left_table(run: DetectionRun) -> Table:
-    """Shift x detector: the share of the detector's clean score that is left, the paper's shares between ours."""
+    """Return shift x detector: the share of the clean score that is left, the paper's shares between ours."""
     rows = []
-    columns = [f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS")]
+    columns = [f"{detector} {metric}" for detector in run.detectors for metric in ("mAP", "NDS")]
     names = published_names(run)
     for shift in run.shifts:
-        head = (run.family(shift), title_of(shift))
-        rows.append(Row(head, tuple(left_cell(run, d, shift, m) for d in run.detectors for m in ("mAP", "NDS"))))
+        row_head = (run.family(shift), title_of(shift))
+        rows.append(
+            Row(
+                row_head,
+                tuple(left_cell(run, detector, shift, m) for detector in run.detectors for m in ("mAP", "NDS")),
+            )
+        )
         if shift in PUBLISHED and any(names):
             cells = [
-                Cell(100 * PUBLISHED[shift][name][k] / PUBLISHED[""][name][k] if name else math.nan)
+                Cell(
+                    100 * PUBLISHED[shift][name][metric_index] / PUBLISHED[""][name][metric_index] if name else math.nan
+                )
                 for name in names
-                for k in (0, 1)
+                for metric_index in (0, 1)
             ]
-            rows.append(Row(head, tuple(cells), published=True))
+            rows.append(Row(row_head, tuple(cells), published=True))
     return Table(
         "left",
         "What is left of the clean score",
@@ -227,35 +245,45 @@ def left_table(run: DetectionRun) -> Table:
 
 
 def severity_table(run: DetectionRun) -> Table:
-    """Every number by severity."""
-    names = [*run.numbers, *(["random"] if "random" in run.suite["severities"] else [])]
+    """Return every number by severity."""
+    severities = [*run.numbers, *(["random"] if "random" in run.suite["severities"] else [])]
     rows = []
     for metric in ("mAP", "NDS", "AP_car"):
         for detector in run.detectors:
             for shift in run.shifts:
-                cells = [cell_of(run, run.record(detector, shift, s), metric) for s in names]
+                cells = [cell_of(run, run.record(detector, shift, severity), metric) for severity in severities]
                 rows.append(Row((metric.replace("_", " "), detector, title_of(shift)), tuple(cells)))
     return Table(
-        "severities", "By severity", ("Metric", "Detector", "Shift"), tuple(f"severity {s}" for s in names), tuple(rows)
+        "severities",
+        "By severity",
+        ("Metric", "Detector", "Shift"),
+        tuple(f"severity {severity}" for severity in severities),
+        tuple(rows),
     )
 
 
 def car_table(run: DetectionRun) -> Table:
-    """AP of cars."""
+    """Return the AP of cars."""
     rows = [
-        Row((run.family(s), title_of(s)), tuple(summary_cell(run, d, s, "AP_car") for d in run.detectors))
-        for s in ["", *run.shifts]
+        Row(
+            (run.family(shift), title_of(shift)),
+            tuple(summary_cell(run, detector, shift, "AP_car") for detector in run.detectors),
+        )
+        for shift in ["", *run.shifts]
     ]
     return Table("car", "Cars alone: AP", ("Family", "Shift"), tuple(run.detectors), tuple(rows), "Percent.")
 
 
 def class_table(run: DetectionRun) -> Table:
-    """AP of each class and the errors of true positives on the clean data."""
-    columns = [*(c.replace("_", " ") for c in CLASSES), *(f"{k} ({unit})" for k, unit in ERRORS.items())]
+    """Return the AP of each class and the errors of true positives on the clean data."""
+    columns = [
+        *(class_name.replace("_", " ") for class_name in CLASSES),
+        *(f"{error_name} ({unit})" for error_name, unit in ERRORS.items()),
+    ]
     rows = []
     for detector in run.detectors:
         record = run.record(detector, "", "0")
-        cells = [cell_of(run, record, f"AP_{c}") for c in CLASSES]
+        cells = [cell_of(run, record, f"AP_{class_name}") for class_name in CLASSES]
         errors = [record["metrics"].get(error) if record else None for error in ERRORS]
         cells += [Cell(math.nan if error is None else error) for error in errors]
         rows.append(Row((detector,), tuple(cells)))
@@ -264,37 +292,54 @@ def class_table(run: DetectionRun) -> Table:
 
 
 def robustness_table(run: DetectionRun) -> Table | None:
-    """Table of mCE and mRR, each of NDS and mAP; the first detector is the baseline of mCE.
+    """Return mCE and mRR, each of NDS and mAP; the first detector is the baseline of mCE.
 
     Returns:
         The table, or None where a number is missing.
     """
     severities = run.numbers or ["random"]
-    found: dict[tuple[str, str], dict[str, list[float]]] = {}
-    draws: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
+    scores: dict[tuple[str, str], dict[str, list[float]]] = {}
+    replicates: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
     for detector in run.detectors:
         for metric in ("NDS", "mAP"):
-            records = {s: [run.record(detector, s, n) for n in severities] for s in ["", *run.shifts]}
-            if any(r is None for row in records.values() for r in row):
+            records = {
+                entry: [run.record(detector, entry, count) for count in severities] for entry in ["", *run.shifts]
+            }
+            # Means over shifts and severities are comparable only if none is missing.
+            if any(record is None for shift_records in records.values() for record in shift_records):
                 return None
-            whole = {s: [r for r in row if r is not None] for s, row in records.items()}
-            found[detector, metric] = {s: [r["metrics"][metric] for r in row] for s, row in whole.items()}
-            draws[detector, metric] = {s: [replicates_of(r, metric) for r in row] for s, row in whole.items()}
+            complete_records = {
+                entry: [record for record in shift_records if record is not None]
+                for entry, shift_records in records.items()
+            }
+            scores[detector, metric] = {
+                entry: [record["metrics"][metric] for record in shift_records]
+                for entry, shift_records in complete_records.items()
+            }
+            replicates[detector, metric] = {
+                entry: [replicates_of(record, metric) for record in shift_records]
+                for entry, shift_records in complete_records.items()
+            }
     rows = []
     for detector in run.detectors:
         cells = []
         for metric in ("NDS", "mAP"):
-            own, base = found[detector, metric], found[run.detectors[0], metric]
-            rate, error = _robustness(own, base)
-            sets = [
-                _robustness(_drawn(draws[detector, metric], k), _drawn(draws[run.detectors[0], metric], k))
-                for k in range(len(draws[detector, metric][""][0]))
+            detector_scores, baseline_scores = scores[detector, metric], scores[run.detectors[0], metric]
+            rate, error = _robustness(detector_scores, baseline_scores)
+            resampled = [
+                _robustness(
+                    _drawn(replicates[detector, metric], draw), _drawn(replicates[run.detectors[0], metric], draw)
+                )
+                for draw in range(len(replicates[detector, metric][""][0]))
             ]
-            for value, several in ((error, [s[1] for s in sets]), (rate, [s[0] for s in sets])):
+            for value, value_draws in (
+                (error, [entry[1] for entry in resampled]),
+                (rate, [entry[0] for entry in resampled]),
+            ):
                 # the baseline's mCE is 1 by definition, so its replicates do not vary
-                known = [] if value is error and own is base else several
-                n = next(iter(run.records.values())).get("n", 0)
-                cells.append(score_cell(run, value, known, n, bounded=False))
+                used_draws = [] if value is error and detector_scores is baseline_scores else value_draws
+                count = next(iter(run.records.values())).get("n", 0)
+                cells.append(score_cell(run, value, used_draws, count, bounded=False))
         rows.append(Row((detector,), tuple(cells)))
     return Table(
         "robustness",
@@ -308,13 +353,13 @@ def robustness_table(run: DetectionRun) -> Table | None:
 
 
 def _drawn(values: Mapping[str, Sequence[Sequence[float]]], k: int) -> dict[str, list[float]]:
-    return {s: [row[k] for row in rows] for s, rows in values.items()}
+    return {shift: [row[k] for row in rows] for shift, rows in values.items()}
 
 
 def _robustness(own: Mapping[str, Sequence[float]], base: Mapping[str, Sequence[float]]) -> tuple[float, float]:
     """Return mRR and mCE of scores by shift, with the clean ones at ""; NaN where they are not defined."""
-    shifted = {s: v for s, v in own.items() if s}
-    reference = {s: v for s, v in base.items() if s}
+    shifted = {shift: values for shift, values in own.items() if shift}
+    reference = {shift: values for shift, values in base.items() if shift}
     try:
         rate = mean_resilience_rate(shifted, own[""][0])
         errors = corruption_error(shifted, reference)
@@ -324,39 +369,39 @@ def _robustness(own: Mapping[str, Sequence[float]], base: Mapping[str, Sequence[
 
 
 def curves(run: DetectionRun, metric: str = "NDS") -> str:
-    """A small plot for each shift: the metric over severity, a line a detector, its interval as a band; as SVG."""
+    """Plot a metric over severity for each shift, a line a detector, its interval as a band; as SVG."""
     if len(run.numbers) < 2:
         return ""
-    steps = ["0", *run.numbers]
-    ticks = [(int(n) / 5, "clean" if n == "0" else n) for n in steps]
-    found = []
+    severities = ["0", *run.numbers]
+    ticks = [(int(severity) / 5, "clean" if severity == "0" else severity) for severity in severities]
+    plots = []
     for shift in run.shifts:
         lines = [
             [
                 Point(
-                    int(n) / 5,
-                    cell_of(run, run.record(d, shift if n != "0" else "", n), metric),
-                    f"{d}, {title_of(shift)} {n}",
+                    int(severity) / 5,
+                    cell_of(run, run.record(detector, shift if severity != "0" else "", severity), metric),
+                    f"{detector}, {title_of(shift)} {severity}",
                 )
-                for n in steps
+                for severity in severities
             ]
-            for d in run.detectors
+            for detector in run.detectors
         ]
-        found.append(Panel(title_of(shift), ticks, lines))
-    return panels(found, label=f"{metric} over severity")
+        plots.append(Panel(title_of(shift), ticks, lines))
+    return panels(plots, label=f"{metric} over severity")
 
 
 def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
-    """Headline numbers of each detector."""
-    found = []
+    """Return the headline numbers of each detector."""
+    entries = []
     for number, detector in enumerate(run.detectors):
         clean = run.record(detector, "", "0")
-        scores = {s: [summary_cell(run, detector, s, "NDS").mean / 100] for s in run.shifts}
-        parts = {s: v for s, v in scores.items() if not math.isnan(v[0])}
-        base = cell_of(run, clean, "NDS").mean / 100
-        rates = resilience_rate(parts, base) if parts and base > 0 else {}
-        worst = min(rates, key=lambda s: rates[s], default="")
-        found.append(
+        scores = {shift: [summary_cell(run, detector, shift, "NDS").mean / 100] for shift in run.shifts}
+        measured = {shift: score for shift, score in scores.items() if not math.isnan(score[0])}
+        clean_score = cell_of(run, clean, "NDS").mean / 100
+        rates = resilience_rate(measured, clean_score) if measured and clean_score > 0 else {}
+        worst = min(rates, key=lambda shift: rates[shift], default="")
+        entries.append(
             {
                 "name": detector,
                 "mAP": cell_of(run, clean, "mAP"),
@@ -365,55 +410,57 @@ def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
                 "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else "",
             }
         )
-    return found
+    return entries
 
 
 def summary(found: Run) -> Table:
-    """The table that is shown on the terminal: percent."""
-    drawn = "random" in found.suite["severities"]
-    note = f"percent; {'severities from 1 to 5' if drawn else 'means over the severities that ran'}"
+    """Return the table for the terminal: percent."""
+    is_random = "random" in found.suite["severities"]
+    note = f"percent; {'severities from 1 to 5' if is_random else 'means over the severities that ran'}"
     return replace(main_table(load_detection_run(found)), note=note)
 
 
 def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
-    """The page of a detection run and its tables."""
+    """Return the page of a detection run and its tables."""
     run = load_detection_run(found)
     robust = robustness_table(run)
-    main, left, severities = main_table(run), left_table(run), severity_table(run)
-    cars, classes = car_table(run), class_table(run)
+    main_rows, left_rows, severities = main_table(run), left_table(run), severity_table(run)
+    car_rows, class_rows = car_table(run), class_table(run)
     page = render(
         TEMPLATE,
         found,
         verdict=verdict,
-        main=main,
-        left=left,
+        main=main_rows,
+        left=left_rows,
         severities=severities,
-        cars=cars,
-        classes=classes,
+        cars=car_rows,
+        classes=class_rows,
         robust=robust,
         tiles=tiles(run, robust),
         plot=curves(run),
         plot_map=curves(run, "mAP"),
         pictures=pictures(found.folder),
-        samples=max(int(r.get("n", 0)) for r in run.records.values()),
+        samples=max(int(record.get("n", 0)) for record in run.records.values()),
         scenes=run.scenes,
         skipped=_skipped(run),
         failures=[
-            (r["detector"], r["shift"] or "clean", r["severity"], r["reason"])
-            for r in run.records.values()
-            if r["status"] != "ok"
+            (record["detector"], record["shift"] or "clean", record["severity"], record["reason"])
+            for record in run.records.values()
+            if record["status"] != "ok"
         ],
     )
-    return page, [t for t in (main, left, robust, severities, cars, classes) if t is not None]
+    return page, [
+        table for table in (main_rows, left_rows, robust, severities, car_rows, class_rows) if table is not None
+    ]
 
 
 def _skipped(run: DetectionRun) -> list[str]:
-    """Where a shift could not be applied as it should."""
-    found = []
+    """Return remarks on shifts that could not be applied to all images."""
+    remarks = []
     for (detector, shift, severity), record in run.records.items():
         if detector != run.detectors[0] or record["status"] != "ok":
             continue
-        parts = [f"{k} {v}" for k, v in record.get("applied", {}).items() if k != "applied"]
+        parts = [f"{reason} {count}" for reason, count in record.get("applied", {}).items() if reason != "applied"]
         if parts:
-            found.append(f"{title_of(shift)}, severity {severity}: {'; '.join(parts)}")
-    return found
+            remarks.append(f"{title_of(shift)}, severity {severity}: {'; '.join(parts)}")
+    return remarks

@@ -7,11 +7,15 @@ from ssad.report.verdict import lines_by, mean_of, metric_of, worst_condition
 
 
 def verdict(run: Run) -> list[str]:
-    """The mAP clean and under the shift that costs most."""
-    found = []
+    """Return the mAP clean and under the shift that costs most."""
+    sentences = []
     for detector, lines in lines_by(run, "detector").items():
         scores: dict[str, list[float]] = {}
         for line in lines:
             scores.setdefault(str(line.get("shift") or ""), []).append(metric_of(line, "mAP"))
-        found.append(worst_condition(detector, "mAP", {name: mean_of(v) for name, v in scores.items()}, "shift"))
-    return found
+        sentences.append(
+            worst_condition(
+                detector, "mAP", {name: mean_of(shift_scores) for name, shift_scores in scores.items()}, "shift"
+            )
+        )
+    return sentences
