@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from benchmarks.detector_accuracy import pairs
+from ssad.core.detections import to_images
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.datasets.nuscenes.camera_truth import scenes_of
@@ -30,7 +31,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.mono3d.multi_camera import merge_cameras
-from ssad.detectors.on_scenes import SampleBoxes, box_table, numbers, to_images
+from ssad.detectors.on_scenes import SampleBoxes, box_table, numbers
 from ssad.metrics.detection import filter_boxes, match
 from ssad.training.detector import parse_changes
 

@@ -26,8 +26,6 @@ from ssad.experiments.perception import scored_data
 from ssad.experiments.perception.digital import attacked_scenes
 from ssad.experiments.perception.digital import kind as digital
 from ssad.experiments.perception.digital.attack_sheet import magnified
-from ssad.experiments.perception.digital.attack_tally import sum_notes
-from ssad.experiments.perception.digital.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
 from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
 from ssad.experiments.perception.digital.page import (
     attempts_of,
@@ -50,6 +48,8 @@ from ssad.experiments.runs import summary, write_report
 from ssad.experiments.suites import load_suite
 from ssad.report.load import load_run
 from ssad.report.paper import DIGITAL as PUBLISHED
+from ssad.scenarios.static.digital.scene_attacker import AttackedScene, AttackSpec, SceneAttacker
+from ssad.scenarios.static.digital.tally import sum_notes
 from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.training.data import nuscenes_items
 

@@ -25,8 +25,6 @@ from ssad.engine.kind import Job, Resources
 from ssad.engine.run import run
 from ssad.experiments.perception.digital import attack_scores, attacked_scenes
 from ssad.experiments.perception.digital.attack_scores import by_distance, target_success, worst_by_sample, worst_of
-from ssad.experiments.perception.digital.attacked_scenes import AttackedScene
-from ssad.experiments.perception.digital.chosen_object import NEAREST, chosen_first, chosen_object, chosen_places
 from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
 from ssad.experiments.perception.digital.page import attempts_of, load_digital_run, main_table
 from ssad.experiments.perception.digital.run import Resampling, setting_of
@@ -41,6 +39,8 @@ from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, b
 from ssad.experiments.perception.shifts.page import interval_note
 from ssad.experiments.runs import write_report
 from ssad.report.load import load_run
+from ssad.scenarios.static.digital.chosen_object import NEAREST, chosen_first, chosen_object, chosen_places
+from ssad.scenarios.static.digital.scene_attacker import AttackedScene
 
 ONE, OTHER = "helpers.linear3d:build", "helpers.linear3d:build_other"
 BLIND = "helpers.linear3d:build_blind"
@@ -258,9 +258,7 @@ def test_the_chosen_object_is_the_nearest_that_a_camera_sees_or_one_instance(
         frame = next(f for f in cameras if len(camera_truth(f, found.take(np.array([row]))).label))
         assert chosen_first(scene, frame, NEAREST, classes).token[0] == found.token[row]
     first = chosen_object(scene, sample, NEAREST)
-    monkeypatch.setattr(
-        "ssad.experiments.perception.digital.chosen_object._seen", lambda frame, found, row: row != first
-    )
+    monkeypatch.setattr("ssad.scenarios.static.digital.chosen_object._seen", lambda frame, found, row: row != first)
     assert chosen_object(scene, sample, NEAREST) == np.argsort(gap, kind="stable")[1], "the nearest is hidden"
     assert chosen_object(scene, sample, "nobody") is None
     assert chosen_object(scene, sample, NEAREST, ("trailer",)) is None, "the tiny set has none"

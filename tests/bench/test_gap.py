@@ -20,14 +20,14 @@ from ssad.core.traces import load_trace
 from ssad.core.types import AgentKind
 from ssad.engine.kind import Plan, Resources
 from ssad.engine.run import run
-from ssad.experiments.gap.kind import Gap, GapSuite
-from ssad.experiments.gap.kind import _conditions as planned_conditions
-from ssad.experiments.gap.loop_perturbations import perturbation_names, texture_version, worn
+from ssad.experiments.gap.kind import Gap, GapSuite, conditions_of
 from ssad.experiments.gap.page import cause_table, conditions, drop_table, main_table, rank_table, scatter, sheets
 from ssad.experiments.runs import summary, write_report
 from ssad.experiments.suites import load_suite, suite_files
 from ssad.report import check_artefacts
 from ssad.report.load import load_run
+from ssad.scenarios.static.catalogue import registered_names
+from ssad.scenarios.static.physical.textures.perturbation import Texture
 from ssad.world.models import MODELS
 
 SHORT = """
@@ -161,36 +161,44 @@ def test_a_collision_goes_where_the_object_that_was_hit_is_found(tmp_path: Path)
 
 
 def test_a_texture_is_worn_where_there_is_a_car(tmp_path: Path) -> None:
-    names = ["wear-grey", "wear-das-yolov5n-twinford"]
+    names = ["grey", "das-yolov5n-twinford"]
     suite = suite_of(tmp_path, BRIGHT, ceilings=[], perturbations=names, severities=[2, 5])
-    mixed = suite.model_copy(update={"scenarios": [*suite.scenarios, "LaneChanging/00"]})
+    scenarios = [*suite.scenarios, "LaneChanging/00"]
+    mixed = suite.model_copy(update={"scenarios": scenarios})
     cells = Gap().plan(mixed).cells
     told = [(cell.fields["perturbation"], cell.fields["severity"], cell.fields["cluster"]) for cell in cells]
     assert told == [
         ("none", 0, "short"),
         ("none", 0, "LaneChanging/00"),
-        ("wear-grey", 1, "LaneChanging/00"),
-        ("wear-das-yolov5n-twinford", 1, "LaneChanging/00"),
+        ("grey", 1, "LaneChanging/00"),
+        ("das-yolov5n-twinford", 1, "LaneChanging/00"),
     ]
-    assert perturbation_names()["wear-grey"] == "texture"
+    assert registered_names()["grey"] == "texture"
     cars = sorted(name for name, model in MODELS.items() if model.kind == AgentKind.CAR)
-    for name in (name for name, family in perturbation_names().items() if family == "texture"):
+    for name in (name for name, family in registered_names().items() if family == "texture"):
         for model in cars[::4]:
-            mesh, edit = worn(name, 1).body(model)
+            mesh, edit = Texture(name).worn_by(1).body(model)
             assert len(mesh.faces) > 100
             assert len(edit.textures) == 1
-    assert cells[2].spec["wearer"] == 1
-    lit = mixed.model_copy(update={"perturbations": ["night", "shine-laser", "shine-shadow"]})
+    assert cells[2].spec["target"] == 1
+    lit = suite_of(
+        tmp_path,
+        BRIGHT,
+        ceilings=[],
+        perturbations=["night", "laser", "shadow"],
+        severities=[2, 5],
+        scenarios=scenarios,
+    )
     told = [(c.fields["perturbation"], c.fields["severity"], c.fields["cluster"]) for c in Gap().plan(lit).cells][2:]
     assert told == [
         ("night", 1, "short"),
         ("night", 1, "LaneChanging/00"),
-        ("shine-laser", 2, "LaneChanging/00"),
-        ("shine-laser", 5, "LaneChanging/00"),
-        ("shine-shadow", 1, "LaneChanging/00"),
+        ("laser", 2, "LaneChanging/00"),
+        ("laser", 5, "LaneChanging/00"),
+        ("shadow", 1, "LaneChanging/00"),
     ]
-    assert texture_version("wear-grey") == ""
-    assert len(texture_version("wear-das-yolov5n-twinford")) == 64
+    assert Texture("grey").version() == ""
+    assert len(Texture("das-yolov5n-twinford").version()) == 64
 
 
 def test_a_detector_that_returns_nan_fails_its_drives_alone(tmp_path: Path) -> None:
@@ -215,14 +223,16 @@ def test_a_detector_that_dies_or_hangs_fails_its_drives_alone(tmp_path: Path, na
     ("changes", "words"),
     [
         ({"perturbations": ["fogg"]}, "fog"),
-        ({"severities": [6]}, "severities are 1 to 5"),
+        ({"severities": [6]}, "less than or equal to 5"),
+        ({"perturbations": ["fog", {"fog": 3}]}, "fog appears twice at severity 3"),
+        ({"perturbations": ["apgd?steps=1"]}, "steps must be 2 or more"),
         ({"systems": [TRUTH, TRUTH]}, "twice"),
         ({"systems": [BRIGHT | {"detector": "yolov5x"}]}, "yolov5"),
         ({"ceilings": ["autopilo"]}, "autopilot"),
     ],
 )
 def test_what_is_wrong_is_one_line(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(SSADError, match=words):
+    with pytest.raises((SSADError, ValidationError), match=words):
         Gap().plan(suite_of(tmp_path, TRUTH, **changes))
 
 
@@ -238,13 +248,14 @@ def test_the_suites_that_are_shipped_can_be_planned() -> None:
     for name in names:
         suite = load_suite(name)
         assert isinstance(suite, GapSuite)
-        assert set(suite.perturbations) <= set(perturbation_names())
+        assert {entry.name for entry in suite.perturbations} <= set(registered_names())
 
 
 def test_the_suite_has_conditions_enough_for_its_rank_correlation() -> None:
     suite = load_suite("gap")
     assert isinstance(suite, GapSuite)
     for system in (one for one in suite.systems if not one.perfect):
-        under = [(name, level) for own, name, level in planned_conditions(suite) if own == system and level]
+        perturbed = [one.perturbation for one in conditions_of(suite) if one.system == system and one.perturbation]
+        under = [(perturbation.name, perturbation.severity) for perturbation in perturbed]
         assert len(under) == len(set(under)) >= 40
         assert len({name for name, _ in under}) >= 15

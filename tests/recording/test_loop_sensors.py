@@ -14,7 +14,6 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeTrace, Limits, SignalState
-from ssad.experiments.gap.loop_perturbations import worn
 from ssad.rendering import onboard as loop_sensors
 from ssad.rendering.agent_edit import LiveAttack
 from ssad.rendering.camera.lamps import Lamp
@@ -29,6 +28,7 @@ from ssad.rendering.scene_objects import PHASES
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import Camouflage
+from ssad.scenarios.static.physical.textures.perturbation import Texture
 from ssad.world.check import check_driver
 from ssad.world.roads import load_town
 from ssad.world.rollout import Loop, rollout
@@ -377,7 +377,7 @@ def test_signs_wear_a_texture_in_the_loop() -> None:
     (scenario, *_) = [s for s in load_scenarios("stop-signs") if s.town == "Larkhill"]
     simulator = World([build_episode(scenario, graph, seed=1)], {"Larkhill": graph})
     camera = rig_camera("CAM_FRONT", 320)
-    onboards = [Onboard(), Onboard(attack=worn("wear-grey-sign", 0))]
+    onboards = [Onboard(), Onboard(attack=Texture("grey-sign").worn_by(0))]
     plain, grey = (o.camera(camera)(simulator, np.array([[0, 0]], np.int32))[0] for o in onboards)
     changed = (plain != grey).any(0)
     assert 0 < changed.sum() < 0.02 * changed.size

@@ -10,7 +10,7 @@ import pytest
 
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.seeding import generator
-from ssad.scenarios.static.faults import COVERED, DELAYS, FAULTS, CameraFault, dirt
+from ssad.scenarios.static.faults.camera import COVERED, DELAYS, FAULTS, CameraFault, dirt
 
 SHAPE = (3, 18, 32)
 

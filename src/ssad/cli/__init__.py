@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import warnings
 from errno import ENOSPC
 from typing import Annotated, Any
 
@@ -119,10 +120,17 @@ def give_up_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+    """Print a warning to the user as one line; those for developers keep their category."""
+    kind = "" if issubclass(category, FutureWarning | UserWarning) else f"{category.__name__}: "
+    print(f"warning: {kind}{message}", file=sys.stderr)
+
+
 def main() -> None:
     """Entry point: an error that the user can fix becomes one line and exit code 2."""
     # click's UsageError, which typer does not export
     usage_error: Any = typer.BadParameter.__mro__[1]
+    warnings.showwarning = _show_warning
     try:
         code = app(standalone_mode=False)
         # Flush here: a closed pipe would otherwise raise while the interpreter exits, outside this handler.

@@ -58,6 +58,17 @@ def _shift_list() -> dict[str, str]:
     return {name: f"{family}: {description}{remarks.get(name, '')}" for name, (family, description) in KNOWN.items()}
 
 
+def _perturbation_list() -> dict[str, str]:
+    from ssad.scenarios.static.catalogue import registered_names
+
+    rows = dict(sorted(registered_names().items(), key=lambda pair: pair[::-1]))
+    return rows | {
+        "NAME.json": "texture: the card of a texture, beside NAME.png (docs/physical.md)",
+        "FOLDER": "texture or light: what ssad export texture or ssad export light wrote",
+        "module:object": "a perturbation of your own (docs/gap.md)",
+    }
+
+
 def _attack_list() -> dict[str, str]:
     from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack, needs
     from ssad.scenarios.static.physical import default_carrier, physical_names
@@ -119,6 +130,7 @@ LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "systems": _system_list,
     "detectors": _detector_list,
     "recipes": _recipe_list,
+    "perturbations": _perturbation_list,
     "shifts": _shift_list,
     "attacks": _attack_list,
     "towns": _town_list,

@@ -9,11 +9,16 @@ size is length, height, width (along x, y, z at yaw 0), yaw turns about the y ax
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ssad.core.types import U8
+
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 
@@ -116,3 +121,11 @@ class Assignment:
     owner: Tensor
     truth: tuple[Truth, ...]
     extra: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+def to_images(images: Sequence[U8], device: torch.device | str) -> Tensor:
+    """Return images uint8 RGB [H, W, 3] of one size as float [B, 3, H, W] in 0 to 1 on a device."""
+    import torch
+
+    stacked = torch.from_numpy(np.stack(images)).to(device)
+    return stacked.permute(0, 3, 1, 2).float() / 255

@@ -510,24 +510,94 @@ One that also has a method `follow`, which takes the simulator, is told of every
 
 
 Frames = npt.NDArray[Any]
-"""Pictures [N, C, H, W]."""
+"""Images [N, C, H, W]."""
 
 Generators = Sequence[np.random.Generator]
-"""Random numbers, a generator for each picture."""
+"""Random numbers, one generator for each row of a reading."""
 
 
-class Perturbation(Protocol):
-    """Changes the images that a driver receives, in the open loop and in the closed loop alike."""
+@runtime_checkable
+class ReadingChange(Protocol):
+    """Changes the readings of a sensor before a driver or a detector receives them."""
 
-    def apply(self, frames: Frames, victim: Any, truth: Any, generators: Generators) -> Frames:
-        """Change images.
+    def apply(self, readings: Any, victim: Any, truth: Any, generators: Generators) -> Any:
+        """Return the changed readings.
 
         Args:
-            frames: [N, C, H, W].
+            readings: [N, ...] of one sensor; images are uint8 [N, C, H, W].
             victim: The driver or detector that receives them.
-            truth: Truth of that moment: in the loop a `WorldState`.
-            generators: One for each image, so that no image depends on its batch.
+            truth: Truth of that moment: in the loop a `WorldState`, of a recording a `RecordedMoment`; both have
+                the field `time`, [N] s.
+            generators: One for each row, so that no row depends on its batch.
 
         Returns:
-            [N, C, H, W].
+            Readings of the same shape and type; the argument must not be changed.
         """
+
+
+@runtime_checkable
+class StateChange(Protocol):
+    """Changes what an ego's driver knows of its own state: pose, speed, acceleration, route."""
+
+    def observe(self, observation: Observation, generators: Generators) -> Observation:
+        """Return the changed observation.
+
+        Args:
+            observation: Observation of N egos.
+            generators: One for each of them, a new one at every step.
+
+        Returns:
+            Observation of the same N egos, such as `dataclasses.replace(observation, speed=...)`.
+        """
+
+
+@runtime_checkable
+class CommandChange(Protocol):
+    """Changes the commands of an ego's driver on their way to the vehicle."""
+
+    def command(self, controls: F32, time: F32, generators: Generators) -> F32:
+        """Return the changed commands.
+
+        Args:
+            controls: [N, 4] throttle, brake, steer and reverse of N egos, as `Driver.act` returns them.
+            time: [N] s since their episodes began.
+            generators: One for each of them, a new one at every step.
+
+        Returns:
+            [N, 4].
+        """
+
+
+@dataclass(frozen=True)
+class LoopChanges:
+    """Everything that a perturbation changes between the sensors of an ego, its driver and its vehicle.
+
+    Attributes:
+        readings: Change of each sensor's readings, by the name of the sensor.
+        state: Changes of what the driver knows of its own state, in order.
+        commands: Changes of its commands, in order.
+    """
+
+    readings: Mapping[str, ReadingChange] = field(default_factory=dict)
+    state: Sequence[StateChange] = ()
+    commands: Sequence[CommandChange] = ()
+
+
+@runtime_checkable
+class CommandedSimulator(Protocol):
+    """A simulator whose step has two halves, so that the commands that it plans itself can be changed in between."""
+
+    def set_controls(self, controls: npt.ArrayLike) -> None:
+        """Set the commands of agents that are driven from outside, as `Simulator.step` takes them."""
+
+    def plan(self) -> None:
+        """Decide the commands of all agents that the simulator drives itself."""
+
+    def planned_controls(self) -> F32:
+        """Return the commands that were planned: [B, A, 4] throttle, brake, steer, reverse."""
+
+    def set_planned_controls(self, controls: F32) -> None:
+        """Replace the commands that were planned, [B, A, 4]."""
+
+    def advance(self) -> None:
+        """Move all agents by their commands."""

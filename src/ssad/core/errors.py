@@ -67,7 +67,19 @@ class FormatError(SSADError):
     """A data file that is broken, malicious or in another format."""
 
 
-LISTED = ("suite", "kind", "scenario", "generator", "system", "detector", "recipe", "shift", "attack", "town")
+LISTED = (
+    "suite",
+    "kind",
+    "scenario",
+    "generator",
+    "system",
+    "detector",
+    "recipe",
+    "perturbation",
+    "shift",
+    "attack",
+    "town",
+)
 """What `ssad list` can list, in the singular: `ssad list suites` and so on."""
 
 

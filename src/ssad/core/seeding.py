@@ -7,6 +7,7 @@ parts count with their types: 1, 1.0, True and "1" are four keys.
 from __future__ import annotations
 
 import hashlib
+import re
 
 import numpy as np
 
@@ -47,3 +48,13 @@ def generator(*key: object) -> np.random.Generator:
         A generator whose draws are independent of those of any other key (Philox, the key as its key).
     """
     return np.random.Generator(np.random.Philox(key=int(digest(*key)[:32], 16)))
+
+
+def file_name(name: str) -> str:
+    """Return a name as the name of a file.
+
+    Characters other than letters, digits, ., @ and - become -, followed by a hash that keeps names apart which differ
+    only in them.
+    """
+    safe_name = re.sub(r"[^\w.@-]", "-", name)
+    return safe_name if safe_name == name else f"{safe_name}-{digest(name)[:6]}"

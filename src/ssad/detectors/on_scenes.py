@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ssad.core.detections import Detections, Solids, Truth
+from ssad.core.detections import Detections, Solids, Truth, to_images
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES, MMDET3D_CLASSES
@@ -47,12 +47,6 @@ class SampleBoxes:
 
     token: str
     boxes: DetectedBoxes
-
-
-def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tensor:
-    """uint8 RGB [H, W, 3] of one size as float [B, 3, H, W] in [0, 1] on the device."""
-    stacked = torch.from_numpy(np.stack(pictures)).to(device)
-    return stacked.permute(0, 3, 1, 2).float() / 255
 
 
 def to_host(found: Sequence[Detections]) -> list[Detections]:

@@ -19,6 +19,7 @@ from ssad.engine.kind import Kind, SuiteBase
 
 KINDS: dict[str, str] = {
     "driving": "ssad.experiments.driving.kind:Driving",
+    "perception": "ssad.experiments.perception.kind:Perception",
     "detection": "ssad.experiments.perception.shifts.kind:Detection",
     "digital": "ssad.experiments.perception.digital.kind:Digital",
     "physical": "ssad.experiments.perception.physical.kind:Physical",

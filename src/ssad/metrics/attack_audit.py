@@ -41,7 +41,7 @@ class Attempt:
         draws: Bootstrap replicates of the score, paired between attempts.
         before: Mean of the ascended loss before the attack.
         after: Mean of the ascended loss after the attack.
-        gradient_error: See `ssad.experiments.perception.digital.attacked_scenes`, as for the next three.
+        gradient_error: See `ssad.scenarios.static.digital.scene_attacker`, as for the next three.
         coupling: Relative change of an image's loss by the rest of its batch.
         used: Share of the budget that is used.
         change: Largest distance of a stored image from the clean one.

@@ -11,7 +11,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ssad.core import safeio
-from ssad.core.driving import Driver, Perturbation, Sensor, Simulator
+from ssad.core.driving import Driver, LoopChanges, ReadingChange, Sensor, Simulator
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import quiet_warp
@@ -165,7 +165,7 @@ def drive(
     device: str,
     driver: Driver | None = None,
     sensors: Mapping[str, Sensor] | None = None,
-    perturbation: Mapping[str, Perturbation] | None = None,
+    perturbation: LoopChanges | Mapping[str, ReadingChange] | None = None,
     key: Callable[[Order], str] = attrgetter("key"),
 ) -> tuple[list[Episode], list[EpisodeTrace], Mapping[str, Any]]:
     """Episodes and traces of orders that share a system and a simulator, run as one batch.
@@ -178,7 +178,7 @@ def drive(
         device: Where the world computes.
         driver: Who drives; None: the system that the orders name.
         sensors: What drivers may ask for; None: `onboard_sensors`.
-        perturbation: What changes the pictures that drivers get; see `ssad.world.rollout.rollout`.
+        perturbation: Changes between sensors, driver and vehicle; see `ssad.world.rollout.rollout`.
         key: Of the episodes, on which the noise of sensors depends; traces have those of their orders.
     """
     from ssad.drivers import make_system

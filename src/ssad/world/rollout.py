@@ -11,11 +11,14 @@ import numpy.typing as npt
 from ssad.core.driving import (
     Believer,
     Choice,
+    CommandedSimulator,
     Driver,
+    LoopChanges,
     NoteKeeper,
-    Perturbation,
+    Observation,
     Planner,
     Policies,
+    ReadingChange,
     Scenes,
     Selector,
     Sensor,
@@ -30,6 +33,8 @@ from ssad.world.observation import observe
 from ssad.world.sensors import SENSORS
 
 Drivers = Mapping[int | Selector, Driver]
+Changes = LoopChanges | ReadingChange | Mapping[str, ReadingChange]
+"""Changes of a loop: of readings, own state and commands; of all images; or of the readings of the named sensors."""
 _AGENT = ("x", "y", "yaw", "speed", "active")
 
 
@@ -43,12 +48,13 @@ class Loop:
         drivers: Driver by agent number, or by a selector that chooses at every step the agents that its driver
             controls; agents that it no longer chooses are returned. Agents without a driver follow their episode.
         sensors: Sensors in addition to `ssad.world.sensors`; only requested ones are computed.
-        perturbation: Changes the images ([N, C, H, W]) that drivers receive; a mapping applies to the sensors it
-            names.
+        perturbation: Changes between sensors, drivers and vehicles. A mapping changes the readings of the sensors it
+            names; a single change applies to all images ([N, C, H, W]).
         policies: Makes the drivers that episodes name (`EpisodeAgent.policy`); `drivers` take precedence.
 
     Raises:
-        ConfigError: A driver does not fit the simulator or requests an unknown sensor, or `policies` is missing.
+        ConfigError: A driver does not fit the simulator or requests an unknown sensor, `policies` is missing, or the
+            simulator lets nobody change the commands that it plans.
     """
 
     def __init__(
@@ -57,7 +63,7 @@ class Loop:
         drivers: Drivers,
         *,
         sensors: Mapping[str, Sensor] | None = None,
-        perturbation: Perturbation | Mapping[str, Perturbation] | None = None,
+        perturbation: Changes | None = None,
         policies: Policies | None = None,
     ) -> None:
         self.simulator = simulator
@@ -69,7 +75,15 @@ class Loop:
                 )
             self.drivers.append((_told_to(simulator, name, len(self.drivers)), policies(name)))
         self.sensors = SENSORS | dict(sensors or {})
-        self.perturbation = perturbation
+        self._image_change = None if isinstance(perturbation, LoopChanges | Mapping | None) else perturbation
+        if isinstance(perturbation, LoopChanges):
+            self._changes = perturbation
+        else:
+            self._changes = LoopChanges(perturbation if isinstance(perturbation, Mapping) else {})
+        if self._changes.commands and not isinstance(simulator, CommandedSimulator):
+            raise ConfigError(
+                f"{type(simulator).__name__} plans and moves in one step: its commands cannot be changed; use World"
+            )
         shape = (simulator.batch, simulator.agents)
         for target, driver in self.drivers:
             if isinstance(target, int) and not 0 <= target < simulator.agents:
@@ -160,7 +174,35 @@ class Loop:
             if isinstance(driver, Believer) and agents is not None:
                 assert state is not None
                 self._believe(driver, state, agents)
-        self.simulator.step(self._controls if has_controls else None)
+        if self._changes.commands:
+            self._step_with_changed_commands(has_controls)
+        else:
+            self.simulator.step(self._controls if has_controls else None)
+
+    def _step_with_changed_commands(self, has_controls: bool) -> None:
+        """Advance all scenes by one step in which the commands of the egos are changed on their way."""
+        simulator = self.simulator
+        assert isinstance(simulator, CommandedSimulator)
+        egos = np.stack([np.arange(simulator.batch), np.zeros(simulator.batch, int)], 1).astype(np.int32)
+        state = simulator.state()
+        simulator.plan()
+        planned = simulator.planned_controls()
+        is_external = simulator.state().controller[:, 0] == Controller.EXTERNAL
+        controls = np.where(is_external[:, None], self._controls[:, 0], planned[:, 0]).astype(np.float32)
+        for number, change in enumerate(self._changes.commands):
+            generators = self._generators(("command", number), state, egos)
+            controls = np.asarray(change.command(controls, state.time.astype(np.float32), generators), np.float32)
+            if controls.shape != (simulator.batch, 4) or not np.isfinite(controls).all():
+                raise ConfigError(
+                    f"{type(change).__name__}.command returned shape {controls.shape} or a number that is not finite; "
+                    f"expected ({simulator.batch}, 4) finite numbers: throttle, brake, steer, reverse"
+                )
+        planned[:, 0] = controls
+        simulator.set_planned_controls(planned)
+        if has_controls or is_external.any():
+            self._controls[:, 0] = np.where(is_external[:, None], controls, self._controls[:, 0])
+            simulator.set_controls(self._controls)
+        simulator.advance()
 
     def _choose(self, who: Selector, state: WorldState) -> tuple[Bool, WorldState]:
         """Whom a selector chooses [B, A], and the state after it has noted what it remembers and removed whom it does.
@@ -184,7 +226,7 @@ class Loop:
         assert isinstance(self.simulator, Planner)
         ended = self.simulator.ended() != End.RUNNING
         readings = self._readings(driver, state, egos)
-        belief = driver.believe(observe(state, egos, ended, readings))
+        belief = driver.believe(self._observe(state, egos, ended, readings))
         readings.close()
         try:
             self.simulator.believe(belief, ~ended)
@@ -195,7 +237,7 @@ class Loop:
         """Return the controls [N, 3|4] of the agents; 0 where the episode has ended."""
         ended = self.simulator.ended() != End.RUNNING
         readings = self._readings(driver, state, agents)
-        controls = np.asarray(driver.act(observe(state, agents, ended, readings)), np.float32)
+        controls = np.asarray(driver.act(self._observe(state, agents, ended, readings)), np.float32)
         readings.close()
         if controls.ndim != 2 or controls.shape[0] != len(agents) or controls.shape[1] not in (3, 4):
             raise ConfigError(
@@ -211,21 +253,35 @@ class Loop:
         names = tuple(getattr(driver, "sensors", ()))
         return _Readings(names, lambda name: self._read(name, driver, state, agents))
 
+    def _observe(self, state: WorldState, agents: I32, ended: Bool, readings: _Readings) -> Observation:
+        """Return the observation of agents; egos know of their own state only what the changes leave."""
+        observation = observe(state, agents, ended, readings)
+        if self._changes.state and not agents[:, 1].any():
+            for number, change in enumerate(self._changes.state):
+                observation = change.observe(observation, self._generators(("state", number), state, agents))
+        return observation
+
     def _read(self, name: str, driver: Driver, state: WorldState, agents: I32) -> Any:
         reading = self.sensors[name](self.simulator, agents)
-        perturbation = self.perturbation.get(name) if isinstance(self.perturbation, Mapping) else self.perturbation
-        # Only images have four dimensions; other readings pass unchanged.
-        if perturbation is None or getattr(reading, "ndim", 0) != 4:
-            return reading
+        change = self._changes.readings.get(name)
+        if change is None:
+            # A change that names no sensor is one of images, and only they have four dimensions.
+            if self._image_change is None or getattr(reading, "ndim", 0) != 4:
+                return reading
+            change = self._image_change
+        generators = self._generators((name,), state, agents)
+        if hasattr(reading, "cpu"):  # images that stayed on a device
+            reading = reading.cpu().numpy()
+        return change.apply(reading, driver, state, generators)
+
+    def _generators(self, purpose: tuple[object, ...], state: WorldState, agents: I32) -> list[np.random.Generator]:
+        """Return a generator for each agent, seeded by what it is for: no result depends on the batch."""
         episodes, assigned = self.simulator.episodes, self.simulator.assigned
         generators = []
         for scene, agent in agents.tolist():
             episode, step = episodes[assigned[scene]], round(float(state.time[scene]) / self.simulator.dt)
-            # Seeded by what it applies to, so that the result does not depend on the batch.
-            generators.append(generator("perturbation", episode.key, episode.seed, name, agent, step))
-        if hasattr(reading, "cpu"):  # pictures that stayed on a device
-            reading = reading.cpu().numpy()
-        return perturbation.apply(reading, driver, state, generators)
+            generators.append(generator("perturbation", episode.key, episode.seed, *purpose, agent, step))
+        return generators
 
 
 class _Readings(Mapping[str, Any]):
@@ -300,7 +356,7 @@ def rollout(
     drivers: Drivers | Driver,
     *,
     sensors: Mapping[str, Sensor] | None = None,
-    perturbation: Perturbation | Mapping[str, Perturbation] | None = None,
+    perturbation: Changes | None = None,
     policies: Policies | None = None,
 ) -> list[EpisodeTrace]:
     """Drive all scenes of a simulator from their starts to their ends.
@@ -309,7 +365,7 @@ def rollout(
         simulator: `World(episodes, graphs)`, or another simulator.
         drivers: Drivers as `Loop` takes them; a single driver drives the egos.
         sensors: Sensors that drivers may request besides `ssad.world.sensors.SENSORS`.
-        perturbation: Changes the images that drivers receive; a mapping applies to the sensors it names.
+        perturbation: Changes between sensors, drivers and vehicles, as `Loop` takes them.
         policies: Makes the drivers that episodes name, such as `ssad.drivers.make_system`.
 
     Returns:

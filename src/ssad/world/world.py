@@ -358,6 +358,15 @@ class World:
         for command in self._plan:
             command.launch()
 
+    def planned_controls(self) -> F32:
+        """Return the controls that `plan` decided, [B, A, 4]: throttle, brake, steer, reverse."""
+        controls: F32 = self.array("control").copy()
+        return controls
+
+    def set_planned_controls(self, controls: F32) -> None:
+        """Replace the controls that `plan` decided, [B, A, 4], for the next `advance`."""
+        self.put("control", np.asarray(controls, np.float32))
+
     def advance(self) -> None:
         """Run the second half of a step: motion, contacts and the egos' records."""
         for command in self._advance:

@@ -6,9 +6,9 @@ The same drive gives metrics of the component, on the images of the driver itsel
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import Field
 
@@ -30,35 +30,27 @@ from ssad.experiments.gap.component_metrics import (
     sign_metrics,
 )
 from ssad.experiments.gap.drive_sheet import Seen, drive_film, drive_sheet
-from ssad.experiments.gap.loop_perturbations import (
-    LIGHT,
-    NONE,
-    TEXTURE,
-    family_of,
-    has_severities,
-    is_worn,
-    signs_of_route,
-    texture_version,
-    wearer,
-)
 from ssad.experiments.gap.perceiving_loop import PerceivingSystem, drive_perceiving, drive_repaired
 from ssad.experiments.gap.verdict import verdict
 from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
 from ssad.report.load import Run
 from ssad.report.tables import Table
+from ssad.scenarios.static.catalogue import NONE, PerturbationTable
+from ssad.scenarios.static.perturbation import EGO, Perturbation
+from ssad.scenarios.static.physical.textures.perturbation import signs_of_route
 from ssad.simulators.closed_loop import episode_of, system_version, town
 
 EVERY = 0.2  # s from one frame of a film to the next
 
 
-class GapSuite(ScenarioSuite):
+class GapSuite(ScenarioSuite, PerturbationTable):
     """Systems x scenarios x perturbations.
 
     Attributes:
         systems: Perceiving systems; names must differ.
         ceilings: Systems that receive the ground truth, without perturbations (`ssad list systems`).
-        perturbations: Names (docs/gap.md); "none" always runs.
-        severities: 1 to 5.
+        perturbations: Perturbations (docs/gap.md); the clean condition always runs.
+        severities: Severities 1 to 5 of the perturbations that set none of their own.
         repetitions: As in suites of kind driving.
         spread: As in suites of kind driving.
         sheets: Number of drives with pictures, collisions first.
@@ -69,14 +61,16 @@ class GapSuite(ScenarioSuite):
     kind: Literal["gap"] = "gap"
     systems: list[PerceivingSystem] = Field(min_length=1)
     ceilings: list[str] = Field(default=["autopilot", "line-of-sight"])
-    perturbations: list[str] = Field(default=[])
-    severities: list[int] = Field(default=[3], min_length=1)
     repetitions: int = Field(default=1, ge=1, le=100_000)
     spread: float = Field(default=1.0, ge=0, le=10, allow_inf_nan=False)
     timeout_s: float = Field(default=1200.0, gt=0, allow_inf_nan=False)
     chunk: int = Field(default=4, ge=1, le=4096)
     sheets: int = Field(default=6, ge=0)
     repair: bool = True
+
+    def beside(self, path: Path) -> Self:
+        """Return the suite with the files of scenarios and perturbations resolved."""
+        return super().beside(path).with_files_beside(path.parent)
 
 
 class Gap(ScenarioKind):
@@ -120,29 +114,27 @@ class Gap(ScenarioKind):
     def plan(self, suite: GapSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Look up names and build detectors once; with `check`, build each scenario once."""
         check_distinct(suite, "systems", [entry.name for entry in suite.systems] + suite.ceilings)
-        for name in suite.perturbations:
-            family_of(name)
-        if any(severity not in range(1, 6) for severity in suite.severities):
-            raise ConfigError(f"suite {suite.name}: severities are 1 to 5, not {suite.severities}")
         for system in suite.systems:
             system.check()
         versions = {entry.name: entry.version for entry in suite.systems}
         versions |= {name: system_version(name) for name in suite.ceilings}
         scenarios, towns = described(suite)
-        conditions = _conditions(suite)
+        conditions = conditions_of(suite)
+        targeted = [condition for condition in conditions if condition.needs_target]
         targets: dict[tuple[str, str], int | None] = {}
-        worn_perturbations = [name for name in suite.perturbations if is_worn(name)]
-        if check or worn_perturbations:
+        if check or targeted:
             for entry in scenarios:
-                episode = episode_of(self._cell(suite, entry, conditions[0], 0, ""))
-                for name in worn_perturbations:
-                    targets[name, entry.scenario.name] = wearer(name, episode, town(entry.scenario.town))
+                episode = episode_of(self._cell(suite, entry, conditions[0], 0, "", EGO))
+                for condition in targeted:
+                    assert condition.perturbation is not None
+                    agent = condition.perturbation.applies_to(episode, town(entry.scenario.town))
+                    targets[condition.title, entry.scenario.name] = agent
         cells = [
-            self._cell(suite, entry, condition, repetition, versions[_name(condition[0])], target)
+            self._cell(suite, entry, condition, repetition, versions[condition.system_name], target)
             for condition in conditions
             for entry in scenarios
-            for target in [targets.get((condition[1], entry.scenario.name))]
-            if target is not None or not is_worn(condition[1])
+            for target in [targets.get((condition.title, entry.scenario.name), None if condition.needs_target else EGO)]
+            if target is not None
             for repetition in range(suite.repetitions)
         ]
         return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
@@ -151,37 +143,42 @@ class Gap(ScenarioKind):
         self,
         suite: GapSuite,
         one: Described,
-        condition: tuple[str | PerceivingSystem, str, int],
+        condition: Condition,
         repetition: int,
         version: str,
-        worn_by: int | None = None,
+        target: int,
     ) -> Cell:
         """Return a cell.
 
         Its seed depends on the scenario and the repetition alone, so that all conditions meet the same drives.
         """
-        system, perturbation, severity = condition
+        system, perturbation = condition.system, condition.perturbation
         system_settings = None if isinstance(system, str) else system.model_dump(mode="json")
-        condition_text = f"{perturbation}-{severity}/" if perturbation != NONE else ""
-        family = family_of(perturbation)
-        texture = texture_version(perturbation) if family in (TEXTURE, LIGHT) else ""
+        condition_text = f"{condition.title}/" if perturbation is not None else ""
+        severity = 0 if perturbation is None else perturbation.severity
         return self.scenario_cell(
             suite,
             one,
             version,
             suite.seed,
-            texture,
-            system=_name(system),
+            "" if perturbation is None else perturbation.version(),
+            system=condition.system_name,
             chance=("episode", repetition),
-            title=f"{_name(system)}/{condition_text}{one.scenario.name}{f'#{repetition}' if repetition else ''}",
-            fields={"perturbation": perturbation, "severity": severity, "family": family},
+            title=(
+                f"{condition.system_name}/{condition_text}{one.scenario.name}{f'#{repetition}' if repetition else ''}"
+            ),
+            fields={
+                "perturbation": NONE if perturbation is None else perturbation.name,
+                "severity": severity,
+                "family": NONE if perturbation is None else perturbation.family,
+            },
             repetition=repetition,
             spread=suite.spread if repetition else 0.0,
             settings=system_settings,
-            perturbation=perturbation,
+            perturbation=condition.entry,
             severity=severity,
             repair=suite.repair and system_settings is not None,
-            **({"wearer": worn_by} if is_worn(perturbation) else {}),
+            target=target,
         )
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
@@ -192,7 +189,7 @@ class Gap(ScenarioKind):
     def alike(self, cell: Cell) -> Hashable:
         """Return town and condition: the street of a batch is then built once."""
         spec = cell.spec
-        return spec["scenario"]["town"], cell.system, spec["perturbation"], spec["severity"], spec.get("wearer")
+        return spec["scenario"]["town"], cell.system, cell.fields["perturbation"], spec["severity"], spec["target"]
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drive the episodes as one batch, and measure component and system."""
@@ -230,11 +227,9 @@ class Gap(ScenarioKind):
         recorded = load_trace(folder / record["artefacts"]["trace"])
         spec, graph = cell.spec, town(recorded.town)
         # The clean drive shows what the perturbation alone changes.
-        clean = replace(
-            cell, spec={name: value for name, value in spec.items() if name != "wearer"} | {"perturbation": NONE}
-        )
+        clean = replace(cell, spec={**spec, "perturbation": None})
         drives, replayed_traces = [], []
-        for driven_cell in [cell] if spec["perturbation"] == NONE else [clean, cell]:
+        for driven_cell in [cell] if spec["perturbation"] is None else [clean, cell]:
             _, (trace,), perception = drive_perceiving(
                 [driven_cell], device=plan.device, seed=plan.suite.seed, every=EVERY
             )
@@ -242,7 +237,7 @@ class Gap(ScenarioKind):
             if perception is not None:
                 images = perception.shots(0)
                 title = (
-                    f"{spec['perturbation']} {spec['severity']}"
+                    f"{cell.fields['perturbation']} {spec['severity']}"
                     if driven_cell is cell and spec["severity"]
                     else "clean"
                 )
@@ -272,18 +267,54 @@ class Gap(ScenarioKind):
         return verdict(run)
 
 
-def _name(system: str | PerceivingSystem) -> str:
-    return system if isinstance(system, str) else system.name
+@dataclass(frozen=True)
+class Condition:
+    """A system under a perturbation.
+
+    Attributes:
+        system: The perceiving system, or the name of a ceiling.
+        perturbation: The perturbation; None: clean.
+        entry: The perturbation as the suite writes it.
+    """
+
+    system: str | PerceivingSystem
+    perturbation: Perturbation | None = None
+    entry: Any = None
+
+    @property
+    def system_name(self) -> str:
+        """Name of the system."""
+        return self.system if isinstance(self.system, str) else self.system.name
+
+    @property
+    def title(self) -> str:
+        """Perturbation and severity, such as "fog-3"."""
+        return NONE if self.perturbation is None else f"{self.perturbation.name}-{self.perturbation.severity}"
+
+    @property
+    def needs_target(self) -> bool:
+        """True if the perturbation needs an agent, or a sign, to be on."""
+        return self.perturbation is not None and self.perturbation.needs_target
 
 
-def _conditions(suite: GapSuite) -> list[tuple[str | PerceivingSystem, str, int]]:
-    """Return system, perturbation, severity; ceilings first, then each system clean and perturbed."""
-    conditions: list[tuple[str | PerceivingSystem, str, int]] = [(name, NONE, 0) for name in suite.ceilings]
+def conditions_of(suite: GapSuite) -> list[Condition]:
+    """Return the conditions of a suite: ceilings first, then each system clean and perturbed.
+
+    Raises:
+        SSADError: A perturbation cannot be made, or appears twice.
+    """
+    try:
+        suite.conditions()
+    except ConfigError as error:
+        raise type(error)(f"suite {suite.name}: {error}") from None
+    made = [
+        (perturbation, entry.model_dump(mode="json"))
+        for entry in suite.perturbations
+        for perturbation in entry.at(suite.severities)
+    ]
+    conditions = [Condition(name) for name in suite.ceilings]
     for system in suite.systems:
-        conditions.append((system, NONE, 0))
+        conditions.append(Condition(system))
         if not system.perfect:
-            names = [name for name in dict.fromkeys(suite.perturbations) if name != NONE]
-            for name in names:
-                severities = dict.fromkeys(suite.severities) if has_severities(name) else [1]
-                conditions += [(system, name, severity) for severity in severities]
+            conditions += [Condition(system, perturbation, entry) for perturbation, entry in made]
     return conditions

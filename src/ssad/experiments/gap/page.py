@@ -21,7 +21,7 @@ from ssad.report.tables import METHODS, Cell, Row, Table
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
-STEPS = re.compile(r"^(attack-.*)-[0-9]+$")  # attack-pgd-2 is of the family attack-pgd
+SETTINGS = re.compile(r"\?.*$|(?<=^attack-)(.*)-[0-9]+$")  # pgd?steps=2 (once attack-pgd-2) is a kind of pgd
 
 Line = Mapping[str, Any]
 Condition = tuple[str, str, int]
@@ -55,7 +55,8 @@ SIZE, MARGIN = 360, 46
 COLOURS = {
     "fault": "var(--s1)",
     "shift": "var(--s0)",
-    "attack": "var(--s2)",
+    "digital": "var(--s2)",
+    "attack": "var(--s2)",  # of runs before version 0.2
     "texture": "var(--s3)",
     "light": "var(--s4)",
 }
@@ -144,7 +145,7 @@ def rank_table(run: Run) -> Table:
     perturbed = [condition for condition in conditions(run) if condition[2]]
     for system in dict.fromkeys(condition[0] for condition in perturbed):
         system_conditions = [condition for condition in perturbed if condition[0] == system]
-        families = [STEPS.sub(r"\1", condition[1]) for condition in system_conditions]
+        families = [SETTINGS.sub(r"\1", condition[1]) for condition in system_conditions]
         for component_metric in ("AP", "target_recall"):
             component_losses = [-change(run, entry, component_metric).mean for entry in system_conditions]
             cells = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -21,11 +21,11 @@ from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.signs import SignReading, sign_labels
 from ssad.drivers.perceiving.tracker import Tracking, tracking_of
 from ssad.experiments.gap.component_metrics import Watcher
-from ssad.experiments.gap.loop_perturbations import LIGHT, family_of, perturbed, worn
+from ssad.experiments.gap.other_drives import images_of_other_drives
 from ssad.metrics import episode_metrics
-from ssad.rendering.hours import at_hour
-from ssad.rendering.onboard import DAY, Onboard
-from ssad.scenarios.static.physical.lights.loop import hour_of
+from ssad.rendering.sensor_suite import SensorSuite
+from ssad.scenarios.static.catalogue import parse_perturbation
+from ssad.scenarios.static.perturbation import Perturbation
 from ssad.simulators.closed_loop import Order, drive
 
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
@@ -149,7 +149,7 @@ def drive_perceiving(
 
     Args:
         orders: What is to be driven; their specs say settings (of a `PerceivingSystem`; None: another driver),
-            perturbation, severity, and for a texture its wearer.
+            perturbation, severity, and the agent that it is on.
         device: Where the world and the cameras compute.
         seed: Of the perturbations.
         repair: What mends one error of the driver.
@@ -161,13 +161,23 @@ def drive_perceiving(
     system = PerceivingSystem.model_validate(spec["settings"])
     watcher = Watcher(front(system.width, system.cameras), len(orders), every)
     driver = system.make(watcher, repair=repair, device=device)
-    name, severity = spec["perturbation"], spec["severity"]
-    agent_edit = worn(name, spec["wearer"], severity=severity, seed=seed) if "wearer" in spec else None
-    weather = at_hour(DAY, hour_of(name)) if family_of(name) == LIGHT else DAY
-    onboard = Onboard(weather=weather, device=device, resident=True, attack=agent_edit)
-    sensors, changes = perturbed(onboard, driver.cameras, name, severity, detector=driver.detector, seed=seed)
-    driven = drive(orders, device=device, key=_paired, driver=driver, sensors=sensors, perturbation=changes)
+    suite = SensorSuite(
+        cameras=driver.cameras,
+        device=device,
+        other_images=lambda camera, count: images_of_other_drives(camera, count, device),
+    )
+    perturbation = perturbation_of(spec)
+    if perturbation is not None:
+        suite = perturbation.in_loop(suite, target=spec["target"], victim=driver.detector, seed=seed)
+    driven = drive(orders, device=device, key=_paired, driver=driver, sensors=suite.build(), perturbation=suite.changes)
     return *driven[:2], watcher
+
+
+def perturbation_of(spec: Mapping[str, Any]) -> Perturbation | None:
+    """Return the perturbation of a cell, from its plain data; None for a clean one."""
+    if spec["perturbation"] is None:
+        return None
+    return parse_perturbation(spec["perturbation"]).make(spec["severity"])
 
 
 def drive_repaired(

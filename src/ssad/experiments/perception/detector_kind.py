@@ -25,8 +25,8 @@ from ssad.engine.progress import Live
 from ssad.engine.replay import difference
 from ssad.engine.run import hash_artefacts
 from ssad.experiments.perception.scene_boxes import (
-    Condition,
     Examination,
+    SceneCondition,
     boxes_path,
     find_boxes,
     forget_failures,
@@ -59,11 +59,11 @@ class DetectorKind(Kind):
     patience = 2
 
     @abstractmethod
-    def scenes(self, cell: Cell, job: Job) -> Sequence[Condition]:
+    def scenes(self, cell: Cell, job: Job) -> Sequence[SceneCondition]:
         """Return the scenes of a cell, each under its condition."""
 
     @abstractmethod
-    def condition(self, data: Any) -> Condition:
+    def condition(self, data: Any) -> SceneCondition:
         """Return a scene under its condition from the plain data of a piece."""
 
     @abstractmethod
@@ -136,7 +136,7 @@ class DetectorKind(Kind):
         folders = sorted({str(boxes_path(Path(), cell.system, scene).parent) for scene in scenes})
         return self.score(examination, cell, scenes, job) | {"artefacts": {"detections": folders}}
 
-    def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
+    def score(self, examination: Examination, cell: Cell, scenes: Sequence[SceneCondition], job: Job) -> dict[str, Any]:
         """Return the record of a cell whose boxes are there."""
         return score_scenes(examination, cell.system, scenes, replicates=job.settings["replicates"])
 
@@ -150,7 +150,6 @@ class DetectorKind(Kind):
             with NuScenes(root, suite.version) as data:
                 version = data.version
         first_detector = next(iter(plan.details.items()))
-        settings = self.settings(suite)
         examination = Examination(
             folder,
             root,
@@ -159,7 +158,6 @@ class DetectorKind(Kind):
             suite.seed,
             plan.device,
             1,
-            settings.get("calibration", "physical"),
         )
         make_picture, caption = self.sheet(examination, suite)
         if not path.is_file():
@@ -208,6 +206,5 @@ def _examination(job: Job) -> Examination:
         settings["seed"],
         job.device,
         settings["threads"],
-        settings.get("calibration", "physical"),
         defended,
     )

@@ -6,31 +6,28 @@ A condition is the treatment of the images: none, a shift, or a digital attack.
 from __future__ import annotations
 
 import io
-import re
+import math
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ssad.core import safeio
 from ssad.core.boxes import size_columns
-from ssad.core.detections import Detections, Solids
 from ssad.core.errors import FormatError, SSADError
 from ssad.core.machine import keep_memory, quiet_warp
-from ssad.core.seeding import digest, generator
+from ssad.core.seeding import digest, file_name, generator
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors import make_detector
-from ssad.detectors.check import promises
 from ssad.detectors.image_scores import (
     PictureBoxes,
     PictureTruth,
@@ -39,14 +36,15 @@ from ssad.detectors.image_scores import (
     picture_figures,
     read_picture_truth,
 )
+from ssad.detectors.monitored import Watched
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes
-from ssad.detectors.on_scenes import AT_ONCE, Look, SampleBoxes, detect_with, match_boxes, numbers, to_host
+from ssad.detectors.on_scenes import AT_ONCE, SampleBoxes, detect_with, match_boxes, numbers
 from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.digital.defences import Defence, Defended
-from ssad.scenarios.static.shifts import Calibration, ShiftSpec
-from ssad.scenarios.static.shifts.scene_shifter import SceneShifter
+from ssad.scenarios.static.perturbation import Look, Perturbation, PerturbedScene, RecordedScene
 
 FOLDER = "detections"
+CAMERAS = 6  # of a sample, as nuScenes has them
 _FLAT = ("camera", "box", "score", "label")  # of 2D detectors
 _COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label", "attribute")  # as nuScenes has them
 
@@ -62,7 +60,6 @@ class Examination:
         seed: of the random numbers.
         device: device of detectors, shifts and attacks.
         threads: of linear algebra.
-        calibration: of the shifts.
         defended: systems that are a detector behind a defence: name -> the detector's name and the defence. All
             other systems are detectors.
     """
@@ -74,78 +71,74 @@ class Examination:
     seed: int
     device: str
     threads: int
-    calibration: Calibration = "physical"
     defended: Mapping[str, tuple[str, Defence]] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
-class Shown:
-    """Presentation of a scene to detectors.
+@dataclass(frozen=True, slots=True)
+class SceneCondition:
+    """One scene under one perturbation.
 
     Attributes:
-        look: returns the images of camera frames; None: the unmodified files.
-        notes: plain data for the file of boxes, complete after the last image.
-        ahead: whether the next images may be made while a detector processes these.
-        at_once: samples per call on a GPU.
-        done: called when the boxes are written.
+        scene: Name of the scene.
+        perturbation: The perturbation; None: the clean scene.
+        source: Name of the attacked system; "": the perturbation attacks none.
+        batch: Camera images that may be computed at once on a GPU.
     """
 
-    look: Look | None = None
-    notes: Callable[[], Mapping[str, Any]] = field(default=dict)
-    ahead: bool = True
-    at_once: int = AT_ONCE
-    done: Callable[[], None] = lambda: None
-
-
-class Condition(Protocol):
-    """One scene under one condition.
-
-    Attributes:
-        scene: name of the scene.
-        name: place of its boxes below the folder of a detector: CONDITION/SCENE.
-    """
-
-    @property
-    def scene(self) -> str:
-        """Name of the scene."""
+    scene: str
+    perturbation: Perturbation | None = None
+    source: str = ""
+    batch: int = 12
 
     @property
     def name(self) -> str:
         """Place of its boxes below the folder of a detector: CONDITION/SCENE."""
+        condition = "clean" if self.perturbation is None else self.perturbation.folder
+        return f"{condition}{f'@{file_name(self.source)}' if self.source else ''}/{self.scene}"
 
-    def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
-        """Return the presentation of the scene to these detectors."""
+    def present(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> PerturbedScene:
+        """Return the scene as these detectors receive it: all of them the same images.
+
+        A failure of the attacked system is recorded, with its reason, as one of all systems that need the images.
+        """
+        if self.perturbation is None:
+            return PerturbedScene()
+        victim = None
+        if self.source:
+            victim = next((detector for detector in detectors if detector.name == self.source), None)
+            victim = victim or Watched(system_of(examination, self.source), self.source)
+        presentation = self.perturbation.on_scene(recorded_scene(examination, data, self), victim)
+        if victim is not None and presentation.look is not None:
+            presentation.look = _passing_failures(presentation.look, victim, detectors)
+        return presentation
 
 
-@dataclass(frozen=True, slots=True)
-class ShiftedScene:
-    """One scene under one shift (None: clean) at one severity ("random": drawn by sample)."""
+def recorded_scene(examination: Examination, data: NuScenes, condition: SceneCondition) -> RecordedScene:
+    """Return the recorded scene of a condition."""
+    return RecordedScene(
+        examination.root,
+        examination.version,
+        data.scene(condition.scene),
+        examination.seed,
+        examination.device,
+        condition.batch,
+        # Only on a CPU does an image take so long that a stopped run should keep it.
+        examination.folder if examination.device == "cpu" else None,
+        examination.detectors,
+    )
 
-    shift: str | None
-    severity: int | str
-    scene: str
 
-    @property
-    def name(self) -> str:
-        """Place of the boxes of this shift, severity and scene below the folder of a detector."""
-        return f"{'clean' if self.shift is None else f'{self.shift}-{self.severity}'}/{self.scene}"
+def _passing_failures(look: Look, victim: Watched, detectors: Sequence[Watched]) -> Look:
+    """Return a function of images after which a failure of the victim is one of all detectors."""
 
-    def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
-        """Return the shifted images, the same for all detectors, and note how often the shift was applied."""
-        shifter = shifter_of(examination, data, self)
-        if shifter is None:
-            return Shown()
-        applied_counts: Counter[str] = Counter()
+    def look_and_pass(frames: Sequence[SensorFrame]) -> Sequence[U8]:
+        images = look(frames)
+        for detector in detectors:
+            if victim.reason and detector is not victim and not detector.reason:
+                detector.reason = f"the attack on {victim.name} failed: {victim.reason}"
+        return images
 
-        def look(frames: Sequence[SensorFrame]) -> Sequence[U8]:
-            device = None if examination.device == "cpu" else examination.device
-            images, reports = shifter.images(frames, device=device)
-            applied_counts.update("applied" if report.applied else "not applied" for report in reports)
-            for report in reports:
-                applied_counts.update({f"skipped: {reason}": int(count) for reason, count in report.skipped.items()})
-            return images
-
-        return Shown(look, lambda: applied_counts)
+    return look_and_pass
 
 
 def detector_of(name: str, weights: str, device: str) -> Any:
@@ -153,80 +146,9 @@ def detector_of(name: str, weights: str, device: str) -> Any:
     return make_detector(name, weights=weights or None, device=device)
 
 
-def boxes_path(folder: Path, detector: str, scene: Condition) -> Path:
+def boxes_path(folder: Path, detector: str, scene: SceneCondition) -> Path:
     """Return the path of the boxes of a detector: detections/DETECTOR/CONDITION/SCENE.npz."""
     return folder / FOLDER / file_name(detector) / f"{scene.name}.npz"
-
-
-def file_name(name: str) -> str:
-    """A name as a file's: what is no letter, digit, ., @ or - becomes -, and then a hash keeps names apart."""
-    safe_name = re.sub(r"[^\w.@-]", "-", name)
-    # The hash keeps names apart that differ only in replaced characters.
-    return safe_name if safe_name == name else f"{safe_name}-{digest(name)[:6]}"
-
-
-class Watched:
-    """Detector whose failure is a result: after an error or a broken promise it returns no more detections.
-
-    Exhausted memory and a lost device are raised. Detections are on the host.
-
-    Attributes:
-        name: of the system.
-        reason: reason of its failure, in one line; "" while it works.
-    """
-
-    def __init__(self, detector: Any, name: str = "") -> None:
-        self.detector, self.name, self.reason = detector, name, ""
-
-    @property
-    def task(self) -> str:
-        """Task of the detector."""
-        return str(getattr(self.detector, "task", "3d"))
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Classes of the detector."""
-        return tuple(self.detector.classes)
-
-    def predict(
-        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
-    ) -> list[Detections]:
-        """Return the detector's predictions, or empty ones after a failure."""
-        if not self.reason:
-            try:
-                detections = to_host(self.detector.predict(images, intrinsic, threshold=threshold))
-                self.reason = self._broken(detections, len(images))
-                if not self.reason:
-                    return detections
-            except Exception as error:  # whatever a stranger's detector raises
-                self.failed(error)
-        empty_floats, empty_integers = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
-        solid = None
-        if self.task != "2d":
-            solid = Solids(
-                empty_floats.reshape(0, 3),
-                empty_floats.reshape(0, 3),
-                empty_floats,
-                empty_floats.reshape(0, 2),
-                empty_integers,
-            )
-        return [Detections(empty_floats, empty_integers, empty_floats.reshape(0, 4), solid)] * len(images)
-
-    def failed(self, error: Exception) -> None:
-        """Record an error of the detector; raise it if memory is exhausted or the device is lost."""
-        if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA error" in str(error):
-            raise error
-        text = " ".join(str(error).split())
-        self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
-
-    def _broken(self, found: Sequence[Detections], images: int) -> str:
-        if len(found) != images:
-            return "broken promise: predict answers for each image"
-        for single in found:
-            for is_kept, promise in promises(single, classes=len(self.detector.classes), three=self.task != "2d"):
-                if not is_kept:
-                    return f"broken promise: {promise}"
-        return ""
 
 
 @lru_cache(maxsize=8)
@@ -251,17 +173,7 @@ def system_of(examination: Examination, name: str) -> Any:
     return detector if defence is None else Defended(detector, defence)
 
 
-def shifter_of(examination: Examination, data: NuScenes, scene: ShiftedScene) -> SceneShifter | None:
-    """The scene through its shift; None for the clean one."""
-    if scene.shift is None:
-        return None
-    is_random = scene.severity == "random"
-    severity = 1 if is_random else int(scene.severity)
-    spec = ShiftSpec(scene.shift, severity, seed=examination.seed, calibration=examination.calibration)
-    return SceneShifter(examination.root, data.scene(scene.scene), spec, random=is_random)
-
-
-def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[str]) -> None:
+def find_boxes(examination: Examination, scene: SceneCondition, detectors: Sequence[str]) -> None:
     """Write the boxes that detectors find in a scene, unless the files exist.
 
     The file of a detector that fails, or breaks a promise, contains the reason instead of boxes. Exhausted memory
@@ -276,7 +188,7 @@ def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[s
         return
     with NuScenes(examination.root, examination.version) as dataset:
         monitored = [Watched(system_of(examination, name), name) for name in missing_names]
-        presentation = scene.shown(examination, dataset, monitored)
+        presentation = scene.present(examination, dataset, monitored)
         detector_objects: list[Any] = list(monitored)
         boxes_by_detector = detect_with(
             detector_objects,
@@ -285,7 +197,7 @@ def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[s
             device=examination.device,
             look=presentation.look,
             ahead=presentation.ahead,
-            at_once=presentation.at_once,
+            at_once=max(AT_ONCE, math.ceil(presentation.images_at_once / CAMERAS)),
         )
     for name, samples, monitored_detector in zip(missing_names, boxes_by_detector, monitored, strict=True):
         _write(
@@ -393,7 +305,12 @@ def sum_applied(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def score_scenes(
-    examination: Examination, detector: str, scenes: Sequence[Condition], *, replicates: int, notes: Sum = sum_applied
+    examination: Examination,
+    detector: str,
+    scenes: Sequence[SceneCondition],
+    *,
+    replicates: int,
+    notes: Sum = sum_applied,
 ) -> dict[str, Any]:
     """Return the metrics of a detector over scenes whose boxes exist, for a record.
 
@@ -423,7 +340,7 @@ def truth_of(examination: Examination, scenes: Sequence[str]) -> GroundTruth:
 
 
 def read_scenes(
-    examination: Examination, detector: str, scenes: Sequence[Condition]
+    examination: Examination, detector: str, scenes: Sequence[SceneCondition]
 ) -> tuple[list[Any], list[dict[str, Any]]]:
     """Read the boxes of a system in scenes, and the notes of each.
 

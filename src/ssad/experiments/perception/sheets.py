@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
+from ssad.core.detections import to_images
 from ssad.core.images import read_image
 from ssad.core.machine import quiet_warp
 from ssad.core.types import U8
@@ -17,21 +19,21 @@ from ssad.datasets.nuscenes.camera_truth import camera_truth, scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.detectors.drawing import FOUND, TRUE, draw_flat, draw_solids
-from ssad.detectors.on_scenes import to_images
-from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, Watched, detector_of, shifter_of
+from ssad.detectors.monitored import Watched
+from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, detector_of, recorded_scene
+from ssad.scenarios.static.perturbation import Perturbation
 from ssad.scenarios.static.shifts import KNOWN
 
 WIDTH, COLUMNS, LEAST, STRONG = 640, 3, 0.3, 3
 
 
-def detection_sheet(examination: Examination, split: str, shifts: Sequence[str], severity: int) -> U8:
-    """Draw one moment, clean and under each shift, with the boxes of the first detector and the true ones.
+def detection_sheet(examination: Examination, split: str, perturbations: Sequence[Perturbation]) -> U8:
+    """Draw one moment, clean and under each perturbation, with the boxes of the first detector and the true ones.
 
     Args:
         examination: data, detector, device.
         split: split that provides the moment with most objects.
-        shifts: names.
-        severity: of all shifts.
+        perturbations: of recorded scenes.
 
     Returns:
         Image [H, W, 3], RGB.
@@ -45,10 +47,12 @@ def detection_sheet(examination: Examination, split: str, shifts: Sequence[str],
     with NuScenes(examination.root, examination.version) as dataset:
         scene, frame = richest(dataset, scenes_of(dataset, split))
         tiles = [tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]
-        for shift in shifts:
-            shifter = shifter_of(examination, dataset, ShiftedScene(shift, severity, scene.record.name))
-            assert shifter is not None
-            tiles.append(tile(detector, scene, frame, shifter.image(frame)[0], title=shift))
+        for perturbation in perturbations:
+            condition = SceneCondition(scene.record.name, perturbation)
+            recorded = replace(recorded_scene(examination, dataset, condition), folder=None)
+            presentation = perturbation.on_scene(recorded, detector[0])
+            assert presentation.look is not None
+            tiles.append(tile(detector, scene, frame, presentation.look([frame])[0], title=perturbation.name))
     while len(tiles) % COLUMNS:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[start : start + COLUMNS], 1) for start in range(0, len(tiles), COLUMNS)]

@@ -11,13 +11,9 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import GroundTruth
 from ssad.detectors.image_scores import match_pictures
 from ssad.experiments.perception.digital.attack_scores import Match, by_distance, target_success, worst_of
-from ssad.experiments.perception.digital.attack_tally import sum_members
-from ssad.experiments.perception.digital.attacked_scenes import AttackSpec
-from ssad.experiments.perception.digital.chosen_object import chosen_places
 from ssad.experiments.perception.scene_boxes import (
-    Condition,
     Examination,
-    ShiftedScene,
+    SceneCondition,
     find_boxes,
     picture_truth_of,
     read_scenes,
@@ -26,10 +22,18 @@ from ssad.experiments.perception.scene_boxes import (
     system_of,
     truth_of,
 )
+from ssad.scenarios.static.digital.chosen_object import chosen_places
+from ssad.scenarios.static.digital.spec import AttackSpec
+from ssad.scenarios.static.digital.tally import sum_members
 
 
 def attack_record(
-    examination: Examination, system: str, specs: Sequence[AttackSpec], scenes: Sequence[Condition], *, replicates: int
+    examination: Examination,
+    system: str,
+    specs: Sequence[AttackSpec],
+    scenes: Sequence[SceneCondition],
+    *,
+    replicates: int,
 ) -> dict[str, Any]:
     """Return the metrics of a system under an attack, and the cost and effect of the attack.
 
@@ -44,7 +48,7 @@ def attack_record(
         ConfigError: The attack is about an object that these scenes do not have.
     """
     scorer = Eye(examination, system)
-    clean_scenes = [ShiftedScene(None, 0, condition.scene) for condition in scenes[: len(scenes) // max(len(specs), 1)]]
+    clean_scenes = [SceneCondition(condition.scene) for condition in scenes[: len(scenes) // max(len(specs), 1)]]
     # The clean boxes are a by-product of other cells; missing ones are found now.
     for condition in clean_scenes:
         find_boxes(examination, condition, [system])
@@ -108,7 +112,7 @@ class Eye:
         return {} if self.flat else by_distance(boxes, truth)
 
 
-def _places(examination: Examination, spec: AttackSpec, scenes: Sequence[Condition]) -> dict[str, F64] | None:
+def _places(examination: Examination, spec: AttackSpec, scenes: Sequence[SceneCondition]) -> dict[str, F64] | None:
     """Return the position of the attacked object by sample; None if more than one is attacked.
 
     Raises:

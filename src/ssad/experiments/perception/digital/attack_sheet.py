@@ -12,9 +12,11 @@ from ssad.core.types import U8
 from ssad.datasets.drawing import title_on
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.experiments.perception.digital.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
-from ssad.experiments.perception.scene_boxes import Examination, Watched, detector_of
+from ssad.detectors.monitored import Watched
+from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, detector_of, recorded_scene
 from ssad.experiments.perception.sheets import WIDTH, richest, tile
+from ssad.scenarios.static.digital.scene_attacker import SceneAttacker
+from ssad.scenarios.static.digital.spec import AttackSpec
 
 
 def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpec]) -> U8:
@@ -40,8 +42,8 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
         for spec in [None, *specs]:
             monitored, image = Watched(detector), clean
             if spec is not None:
-                attacker = SceneAttacker(AttackedScene(spec, scene.record.name), examination, scene, monitored)
-                (image,) = attacker.look([frame])
+                recorded = recorded_scene(examination, dataset, SceneCondition(scene.record.name))
+                (image,) = SceneAttacker(spec, recorded, monitored).look([frame])
                 if monitored.reason:
                     continue
             title = "clean" if spec is None else f"{spec.attack}, loss {spec.loss}, {spec.radius:g} px {spec.norm}"

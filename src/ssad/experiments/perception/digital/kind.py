@@ -19,7 +19,6 @@ from ssad.experiments.perception.detector_kind import DetectorKind, DetectorSuit
 from ssad.experiments.perception.digital import page
 from ssad.experiments.perception.digital.attack_record import attack_record
 from ssad.experiments.perception.digital.attack_sheet import attack_sheet
-from ssad.experiments.perception.digital.attacked_scenes import AttackedScene, AttackSpec
 from ssad.experiments.perception.digital.points import (
     AttackTable,
     bystander_points,
@@ -31,10 +30,12 @@ from ssad.experiments.perception.digital.points import (
     transfers_of,
 )
 from ssad.experiments.perception.digital.verdict import verdict
-from ssad.experiments.perception.scene_boxes import Condition, Examination, ShiftedScene, boxes_path
+from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, boxes_path
 from ssad.experiments.perception.scored_data import data_of, detectors_of
 from ssad.report.load import Run
 from ssad.report.tables import Table
+from ssad.scenarios.static.digital.perturbation import DigitalAttack
+from ssad.scenarios.static.digital.spec import AttackSpec
 from ssad.scenarios.static.digital.universal import UniversalFit
 
 
@@ -112,10 +113,10 @@ class Digital(DetectorKind):
         settings = super().prepare(plan, folder, resources, retry=retry)
         job, images = Job(folder, plan.device, settings), settings["images"]
         passes_by_scene: dict[str, Any] = {
-            f"{scene.source}/{scene.name}": scene.spec.passes_in(images[scene.scene])
+            f"{scene.source}/{scene.name}": scene.perturbation.spec.passes_in(images[scene.scene])
             for cell in plan.cells
             for scene in self.scenes(cell, job)
-            if isinstance(scene, AttackedScene)
+            if isinstance(scene.perturbation, DigitalAttack)
         }
         detector_count = len(plan.details)
         text = (
@@ -129,7 +130,7 @@ class Digital(DetectorKind):
         """Return the priority of a cell: clean first, then the rows of the table, then the curves."""
         return 0 if not cell.spec["attacks"] else 1 if cell.fields["row"] else 2
 
-    def scenes(self, cell: Cell, job: Job) -> list[Condition]:
+    def scenes(self, cell: Cell, job: Job) -> list[SceneCondition]:
         """Return the scenes of a cell under its attack; of an ensemble those of one member after another."""
         towns: dict[str, list[str]] = {}
         for scene in job.settings["scenes"]:
@@ -137,10 +138,10 @@ class Digital(DetectorKind):
         selected = {scene for town_scenes in towns.values() for scene in town_scenes[: cell.spec["scenes"] or None]}
         scenes = [scene for scene in job.settings["scenes"] if scene in selected]
         if not cell.spec["attacks"]:
-            return [ShiftedScene(None, 0, scene) for scene in scenes]
+            return [SceneCondition(scene) for scene in scenes]
         batch, source = job.settings["batch"], cell.spec["source"]
         specs = [AttackSpec.of_row(row) for row in cell.spec["attacks"]]
-        return [AttackedScene(spec, scene, batch, source) for spec in specs for scene in scenes]
+        return [SceneCondition(scene, DigitalAttack(spec), source, batch) for spec in specs for scene in scenes]
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """Return the scenes whose boxes are still to be found.
@@ -150,19 +151,21 @@ class Digital(DetectorKind):
         """
         found: dict[str, Any] = {}
         for scene in self.scenes(cell, job):
-            clean = ShiftedScene(None, 0, scene.scene)
+            clean = SceneCondition(scene.scene)
             if not boxes_path(job.folder, cell.system, clean).is_file():
                 found[clean.name] = {"scene": scene.scene}
-            if isinstance(scene, AttackedScene) and not boxes_path(job.folder, cell.system, scene).is_file():
-                piece = {"scene": scene.scene, "batch": scene.batch, "source": scene.source, **scene.spec.row}
+            attack = scene.perturbation
+            if isinstance(attack, DigitalAttack) and not boxes_path(job.folder, cell.system, scene).is_file():
+                piece = {"scene": scene.scene, "batch": scene.batch, "source": scene.source, **attack.spec.row}
                 found[f"{scene.source}/{scene.name}"] = piece
         return found
 
-    def condition(self, data: Any) -> Condition:
+    def condition(self, data: Any) -> SceneCondition:
         """Return the attacked or clean scene of a piece."""
         if "attack" not in data:
-            return ShiftedScene(None, 0, data["scene"])
-        return AttackedScene(AttackSpec.of_row(data), data["scene"], data["batch"], data["source"])
+            return SceneCondition(data["scene"])
+        attack = DigitalAttack(AttackSpec.of_row(data))
+        return SceneCondition(data["scene"], attack, data["source"], data["batch"])
 
     def settings(self, suite: DigitalSuite) -> dict[str, Any]:
         """Return the batch size and the defended detectors."""
@@ -184,7 +187,7 @@ class Digital(DetectorKind):
             },
         }
 
-    def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
+    def score(self, examination: Examination, cell: Cell, scenes: Sequence[SceneCondition], job: Job) -> dict[str, Any]:
         """Return the metrics, the cost of the attack, and the share of the system's clean mAP that is lost."""
         specs = [AttackSpec.of_row(row) for row in cell.spec["attacks"]]
         return attack_record(examination, cell.system, specs, scenes, replicates=job.settings["replicates"])

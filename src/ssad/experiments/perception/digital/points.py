@@ -12,11 +12,11 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.schema import Schema
-from ssad.experiments.perception.digital.attacked_scenes import AttackSpec, takes
 from ssad.scenarios.static.digital import default_loss, make_objective
 from ssad.scenarios.static.digital.budget import Norm
 from ssad.scenarios.static.digital.defences import make_defence
 from ssad.scenarios.static.digital.objectives import UNDIVIDED
+from ssad.scenarios.static.digital.spec import AttackSpec, takes
 from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.scenarios.static.digital.victim import Precision
 

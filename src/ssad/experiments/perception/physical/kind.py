@@ -13,8 +13,9 @@ from ssad.core.checkpoints import state_hash
 from ssad.core.errors import ConfigError
 from ssad.core.machine import keep_memory, quiet_warp
 from ssad.detectors import make_detector
-from ssad.engine.kind import Cell, CellError, Column, Job, Kind, Plan, Resources, SuiteBase, find_cell
+from ssad.engine.kind import Cell, Column, Job, Kind, Plan, Resources, SuiteBase, find_cell
 from ssad.engine.progress import Live
+from ssad.experiments.perception.kind import check_floor
 from ssad.experiments.perception.physical import page
 from ssad.experiments.perception.physical.lit_images import LitPictures
 from ssad.experiments.perception.physical.target_attacks import TargetAttacks, see_all
@@ -23,7 +24,7 @@ from ssad.experiments.perception.physical.target_table import CLEAN, GRID, Targe
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.experiments.perception.physical.verdict import verdict
 from ssad.experiments.runs import read_plan
-from ssad.metrics.target_attacks import Sighting, precision, sightings, target_scores
+from ssad.metrics.target_attacks import Sighting, sightings, target_scores
 from ssad.metrics.target_grid import grid_scores
 from ssad.recorders.target_images import record_all
 from ssad.rendering.target import class_of_target, parse_target
@@ -165,13 +166,9 @@ class Physical(Kind):
         if cell.fields["attack"] == CLEAN:
             scores = target_scores(clean_sightings, **bootstrap_options)
             return scores | (grid_scores(images.rows(), clean_sightings, None, floor=floor) if grid else {})
-        # An attack cannot hide a target that the detector does not find anyway.
-        clean_precision = round(precision(clean_sightings) or 0.0, 6)
-        if clean_precision < floor:
-            hour_text = f" ({light['hour']})" if light else ""
-            target_name = class_of_target(parse_target(settings["target"])).replace("_", " ")
-            finding = f"{detector} finds the clean {target_name}{hour_text} with AP50 {clean_precision:.3f}"
-            raise CellError(f"{finding}, which is less than the floor of {floor:g}")
+        hour_text = f" ({light['hour']})" if light else ""
+        target_name = class_of_target(parse_target(settings["target"])).replace("_", " ")
+        clean_precision = check_floor(clean_sightings, floor, f"{detector} finds the clean {target_name}{hour_text}")
         if lit_images:
             spec = LightSpec.of_row(light or {})
             attacked_images, attack_fields = attacks.under(lit_images, spec), partial(attacks.about_light, spec)

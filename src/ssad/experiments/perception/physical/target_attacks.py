@@ -24,7 +24,6 @@ from ssad.experiments.perception.physical.lit_images import LitPictures
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
-from ssad.metrics.target_attacks import TOGETHER
 from ssad.recorders.target_recording import Clips
 from ssad.rendering.camera.scene import Decal, Layer
 from ssad.rendering.camera.scene_edit import SceneEdit
@@ -34,6 +33,7 @@ from ssad.scenarios.static.physical.lights import LitView, Target
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec
 from ssad.scenarios.static.physical.textures.carrier import covered
 from ssad.scenarios.static.physical.textures.folder import TextureFolder
+from ssad.scenarios.static.physical.textures.perturbation import worn
 from ssad.scenarios.static.physical.textures.printing import conspicuousness
 
 
@@ -93,16 +93,8 @@ class TargetAttacks:
         )
 
     def worn(self, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Drive, picture and truth of clips under a texture."""
-        colour = albedo_of(self.texture(spec)).to(self.device)  # may be trained now, so gradients are on
-        remaining = clips.wearing(surface_of(self.target, spec.surface))
-        # One at a time on the CPU: the bits of an image must not depend on its batch.
-        while batch := list(islice(remaining, 1 if self.device == "cpu" else TOGETHER)):
-            prepared_images = [view.picture for _, view in batch]
-            with torch.no_grad():
-                images = prepared_images[0].together(prepared_images, {0: colour.expand(len(batch), *colour.shape)})
-            for (drive, view), image in zip(batch, torch.split(images, 1), strict=True):
-                yield drive, image, view.truth
+        """Yield drive, image and truth of recorded images under a texture, which is trained now if necessary."""
+        return worn(clips, albedo_of(self.texture(spec)), surface_of(self.target, spec.surface))
 
     def about(self, spec: TextureSpec) -> dict[str, Any]:
         """Return the record of a texture: its file, the distance of its colours from the paint, and its training."""

@@ -14,7 +14,7 @@ from ssad.engine.kind import Cell, Job, Names, Plan
 from ssad.experiments.perception.detector_kind import DetectorKind, DetectorSuite
 from ssad.experiments.perception.scene_boxes import (
     Examination,
-    ShiftedScene,
+    SceneCondition,
     boxes_path,
 )
 from ssad.experiments.perception.scored_data import data_of, detectors_of
@@ -23,7 +23,8 @@ from ssad.experiments.perception.shifts import page
 from ssad.experiments.perception.shifts.verdict import verdict
 from ssad.report.load import Run
 from ssad.report.tables import Table
-from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, Calibration, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts.perturbation import Shift
 
 Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
 
@@ -88,28 +89,32 @@ class Detection(DetectorKind):
         """Return the scenes whose boxes are still to be found."""
         scenes = self.scenes(cell, job)
         missing = [scene for scene in scenes if not boxes_path(job.folder, cell.system, scene).is_file()]
-        return {scene.name: [scene.shift, scene.severity, scene.scene] for scene in missing}
+        calibration = cell.spec["calibration"]
+        return {
+            scene.name: [cell.fields["shift"], getattr(scene.perturbation, "severity", 0), calibration, scene.scene]
+            for scene in missing
+        }
 
-    def scenes(self, cell: Cell, job: Job) -> list[ShiftedScene]:
+    def scenes(self, cell: Cell, job: Job) -> list[SceneCondition]:
         """Return the scenes of a cell under its shift.
 
         A severity dealt to a scene is one of the five: its boxes are shared with that cell.
         """
         tokens: Mapping[str, str] = job.settings["scenes"]
-        shift, severity = cell.fields["shift"], cell.fields["severity"]
-        if shift is None or severity != "random" or cell.spec["calibration"] == "paper":
-            return [ShiftedScene(shift, severity, scene) for scene in tokens]
-        spec = ShiftSpec(shift, seed=cell.seed, calibration=cell.spec["calibration"])
+        shift, severity, calibration = cell.fields["shift"], cell.fields["severity"], cell.spec["calibration"]
+        if shift is None or severity != "random" or calibration == "paper":
+            return [shifted_scene(shift, severity, calibration, scene) for scene in tokens]
+        spec = ShiftSpec(shift, seed=cell.seed, calibration=calibration)
         severity_by_token = dealt_severities(spec, tokens.values())
-        return [ShiftedScene(shift, severity_by_token[token], scene) for scene, token in tokens.items()]
+        return [shifted_scene(shift, severity_by_token[token], calibration, scene) for scene, token in tokens.items()]
 
-    def condition(self, data: Any) -> ShiftedScene:
+    def condition(self, data: Any) -> SceneCondition:
         """Return the shifted scene of a piece."""
-        return ShiftedScene(*data)
+        return shifted_scene(*data)
 
     def settings(self, suite: DetectionSuite) -> dict[str, Any]:
-        """Return the calibration of the shifts."""
-        return {"calibration": suite.calibration}
+        """Return no further settings."""
+        return {}
 
     def sheet(
         self, examination: Examination, suite: DetectionSuite, cell: Cell | None = None
@@ -126,7 +131,8 @@ class Detection(DetectorKind):
             f"What {examination.detectors[0][0]} finds (orange, score at least 0.3) and what is there (white), clean "
             f"and under each shift at severity {severity}."
         )
-        return lambda: detection_sheet(examination, suite.split, shifts, severity), caption
+        perturbations = [Shift(shift, severity, suite.calibration) for shift in shifts]
+        return lambda: detection_sheet(examination, suite.split, perturbations), caption
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
         """Return the page of a run and its tables."""
@@ -139,3 +145,8 @@ class Detection(DetectorKind):
     def verdict(self, run: Run) -> list[str]:
         """Return the findings of a run in sentences."""
         return verdict(run)
+
+
+def shifted_scene(shift: str | None, severity: int | str, calibration: Calibration, scene: str) -> SceneCondition:
+    """Return a scene under a shift at a severity; None: the clean scene."""
+    return SceneCondition(scene, None if shift is None else Shift(shift, severity, calibration))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from ssad.core.types import F32, F64, I32, U8, Episode
 from ssad.rendering.onboard import OnboardCamera, Sight
 from ssad.scenarios.static.shifts import ShiftSpec, shift_images, sky_light
 from ssad.scenarios.static.shifts.anomaly import place_objects
-from ssad.scenarios.static.shifts.spec import KNOWN
+from ssad.scenarios.static.shifts.perturbation import OwnShift
 from ssad.world.models import MODELS
-
-LOOP_SHIFTS: Final = tuple(KNOWN)
 
 
 class ShiftedCamera:
@@ -56,18 +54,26 @@ class ShiftedCamera:
                 for row, agent_view in enumerate(batch)
             ]
             episodes = [simulator.episodes[simulator.assigned[scene]] for scene in scenes]
-            self._learn(batch, frames, images, episodes)
-            device = self.camera.onboard.device  # where it is fast: pictures and depths were brought to the host
-            shifted, _ = shift_images(images, frames, self.spec, contexts=self._contexts, device=device)
+            shifted = self._shifted(batch, frames, images, episodes)
             shifted_images[[agent_view.row for agent_view in batch]] = shifted
         return np.moveaxis(shifted_images, -1, 1)
+
+    def _shifted(self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]) -> U8:
+        """Return the images [N, H, W, 3] under the shift."""
+        self._learn(sights, frames, images, episodes)
+        device = self.camera.onboard.device  # images and depths are on the host, but the kernels are fast there
+        shifted: U8 = shift_images(images, frames, self.spec, contexts=self._contexts, device=device)[0]
+        return shifted
+
+    @property
+    def _needs_boxes(self) -> bool:
+        """True if the shift uses the boxes of objects, which take time to build."""
+        return self.spec.family == "object" or self.spec.places_objects
 
     def _frame(self, sight: Sight, depth: Any, speed: F32, dt: float) -> Frame:
         key, step = sight.looks.key, sight.moment.step
         sample = f"{key}/{step}/{sight.agent}/{self.camera.camera.channel}"
-        # Boxes are built only for the shifts that use them.
-        needs_boxes = self.spec.family == "object" or self.spec.places_objects
-        boxes, ego_velocity = boxes_of(sight, speed) if needs_boxes else (TrackedBoxes.empty(), np.zeros(3))
+        boxes, ego_velocity = boxes_of(sight, speed) if self._needs_boxes else (TrackedBoxes.empty(), np.zeros(3))
         return Frame(self.camera.camera, key, sample, step * dt, sight.pose, ego_velocity, boxes, depth=depth)
 
     def _learn(self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]) -> None:
@@ -79,6 +85,34 @@ class ShiftedCamera:
                 if self.spec.places_objects:
                     objects = place_objects(self.spec, frame.scene, _route(episode), [frame.boxes])
                 self._contexts[frame.scene] = SceneContext(frame.scene, light, heading, objects=objects)
+
+
+class OwnShiftedCamera(ShiftedCamera):
+    """Camera that agents carry, with its images under a shift of the user's own.
+
+    Args:
+        camera: The camera.
+        shift: The shift.
+        seed: Root of its random numbers.
+    """
+
+    def __init__(self, camera: OnboardCamera, shift: OwnShift, seed: int) -> None:
+        super().__init__(camera, ShiftSpec("uniform", 0))
+        self.shift, self.seed = shift, seed
+
+    @property
+    def _needs_boxes(self) -> bool:
+        """True: nothing is known of what the shift uses."""
+        return True
+
+    def _shifted(self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]) -> U8:
+        """Return the images [N, H, W, 3] under the shift, each by itself: no result depends on the batch."""
+        return np.stack(
+            [
+                self.shift.shifted(image[None], [frame], self.seed)[0]
+                for image, frame in zip(images, frames, strict=True)
+            ]
+        )
 
 
 def boxes_of(sight: Sight, speed: F32) -> tuple[TrackedBoxes, F64]:

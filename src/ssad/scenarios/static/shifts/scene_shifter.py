@@ -274,6 +274,12 @@ class SceneShifter:
             return self._frame(frame, boxes)
         return self._frame(frame, boxes, self._points(frame), self._depth(frame))
 
+    def described(self, frame: SensorFrame) -> Frame:
+        """Return the description of an image with all that is known of it: boxes, depth, LiDAR returns."""
+        return self._frame(
+            frame, boxes_of(self.scene.annotations_of(frame))[0], self._points(frame), self._depth(frame)
+        )
+
     def read(self, frame: SensorFrame) -> U8:
         """Return the clean image.
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ssad.core.errors import unknown_name
+from ssad.core.registry import make, names, resolve
 from ssad.core.schema import checked
 from ssad.scenarios.static.physical.lights.flashlight import Flashlight
 from ssad.scenarios.static.physical.lights.laser import Laser
@@ -23,20 +24,22 @@ LIGHTS: dict[str, Callable[..., Shadow | Laser | Projector | Flashlight]] = {
 }
 
 
-def make_light(name: str, options: Mapping[str, Any]) -> Shadow | Laser | Projector | Flashlight:
+def make_light(name: str, options: Mapping[str, Any]) -> Any:
     """Create a light attack by name.
 
     Args:
-        name: Key of `LIGHTS`.
+        name: Key of `LIGHTS`, entry point of the group `ssad.lights`, or "module:object" of a `LightAttack`.
         options: Fields that differ from the defaults.
 
     Raises:
         UnknownNameError: There is no such attack.
         ConfigError: An option is unknown or has an invalid value.
     """
-    if name not in LIGHTS:
+    if name in LIGHTS:
+        return checked(LIGHTS[name], options, what=f"attack {name}")
+    if ":" not in name and name not in names("light", {}):
         raise unknown_name("light attack", name, LIGHTS)
-    return checked(LIGHTS[name], options, what=f"attack {name}")
+    return make("light", name, resolve("light", {}, name), options, ("ranges", "edit"))
 
 
 __all__ = [

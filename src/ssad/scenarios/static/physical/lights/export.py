@@ -57,7 +57,8 @@ class Shining:
         length, width, height = (upper - lower).tolist()
         target = Target(length, width, height)
         if not isinstance(light, Projector):
-            return light.edit(self.values, target)
+            edit: SceneEdit = light.edit(self.values, target)
+            return edit
         if self.colour is None:
             raise ConfigError(f"{self.attack}: there is no picture that it shows")
         return light.edit(self.colour, target)

@@ -137,10 +137,11 @@ class LightFolder:
             else:
                 values = random_settings(attack, target, key=(self.seed, spec.number))
                 record = {"values": values, "queries": 0}
-            record["lumens"] = attack.power(record["values"])  # type: ignore[arg-type]
+            record["lumens"] = attack.power(record["values"])
             _write(path, record)
         values, _ = self.found(spec)
-        return attack.edit(values, target)
+        edit: SceneEdit = attack.edit(values, target)
+        return edit
 
     def found(self, spec: LightSpec) -> tuple[dict[str, float], Tensor | None]:
         """Load the settings of a finished attack; for a projector none, but its image [3, H, W] in sRGB."""

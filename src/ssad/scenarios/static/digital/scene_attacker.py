@@ -1,4 +1,4 @@
-"""A scene whose camera images a digital attack has changed, each by itself, and the cost of the attack.
+"""Attacks on the camera images of a recorded scene, each image by itself, and their cost.
 
 The images are made against one system, the source, and may be shown to others as well: to other detectors
 (transfer), or to the same detector behind a defence that the attack does not know.
@@ -6,17 +6,15 @@ The images are made against one system, the source, and may be shown to others a
 
 from __future__ import annotations
 
-import inspect
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Self, TypeVar
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ssad.core.detections import Truth
+from ssad.core.detections import Truth, to_images
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -24,200 +22,21 @@ from ssad.core.types import U8
 from ssad.datasets.nuscenes.camera_truth import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
-from ssad.detectors.on_scenes import AT_ONCE, to_images
-from ssad.experiments.perception.digital.attack_tally import Tally
-from ssad.experiments.perception.digital.chosen_object import chosen_first
-from ssad.experiments.perception.digital.saved_images import FOLDER, SavedPictures
-from ssad.experiments.perception.scene_boxes import Examination, Shown, Watched, file_name, system_of
-from ssad.scenarios.static.digital import (
-    ATTACKS,
-    Aim,
-    Attack,
-    Budget,
-    make_attack,
-    make_objective,
-    px,
-    run_attack,
-)
-from ssad.scenarios.static.digital.budget import LEVELS, Norm
+from ssad.scenarios.static.digital import Attack, Budget, make_objective, px, run_attack
+from ssad.scenarios.static.digital.budget import LEVELS
+from ssad.scenarios.static.digital.chosen_object import chosen_first
 from ssad.scenarios.static.digital.defences import RandomResize
 from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
+from ssad.scenarios.static.digital.saved_images import SavedPictures
+from ssad.scenarios.static.digital.spec import AttackSpec
+from ssad.scenarios.static.digital.tally import Tally
 from ssad.scenarios.static.digital.transfer import translate
 from ssad.scenarios.static.digital.universal import UniversalFit
-from ssad.scenarios.static.digital.victim import NothingToAttackError, Precision, Victim, steady
+from ssad.scenarios.static.digital.victim import NothingToAttackError, Victim, steady
+from ssad.scenarios.static.perturbation import RecordedScene, SceneVictim
 
-CAMERAS = 6  # of a sample, as nuScenes has them
 _INSPECTED: dict[tuple[Any, ...], tuple[float | None, float | None]] = {}  # of this process
-
-
-@dataclass(frozen=True, slots=True)
-class AttackSpec:
-    """Attack with all its settings.
-
-    Attributes:
-        attack: name (`ssad list attacks`).
-        loss: objective of the ascent.
-        norm: of the budget.
-        radius: of the budget, in 8-bit code values.
-        options: further settings of the attack, such as ("steps", 10), in order of their names.
-        classes: names of the attacked classes; empty: all.
-        becomes: (class, target class of its objects); empty: any other.
-        draws: draws of a random defence that the attack knows, over which it ascends the mean loss; 0: it knows
-            none.
-        object: attacked object of each moment (see `ssad.experiments.perception.digital.chosen_object`); "": all.
-        precision: of the gradients.
-    """
-
-    attack: str
-    loss: str
-    norm: Norm
-    radius: float
-    options: tuple[tuple[str, Any], ...] = ()
-    classes: tuple[str, ...] = ()
-    becomes: tuple[tuple[str, str], ...] = ()
-    draws: int = 0
-    object: str = ""
-    precision: Precision = "float32"
-
-    @classmethod
-    def of_row(cls, row: Mapping[str, Any]) -> Self:
-        """Rebuild a spec from its `row`, in which JSON has turned tuples into lists; further keys are ignored."""
-        values = {name: row[name] for name in cls.__slots__}
-        pairs = {name: tuple((key, value) for key, value in values[name]) for name in ("options", "becomes")}
-        return cls(**{**values, **pairs, "classes": tuple(values["classes"])})
-
-    @property
-    def row(self) -> dict[str, Any]:
-        """Plain data."""
-        return asdict(self)
-
-    @property
-    def name(self) -> str:
-        """Such as "pgd-full-linf-5-steps10"; it distinguishes specs and can be a file name."""
-        name_parts = [
-            self.attack,
-            self.loss,
-            self.norm,
-            f"{self.radius:g}",
-            *(f"{key}{value}" for key, value in self.options),
-            *self.classes,
-            *(f"{source_class}-to-{target_class}" for source_class, target_class in self.becomes),
-            *([f"draws{self.draws}"] if self.draws else []),
-            *([f"object-{self.object}"] if self.object else []),
-            *([self.precision] if self.precision != "float32" else []),
-        ]
-        return file_name("-".join(name_parts))
-
-    @property
-    def steps(self) -> int:
-        """Steps of gradient ascent: the option, 1 for a white-box attack without it, else 0."""
-        steps_option = dict(self.options).get("steps")
-        return int(steps_option) if steps_option is not None else int(self.make().access == "white-box")
-
-    @property
-    def aim(self) -> Aim:
-        """Attacked objects, and their target classes."""
-        return Aim(self.classes or None, (0,) if self.object else None, dict(self.becomes))
-
-    @property
-    def wanted(self) -> tuple[str, ...]:
-        """Names of the classes whose objects are attacked; empty: all."""
-        return tuple(source_class for source_class, _ in self.becomes) or self.classes
-
-    @property
-    def target(self) -> str:
-        """Attacked objects and their target classes in words: "nearest car", "car to bus"; "": all."""
-        changes = [f"{source_class} to {target_class}" for source_class, target_class in self.becomes]
-        return " ".join(filter(None, [self.object, ", ".join(changes or self.classes)]))
-
-    @property
-    def passes(self) -> int:
-        """Forward and backward passes per image."""
-        restarts = int(dict(self.options).get("restarts", 0))
-        return self.steps * (1 + restarts) * max(self.draws, 1) if self.make().access == "white-box" else 0
-
-    def passes_in(self, images: int) -> int:
-        """Return the forward and backward passes for all images of a scene."""
-        attack = self.make()
-        return attack.passes if isinstance(attack, UniversalFit) else self.passes * images
-
-    def make(self) -> Attack:
-        """Build the attack.
-
-        Raises:
-            UnknownNameError: unknown attack.
-            ConfigError: it refuses a setting.
-        """
-        attack: Attack = make_attack(self.attack, **dict(self.options))
-        return attack
-
-
-def takes(attack: str, option: str) -> bool:
-    """Return True if a built-in attack has an option.
-
-    Args:
-        attack: name.
-        option: name of a setting, such as "steps".
-
-    Raises:
-        UnknownNameError: unknown attack.
-    """
-    from ssad.core.registry import resolve
-
-    factory = resolve("attack", ATTACKS, attack)
-    return callable(factory) and option in inspect.signature(factory).parameters
-
-
-@dataclass(frozen=True, slots=True)
-class AttackedScene:
-    """One scene under one attack on one system; see `ssad.experiments.perception.scene_boxes.Condition`.
-
-    Attributes:
-        spec: the attack.
-        scene: name of the scene.
-        batch: camera images at once on a GPU; on the CPU it is one.
-        source: name of the attacked system.
-    """
-
-    spec: AttackSpec
-    scene: str
-    batch: int = 12
-    source: str = ""
-
-    @property
-    def name(self) -> str:
-        """Place of the boxes of this attack, source and scene below the folder of a detector."""
-        return f"{self.spec.name}{f'@{file_name(self.source)}' if self.source else ''}/{self.scene}"
-
-    def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
-        """Return the attacked images: all systems see the same ones, which are made once, against the source.
-
-        A missing or wrong gradient of the source is recorded, with its reason, as a failure of all cells that need
-        the images.
-        """
-        source = next((detector for detector in detectors if detector.name == self.source), None)
-        if source is None:
-            source = Watched(system_of(examination, self.source), self.source)
-        saved_pictures = SavedPictures(examination.folder / FOLDER / self.name) if examination.device == "cpu" else None
-        attacker = SceneAttacker(self, examination, data.scene(self.scene), source, saved_pictures)
-
-        def look(frames: Sequence[SensorFrame]) -> list[U8]:
-            images = attacker.look(frames)
-            for shown_detector in detectors:
-                if source.reason and shown_detector is not source and not shown_detector.reason:
-                    shown_detector.reason = f"the attack on {self.source} failed: {source.reason}"
-            return images
-
-        # enough pictures at once to fill a batch, of one sample's cameras or of several
-        samples_per_call = max(AT_ONCE, math.ceil(self.batch / CAMERAS))
-        return Shown(
-            look,
-            attacker.tally.notes,
-            ahead=False,
-            at_once=samples_per_call,
-            done=saved_pictures.forget if saved_pictures else _nothing,
-        )
 
 
 @dataclass(slots=True)
@@ -228,32 +47,32 @@ class SceneAttacker:
     image.
 
     Attributes:
-        view: The scene and its attack.
-        examination: Data, device, seed.
-        scene: The data.
+        spec: The attack.
+        recorded: The scene, its data set, device and seed.
         watched: The attacked system; it stores its own errors.
+        source: Name of the attacked system; "": images for a sheet, whose attack was checked elsewhere.
         saved: Storage of images until the scene is finished; None: no storage.
         attack: The attack with its settings.
         tally: Cost of the attack.
         batch: Images at once; it shrinks if memory does not suffice.
     """
 
-    view: AttackedScene
-    examination: Examination
-    scene: SceneData
-    watched: Watched
+    spec: AttackSpec
+    recorded: RecordedScene
+    watched: SceneVictim
+    source: str = ""
     saved: SavedPictures | None = None
     attack: Attack = field(init=False)
     tally: Tally = field(init=False)
     batch: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.attack = self.view.spec.make()
+        self.attack = self.spec.make()
         defence = getattr(self.watched.detector, "defence", None)
-        if self.view.spec.draws and isinstance(defence, RandomResize):
-            self.attack = Expected(self.attack, defence, self.view.spec.draws)
+        if self.spec.draws and isinstance(defence, RandomResize):
+            self.attack = Expected(self.attack, defence, self.spec.draws)
         self.tally = Tally(self.attack.access)
-        self.batch = 1 if self.examination.device == "cpu" else self.view.batch
+        self.batch = 1 if self.recorded.device == "cpu" else self.recorded.batch
 
     def look(self, frames: Sequence[SensorFrame]) -> list[U8]:
         """Return the attacked images of camera frames; the clean ones once the detector has failed.
@@ -280,14 +99,14 @@ class SceneAttacker:
         return images
 
     def _read(self, frame: SensorFrame) -> U8:
-        return read_image(self.examination.root / frame.filename)
+        return read_image(self.recorded.root / frame.filename)
 
     def _truth(self, frame: SensorFrame, scene: SceneData | None = None) -> Truth:
         """Return the truth of a frame, with the labels of the attacked detector; other classes are left out.
 
         If one object is attacked it comes first; a frame without it is empty.
         """
-        scene, spec = scene or self.scene, self.view.spec
+        scene, spec = scene or self.recorded.data, self.spec
         visible_annotations = scene.annotations(frame.sample_token)
         if spec.object:
             visible_annotations = chosen_first(scene, frame, spec.object, spec.wanted)
@@ -324,7 +143,7 @@ class SceneAttacker:
         if saved_pictures and (stored := saved_pictures.read(frames[0].token)):
             self.tally.absorb(stored[1])
             return [stored[0]]
-        spec = self.view.spec
+        spec = self.spec
         budget = Budget(px(spec.radius), spec.norm)
         images, intrinsics = self._tensors(frames, pictures)
         truth = [self._truth(frame) for frame in frames]
@@ -346,7 +165,7 @@ class SceneAttacker:
             intrinsic=intrinsics[active],
             check=False,
             precision=spec.precision,
-            keys=[(self.examination.seed, frames[row].token) for row in active],
+            keys=[(self.recorded.seed, frames[row].token) for row in active],
         )
         batch_tally = Tally(self.attack.access)
         batch_tally.add(attacked, active_images, budget)
@@ -360,14 +179,14 @@ class SceneAttacker:
 
     def _tensors(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> tuple[Tensor, Tensor]:
         """Images [B, 3, H, W] and intrinsics [B, 3, 3] on the device."""
-        device = self.examination.device
+        device = self.recorded.device
         intrinsics = np.stack([np.asarray(frame.intrinsic, np.float32) for frame in frames])
         return to_images(pictures, device), torch.from_numpy(intrinsics).to(device)
 
     def _attackable(self, images: Tensor, lens: Tensor, truth: Sequence[Truth]) -> list[int]:
         """Images in which there is something to attack, for this loss: in any batch the same."""
-        aim = self.view.spec.aim
-        if not make_objective(self.view.spec.loss).needs_objects and aim.everything:
+        aim = self.spec.aim
+        if not make_objective(self.spec.loss).needs_objects and aim.everything:
             return list(range(len(images)))
         detector: Any = self.watched.detector
         with steady(detector), torch.no_grad():
@@ -384,17 +203,17 @@ class SceneAttacker:
         """
         if self.watched.task == "3d" and self.watched.classes != MMDET3D_CLASSES:
             raise ConfigError(f"{self.watched.detector.name} finds other classes than the ten of nuScenes")
-        frames = _key_frames(self.scene)
-        if self.attack.access == "none" or not self.view.source:
+        frames = _key_frames(self.recorded.data)
+        if self.attack.access == "none" or not self.source:
             return
-        settings, spec = self.examination, self.view.spec
+        recorded, spec = self.recorded, self.spec
         cache_key = (
-            str(settings.root),
-            settings.version,
-            settings.detectors,
-            settings.device,
-            self.view.source,
-            self.scene.record.name,
+            str(recorded.root),
+            recorded.version,
+            recorded.inputs,
+            recorded.device,
+            self.source,
+            self.recorded.data.record.name,
             spec.loss,
             spec.classes,
             spec.becomes,
@@ -416,7 +235,7 @@ class SceneAttacker:
                 self._halve(self.batch)
 
     def _fit_to(self, fit: UniversalFit) -> None:
-        spec = self.view.spec
+        spec = self.spec
         detector, budget = self.watched.detector, Budget(px(spec.radius), spec.norm)
         victims = []
         with steady(detector):
@@ -450,10 +269,10 @@ class SceneAttacker:
         Raises:
             ConfigError: The data set has no other drive.
         """
-        scene_name = self.scene.record.name
+        scene_name = self.recorded.data.record.name
         if fit.over == "drive":
-            return [(_spread(_key_frames(self.scene), fit.frames), self.scene)]
-        with NuScenes(self.examination.root, self.examination.version) as dataset:
+            return [(_spread(_key_frames(self.recorded.data), fit.frames), self.recorded.data)]
+        with NuScenes(self.recorded.root, self.recorded.version) as dataset:
             names = _spread([record.name for record in dataset.scenes() if record.name != scene_name], fit.frames)
             if not names:
                 raise ConfigError(f"universal: there is no drive besides {scene_name}; use over: drive, or more scenes")
@@ -469,7 +288,7 @@ class SceneAttacker:
 
     def _inspected(self, frames: Sequence[SensorFrame]) -> tuple[float | None, float | None]:
         """Return the error of the gradient and the coupling; None if it cannot be measured."""
-        names = self.view.spec.wanted or MMDET3D_CLASSES
+        names = self.spec.wanted or MMDET3D_CLASSES
         detector_classes = self.watched.classes
         target_labels = torch.tensor([detector_classes.index(name) for name in names if name in detector_classes])
         frames_by_count = sorted(
@@ -490,9 +309,9 @@ class SceneAttacker:
             return None, None
         detector: Any = self.watched.detector
         error = coupling = None
-        objective = make_objective(self.view.spec.loss)
+        objective = make_objective(self.spec.loss)
         with steady(detector):
-            aim = self.view.spec.aim
+            aim = self.spec.aim
             single_victim = Victim(detector, images[:1], truth[:1], objective, intrinsic=intrinsics[:1], aim=aim)
             if self.attack.access == "white-box":
                 error = check_gradient(single_victim)
@@ -502,10 +321,6 @@ class SceneAttacker:
                 pair_loss = float(pair_victim.loss(pair_victim.clean)[0])
                 coupling = abs(pair_loss - single_loss) / max(abs(single_loss), 1e-6)
         return error, coupling
-
-
-def _nothing() -> None:
-    """Do nothing: no images were saved."""
 
 
 def _key_frames(scene: SceneData) -> list[SensorFrame]:

@@ -1,7 +1,8 @@
 """Camera faults in the loop: frozen, lost, black or late images, or a dirty lens.
 
-They are `ssad.core.driving.Perturbation`s. The output depends on earlier images, so an instance belongs to one camera
-of one batch of episodes that begin together; all draws of an episode come from the generator of its first image.
+A fault changes readings (`ssad.core.driving.ReadingChange`). The output depends on earlier images, so an instance
+belongs to one camera of one batch of episodes that begin together; all draws of an episode come from the generator of
+its first image.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Faults of sensors, of the ego's knowledge of itself and of its commands."""
