@@ -28,7 +28,7 @@ class Environment:
     tests: tuple[str, ...]
 
 
-COMMONROAD = "tests/interchange/test_commonroad_tools.py"
+COMMONROAD = "tests/interchange/test_commonroad_writer_tools.py"
 ENVIRONMENTS = {
     "commonroad": Environment(("--extra", "commonroad"), (COMMONROAD, "-k", "valid or overlap")),
     "crime": Environment(("--group", "crime"), (COMMONROAD, "-k", "crime")),

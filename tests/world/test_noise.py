@@ -12,7 +12,7 @@ from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
 from ssad.world.roads import load_town
 from ssad.world.world import World
-from tests.world.test_lane_changes import two_lanes
+from tests.world.kernels.test_overtake import two_lanes
 from tests.world.worlds import ego, episode, line_route
 
 NOISE = Noise(accel=0.8, accel_time=0.5, lapse=0.1, careless=0.1, choice_time=2.0, stretches=3, stretch=5)

@@ -78,7 +78,7 @@ def test_readings_do_not_depend_on_the_other_rows() -> None:
     everybody = agents((0, 0), (0, 1), (1, 0), (1, 1))
     for name, sensor in SENSORS.items():
         if name == "truth":
-            continue  # a belief, of egos alone: see test_belief.py
+            continue  # a belief, of egos alone: see tests/drivers/test_belief.py
         together = sensor(world, everybody).copy()
         for k, row in enumerate(everybody):
             np.testing.assert_array_equal(sensor(world, row[None])[0], together[k], err_msg=name)

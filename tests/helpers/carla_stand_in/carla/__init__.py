@@ -1,6 +1,6 @@
 """A stand-in of CARLA's client interface over SSAD's own world: what `ssad.simulators.carla` uses of it, no more.
 
-Every name and argument here is checked against the stubs of the real wheel (tests/interchange/test_carla.py). Bodies
+Every name and argument here is checked against the stubs of the real wheel (tests/simulators/test_carla.py). Bodies
 with physics move as those of `ssad.world`, so that an episode must go as in the embedded world. The server's maps are
 SSAD's towns. Frames are CARLA's: left-handed, degrees.
 

@@ -1,0 +1,65 @@
+"""The template of a package for SSAD works as it lies there: under its names, as pip would install it."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from helpers.command import ssad
+
+FOLDER = Path(__file__).resolve().parents[2] / "templates" / "ssad-plugin"
+PROJECT = tomllib.loads((FOLDER / "pyproject.toml").read_text())["project"]
+
+
+@pytest.fixture(autouse=True)
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Its modules on the path, and metadata with the entry points of its pyproject.toml: no build, no network."""
+    info = tmp_path / "ssad_example-0.1.0.dist-info"
+    info.mkdir()
+    groups = PROJECT["entry-points"]
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {PROJECT['name']}\nVersion: {PROJECT['version']}\n")
+    (info / "entry_points.txt").write_text(
+        "\n".join(f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in names.items()) for group, names in groups.items())
+    )
+    for folder in (tmp_path, FOLDER / "src"):
+        monkeypatch.syspath_prepend(folder)
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] == "ssad_example"]:
+        del sys.modules[name]
+
+
+def its_tests() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("ssad_example_tests", FOLDER / "tests" / "test_example.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("group", ["systems", "detectors", "attacks", "generators", "scenarios", "kinds"])
+def test_its_names_are_listed(group: str) -> None:
+    done = ssad("list", group)
+    assert done.returncode == 0, done.stderr
+    listed = [line.split()[0] for line in done.stdout.splitlines()]
+    assert set(PROJECT["entry-points"][f"ssad.{group}"]) <= set(listed)
+
+
+@pytest.mark.parametrize("name", [name for name in vars(its_tests()) if name.startswith("test_")])
+def test_its_own_tests_pass(name: str, tmp_path: Path) -> None:
+    test = getattr(its_tests(), name)
+    (tmp_path / "work").mkdir()
+    test(tmp_path / "work") if "tmp_path" in test.__code__.co_varnames[: test.__code__.co_argcount] else test()
+
+
+def test_its_page_names_only_what_is_there() -> None:
+    page = (FOLDER / "README.md").read_text()
+    for file in (FOLDER / "src" / "ssad_example").glob("[a-z]*.py"):
+        assert f"`{file.name}`" in page
+    for name in (name for names in PROJECT["entry-points"].values() for name in names if name.startswith("example-")):
+        assert name in page or name == "example-coin"
