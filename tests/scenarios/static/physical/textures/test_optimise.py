@@ -22,7 +22,13 @@ from ssad.scenarios.static.physical.lights.projector import AIMED, Projector
 from ssad.scenarios.static.physical.textures.attention import Distraction, Redistribution, _parts, attention
 from ssad.scenarios.static.physical.textures.carrier import Surface, albedo_of
 from ssad.scenarios.static.physical.textures.controls import control
-from ssad.scenarios.static.physical.textures.optimise import TARGET, TextureAttack, View, train_texture
+from ssad.scenarios.static.physical.textures.optimise import (
+    TARGET,
+    TextureAttack,
+    View,
+    _order,
+    train_texture,
+)
 from ssad.scenarios.static.physical.textures.printing import NOMINAL, Expectation, conspicuousness
 from tests.scenarios.static.digital.toy_detector import CELL, ToyDetector, pattern, toy_scene
 
@@ -89,6 +95,49 @@ def test_a_trained_texture_beats_all_that_learn_nothing() -> None:
     others.append(trained.colour.flatten(1).flip(1).reshape(trained.colour.shape))
     assert own < 0.5 * min(score(other, fresh) for other in others)
     assert bool((torch.sign(0.5 - trained.colour) == pattern("car")).float().mean() > 0.95)
+
+
+def test_an_epoch_has_each_picture_once_unless_a_share_goes_to_the_worst() -> None:
+    draws, losses = np.random.default_rng(0), np.array([-1.0, 1.0] * 500)
+    assert sorted(_order(PLAIN, losses, draws)) == list(range(1000))
+    assert sorted(_order(replace(PLAIN, worst=1.0), np.zeros(1000), draws)) == list(range(1000)), "none is worse"
+    order = _order(replace(PLAIN, worst=0.25), losses, draws)
+    assert len(order) == 1000
+    assert len(set(order[250:])) == 750, "the others come once each"
+    # the loss is ascended: the lower it is, the more of the target is still detected
+    for worst in (0.25, 1.0):
+        chosen = losses[_order(replace(PLAIN, worst=worst), losses, draws)[: int(1000 * worst)]]
+        assert np.mean(chosen < 0.0) == pytest.approx(np.exp(1) / (np.exp(1) + np.exp(-1)), abs=0.06)
+
+
+def test_pictures_on_which_the_attack_fails_are_shown_more_often() -> None:
+    """One target in four is detected; a tiny rate leaves it so."""
+    shown: list[int] = []
+
+    @dataclass(frozen=True)
+    class Counted(Painted):
+        number: int = 0
+
+        @classmethod
+        def together(
+            cls,
+            pictures: Sequence[Counted],  # type: ignore[override]
+            textures: Mapping[int, Tensor],
+            noise: Sequence[torch.Generator] | None = None,
+        ) -> Tensor:
+            shown.extend(one.number for one in pictures)
+            return super().together(pictures, textures, noise)
+
+    seen = []
+    for number, view in enumerate(views(4)):
+        image, (left, top) = view.picture.image.clone(), view.picture.corner
+        if number != 2:
+            image[:, top : top + CELL, left : left + CELL] = 0.5  # nothing of the pattern that the detector looks for
+        seen.append(replace(view, picture=Counted(image, (left, top), number)))
+    attack = replace(PLAIN, epochs=13, rate=1e-6, worst=1.0)
+    train_texture(attack, detector(), SURFACE, seen, start=control("grey", SURFACE.size))
+    assert sorted(shown[:4]) == [0, 1, 2, 3], "nothing is known in the first epoch"
+    assert shown[4:].count(2) > 0.5 * len(shown[4:])
 
 
 def test_stealth_keeps_a_texture_near_what_it_covers() -> None:
