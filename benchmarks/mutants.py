@@ -1,10 +1,16 @@
-"""How many small errors do the tests find? Random mutants of a package, each against that package's tests.
+"""How many small errors do the tests find? Random mutants of a package, each against the tests of its module.
 
     uv run python benchmarks/mutants.py core --count 200 --seed 0 --workers 2
+    uv run python benchmarks/mutants.py scenarios/static/physical --count 60
+    uv run python benchmarks/mutants.py metrics/rank.py
 
 A mutant is the package with one change: `<=` for `<`, `-` for `+`, another constant, a condition the other way round,
 no return value, a call or a `raise` left out. It is killed if a test fails, hangs or crashes. What survives is printed
 with file, line and change: a test is missing, or the change makes no difference.
+
+A mutant of `src/ssad/a/b/module.py` meets `tests/a/b/test_module*.py` first, then the rest of `tests/a/b`, the tests of
+the package itself (`tests/a/test_b*.py`), and those of `tests/integration` that are named after the module or import
+something of `ssad.a.b`.
 
 The source is never changed in place: each worker has a copy of its own. Verdicts go to a file of JSON lines as they
 come, and the same command goes on where it was stopped; `--retry` tries again what survived, after tests were added.
@@ -36,37 +42,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("src", "tests", "suites", "docs", "benchmarks", "pyproject.toml", "README.md")
 MEMORY = 8 << 30  # bytes that a test run may allocate: a mutant may fill a list for ever
 
-# package under src/ssad -> its tests, the quickest first; for all other packages they are tests/<package>
-TESTS: dict[str, tuple[str, ...]] = {
-    "scenarios/dynamic": tuple(
-        f"tests/scenarios/test_{name}.py"
-        for name in ("yaml", "knowledge", "docs", "sets", "natural", "import", "sampling", "episode")
-    ),
-    "scenarios/static": tuple(
-        f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_objects", "_published", "_wet")
-    ),
-    "jobs": (
-        *(
-            f"tests/jobs/test_{name}.py"
-            for name in ("machine", "progress", "cluster", "local", "store", "worker", "pool")
-        ),
-        "tests/bench/test_engine.py",
-    ),
-    "bench": tuple(
-        f"tests/bench/test_{name}.py"
-        for name in (
-            *("kind", "source", "run", "suite", "driving_kind", "detection_kind", "digital"),
-            *("pictures", "digital_rows", "driving", "engine", "detection"),
-        )
-    ),
-    "drivers": ("tests/world",),
-    "envs": ("tests/test_envs.py", "tests/world/test_env.py"),
-}
+INTEGRATION = Path("tests") / "integration"
 
 _COMPARISON: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.LtE,
@@ -210,13 +192,62 @@ def drawn(package: Path, root: Path, count: int, seed: int) -> list[Mutant]:
     return random.Random(seed).sample(every, min(count, len(every)))
 
 
+def imported_modules(test: Path) -> set[str]:
+    """Return the dotted names that a test file imports, those of `from package import name` with and without `name`."""
+    names = set[str]()
+    for node in ast.walk(ast.parse(test.read_bytes())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def tests_of(file: Path, root: Path) -> tuple[str, ...]:
+    """Return the test files for a module under `src/ssad`, the nearest first, as paths relative to `root`.
+
+    A package without tests at the mirrored place has those of the package that holds it.
+    """
+    module = file.relative_to(root / "src" / "ssad")
+    package = module.parent
+    stem = package.name if module.stem == "__init__" else module.stem.strip("_")
+    mirrored: list[Path] = []
+    while not mirrored:
+        folder = root / "tests" / package
+        if package == Path():  # a module beside the packages, such as envs.py: tests/ itself holds more than its tests
+            mirrored = sorted(folder.glob(f"test_{stem}*.py"))
+            break
+        mirrored = [*sorted(folder.rglob("test_*.py")), *sorted(folder.parent.glob(f"test_{package.name}*.py"))]
+        if not mirrored:
+            package = package.parent
+    mirrored.sort(key=lambda path: (not path.name.startswith(f"test_{stem}"), len(path.parts)))
+    name = ".".join(("ssad", *(module.with_suffix("").parts if package == Path() else package.parts)))
+    crossing = [
+        path
+        for path in sorted((root / INTEGRATION).glob("test_*.py"))
+        if path.name.startswith(f"test_{stem}")
+        or any(other == name or other.startswith(f"{name}.") for other in imported_modules(path))
+    ]
+    return tuple(path.relative_to(root).as_posix() for path in (*mirrored, *crossing))
+
+
+def seconds_by_file(report: Path, folder: Path) -> Counter[str]:
+    """Return the seconds of each test file from a JUnit report of pytest in `folder`."""
+    seconds = Counter[str]()
+    for case in ElementTree.parse(report).iter("testcase"):
+        parts = case.get("classname", "").split(".")
+        while parts and not folder.joinpath(*parts).with_suffix(".py").is_file():
+            parts.pop()
+        seconds["/".join(parts) + ".py"] += float(case.get("time", 0))
+    return seconds
+
+
 @dataclass(frozen=True)
 class Copy:
     """A copy of the source in `folder`, in which one mutant at a time is tested."""
 
     folder: Path
     root: Path
-    tests: tuple[str, ...]
 
     def make(self) -> None:
         """Copy what the tests read."""
@@ -226,14 +257,8 @@ class Copy:
             elif (self.root / name).is_file():
                 shutil.copy2(self.root / name, self.folder / name)
 
-    def run(self, *, timeout: float, first: str = "", **environment: str) -> tuple[str, float, str]:
-        """("passed", "failed" or "timed out", seconds, output); tests named after `first` go before the others."""
-        near = [
-            str(path.relative_to(self.folder))
-            for test in map(self.folder.joinpath, self.tests)
-            for path in (sorted(test.rglob("test_*.py")) if test.is_dir() else [test])
-            if first and path.name.startswith(f"test_{first}")
-        ]
+    def run(self, tests: Sequence[str], *, timeout: float, **environment: str) -> tuple[str, float, str]:
+        """Return ("passed", "failed" or "timed out", seconds, output) of `tests`, files or words for pytest."""
         data = self.root / os.environ.get("SSAD_DATA", "../shared/data")
         environment |= {
             "PYTHONPATH": str(self.folder / "src"),
@@ -242,7 +267,7 @@ class Copy:
         }
         began = time.monotonic()
         process = subprocess.Popen(
-            [sys.executable, "-m", "pytest", "-x", "-q", *near, *self.tests],
+            [sys.executable, "-m", "pytest", "-x", "-q", *tests],
             cwd=self.folder,
             env=os.environ | environment,
             start_new_session=True,
@@ -262,7 +287,7 @@ class Copy:
         process.wait()
         return verdict, time.monotonic() - began, output
 
-    def run_mutant(self, mutant: Mutant, *, timeout: float) -> tuple[str, float, str]:
+    def run_mutant(self, mutant: Mutant, tests: Sequence[str], *, timeout: float) -> tuple[str, float, str]:
         """Verdict and seconds of the tests with this one change, and the lines that it changes."""
         target = self.folder / mutant.file
         before, times = target.read_bytes(), target.stat()
@@ -272,7 +297,7 @@ class Copy:
             compiled.unlink()
         target.write_bytes(after)
         try:
-            verdict, seconds, _ = self.run(timeout=timeout, first=target.stem, PYTHONDONTWRITEBYTECODE="1")
+            verdict, seconds, _ = self.run(tests, timeout=timeout, PYTHONDONTWRITEBYTECODE="1")
         finally:
             target.write_bytes(before)
             os.utime(target, ns=(times.st_atime_ns, times.st_mtime_ns))
@@ -287,34 +312,52 @@ def shown(before: bytes, after: bytes) -> str:
 
 
 def measure(
-    mutants: Sequence[Mutant], tests: Sequence[str], out: Path, *, root: Path, workers: int = 1, retry: bool = False
+    mutants: Sequence[Mutant],
+    out: Path,
+    *,
+    root: Path,
+    tests: Sequence[str] = (),
+    workers: int = 1,
+    retry: bool = False,
 ) -> list[dict[str, Any]]:
-    """The verdicts of all mutants, in the order given; those that `out` does not hold yet are tried and added to it."""
+    """The verdicts of all mutants, in the order given; those that `out` does not hold yet are tried and added to it.
+
+    Each meets `tests` or, without any, the tests of its module.
+    """
     known: dict[str, dict[str, Any]] = {}
     if out.is_file():
         known = {row["key"]: row for row in map(json.loads, out.read_text().splitlines())}
     todo = [m for m in mutants if m.key not in known or (retry and known[m.key]["verdict"] == "survived")]
     if not todo:
         return [known[mutant.key] for mutant in mutants]
+    wanted = {m.file: tuple(tests) or tests_of(root / m.file, root) for m in todo}
+    if lonely := sorted(file for file, files in wanted.items() if not files):
+        raise SystemExit(f"error: no tests for {', '.join(lonely)}")
     lock, free, tried = threading.Lock(), queue.SimpleQueue[Copy](), Counter[str]()
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
-        first = Copy(Path(folder) / "0", root, tuple(tests))
+        first = Copy(Path(folder) / "0", root)
         first.make()
-        verdict, seconds, output = first.run(timeout=3600)
+        report = Path(folder) / "report.xml"
+        every = list(dict.fromkeys(test for files in wanted.values() for test in files))
+        verdict, seconds, output = first.run([f"--junitxml={report}", *every], timeout=3600)
         if verdict != "passed":
             raise SystemExit(f"{output[-3000:]}\nerror: the tests fail without any mutant")
         print(f"{seconds:.1f} s without a mutant; to try: {len(todo)}, known: {len(mutants) - len(todo)}", flush=True)
+        took = seconds_by_file(report, first.folder)
+        rest = seconds - took.total()  # start and imports
         free.put(first)
         for k in range(1, workers):  # with the compiled files of the first
             shutil.copytree(first.folder, Path(folder) / str(k))
-            free.put(Copy(Path(folder) / str(k), root, tuple(tests)))
+            free.put(Copy(Path(folder) / str(k), root))
 
         def work(mutant: Mutant) -> None:
             place = free.get()
-            verdict, took, lines = place.run_mutant(mutant, timeout=30 + 4 * seconds)
+            files = wanted[mutant.file]
+            usual = seconds if tests else rest + sum(took[test] for test in files)
+            verdict, duration, lines = place.run_mutant(mutant, files, timeout=30 + 4 * usual)
             free.put(place)
             told = {"passed": "survived"}.get(verdict, verdict)
-            row = {"key": mutant.key, "verdict": told, "seconds": round(took, 1), "change": lines}
+            row = {"key": mutant.key, "verdict": told, "seconds": round(duration, 1), "change": lines}
             with lock, out.open("a") as file:
                 known[mutant.key] = asdict(mutant) | row
                 file.write(json.dumps(known[mutant.key]) + "\n")
@@ -339,23 +382,22 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
 def main(words: Sequence[str] | None = None, *, root: Path = ROOT) -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("package", help="folder or file under src/ssad, such as core or scenarios/dynamic")
+    parser.add_argument("package", help="folder or file under src/ssad, such as core or scenarios/static/physical")
     parser.add_argument("--count", type=int, default=200, help="how many mutants are drawn")
     parser.add_argument("--seed", type=int, default=0, help="of the draw")
     parser.add_argument("--workers", type=int, default=1, help="how many are tried at a time")
-    parser.add_argument("--tests", nargs="+", help="test files or folders, instead of the package's own")
+    parser.add_argument("--tests", nargs="+", help="test files or folders, instead of those of each module")
     parser.add_argument("--out", type=Path, help="file of verdicts (default: runs/mutants/PACKAGE.jsonl)")
     parser.add_argument("--retry", action="store_true", help="try again what survived")
     given = parser.parse_args(words)
     package = root / "src" / "ssad" / given.package
-    tests = given.tests or TESTS.get(given.package) or (f"tests/{given.package}",)
-    for path in (package, *(root / test for test in tests)):
+    for path in (package, *(root / test for test in given.tests or ())):
         if not path.exists():
             parser.error(f"{path}: not there")
     out = given.out or root / "runs" / "mutants" / f"{given.package.replace('/', '-')}.jsonl"
     out.parent.mkdir(parents=True, exist_ok=True)
     mutants = drawn(package, root, given.count, given.seed)
-    print(summary(measure(mutants, tests, out, root=root, workers=given.workers, retry=given.retry)))
+    print(summary(measure(mutants, out, root=root, tests=given.tests or (), workers=given.workers, retry=given.retry)))
 
 
 if __name__ == "__main__":

@@ -106,3 +106,62 @@ def test_tests_that_fail_by_themselves_are_no_measure(tmp_path: Path) -> None:
     (tests / "test_one.py").write_text("def test_one():\n    assert False\n")
     with pytest.raises(SystemExit, match="the tests fail without any mutant"):
         TOOL.main(["small", "--out", str(tmp_path / "out")], root=tmp_path)
+
+
+def test_a_module_meets_its_tests_those_of_its_package_and_those_across_packages(tmp_path: Path) -> None:
+    texts = {
+        "src/ssad/envs.py": "",
+        "src/ssad/a/__init__.py": "",
+        "src/ssad/a/b/kind.py": "",
+        "src/ssad/a/b/_page.py": "",
+        "src/ssad/a/c/other.py": "",
+        "tests/test_envs.py": "",
+        "tests/test_results.py": "",
+        "tests/a/test_b.py": "",
+        "tests/a/test_more.py": "",
+        "tests/a/b/test_kind.py": "",
+        "tests/a/b/test_kind_rows.py": "",
+        "tests/a/b/test_page.py": "",
+        "tests/a/b/d/test_deep.py": "",
+        "tests/integration/test_1.py": "from ssad.a.b.kind import x",
+        "tests/integration/test_2.py": "def test():\n    import ssad.a.c.other",
+        "tests/integration/test_3.py": "from ssad.a import b",
+        "tests/integration/test_4.py": "from ssad.ab import b",
+        "tests/integration/test_5.py": "from ssad import envs",
+        "tests/integration/test_pages.py": "",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    def tests_of(name: str) -> list[str]:
+        found = TOOL.tests_of(tmp_path / "src" / "ssad" / name, tmp_path)
+        return [test.removeprefix("tests/").replace("integration/test_", "") for test in found]
+
+    rest = ["1.py", "3.py"]
+    kind = ["a/b/test_kind.py", "a/b/test_kind_rows.py"]
+    assert tests_of("a/b/kind.py") == [*kind, "a/test_b.py", "a/b/test_page.py", "a/b/d/test_deep.py", *rest]
+    assert tests_of("a/b/_page.py")[0] == "a/b/test_page.py"
+    assert sorted(tests_of("a/b/_page.py")) == sorted([*tests_of("a/b/kind.py"), "pages.py"])
+    whole = tests_of("a/__init__.py")
+    assert len(whole) == 6 + 3
+    assert tests_of("a/c/other.py") == [*whole[:6], "1.py", "2.py", "3.py"], "no folder of its own: that of the package"
+    assert tests_of("envs.py") == ["test_envs.py", "5.py"]
+
+
+def test_every_module_has_tests() -> None:
+    root = Path(__file__).parents[2]
+    modules = sorted((root / "src" / "ssad").rglob("*.py"))
+    assert [file.name for file in modules if not TOOL.tests_of(file, root)] == ["__main__.py"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", ["scenarios/static/physical", "metrics/rank.py"])
+def test_a_package_within_a_package_and_a_single_module_can_be_measured(
+    given: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(__file__).parents[2]
+    TOOL.main([given, "--count", "1", "--out", str(tmp_path / "out.jsonl")], root=root)
+    row = json.loads((tmp_path / "out.jsonl").read_text())
+    assert row["file"].startswith(f"src/ssad/{given}")
+    assert " of 1 killed" in capsys.readouterr().out
