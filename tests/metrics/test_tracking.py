@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.optional import import_or_skip
 
 from ssad.drivers.perceiving.objects import no_objects
 from ssad.drivers.perceiving.tracker import Tracker
@@ -104,8 +105,7 @@ def test_scores_are_those_that_trackeval_gave(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2, None])
 def test_scores_are_those_of_trackeval(seed: int | None) -> None:
-    pytest.importorskip("trackeval", reason="it brings another OpenCV: pip install --no-deps trackeval tabulate")
-    from trackeval.metrics import CLEAR, HOTA, Identity
+    metrics = import_or_skip("trackeval.metrics", "uv sync --inexact --group references")
 
     frames = tracker_frames() if seed is None else random_frames(seed)
     own = track_scores(frames)
@@ -122,7 +122,12 @@ def test_scores_are_those_of_trackeval(seed: int | None) -> None:
         "similarity_scores": [f.similarity for f in frames],
     }
     hota, clear, identity = (
-        made.eval_sequence(data) for made in (HOTA(), CLEAR({"PRINT_CONFIG": False}), Identity({"PRINT_CONFIG": False}))
+        made.eval_sequence(data)
+        for made in (
+            metrics.HOTA(),
+            metrics.CLEAR({"PRINT_CONFIG": False}),
+            metrics.Identity({"PRINT_CONFIG": False}),
+        )
     )
     expected = [np.mean(hota["HOTA"]), np.mean(hota["DetA"]), np.mean(hota["AssA"]), clear["MOTA"], identity["IDF1"]]
     np.testing.assert_allclose([own.hota, own.detection, own.association, own.mota, own.idf1], expected, atol=1e-12)
@@ -130,3 +135,12 @@ def test_scores_are_those_of_trackeval(seed: int | None) -> None:
     assert 0.2 < own.hota < 0.95
     if seed is not None:
         assert own.switches > 5
+
+
+@pytest.mark.parametrize(("variable", "outcome"), [("1", pytest.fail.Exception), ("0", pytest.skip.Exception)])
+def test_in_continuous_integration_nothing_is_compared_with_less(
+    variable: str, outcome: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSAD_CI", variable)
+    with pytest.raises(outcome, match="no module trackeval_of_nobody: install it"):
+        import_or_skip("trackeval_of_nobody", "install it")
