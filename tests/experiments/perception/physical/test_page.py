@@ -257,6 +257,20 @@ def test_a_heat_map_is_red_where_the_value_is_low_and_marks_its_worst_cell() -> 
     assert text.count('stroke="var(--ink)"') == 1
 
 
+@pytest.mark.parametrize(("count", "wide", "high"), [(1, 1, 1), (2, 2, 1), (3, 3, 1), (4, 3, 2), (6, 3, 2), (7, 3, 3)])
+def test_heat_maps_stand_in_rows_of_three(count: int, wide: int, high: int) -> None:
+    maps = [HeatMap(f"m{k}", ["5 m"], ["0°", "90°"], {}) for k in range(count)]
+    text = heat_maps(maps, label="l")
+    size = re.search(r'viewBox="0 0 (\d+) (\d+)"', text)
+    assert size is not None
+    width, height = int(size[1]) // wide, int(size[2]) // high
+    names = re.findall(r'<text x="(\d+)" y="(\d+)" class="name">m(\d+)<', text)
+    left, top = int(names[0][0]), int(names[0][1])
+    assert [((int(x) - left) / width, (int(y) - top) / height) for x, y, _ in names] == [
+        (k % 3, k // 3) for k in range(count)
+    ]
+
+
 @pytest.mark.data
 def test_the_papers_tables_are_as_the_paper_has_them(data_dir: Path) -> None:
     sources = sorted((data_dir.parent / "paper").glob("*.txt"))
