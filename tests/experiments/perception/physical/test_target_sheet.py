@@ -13,6 +13,8 @@ from ssad.core.detections import Truth
 from ssad.experiments.perception.physical import target_sheet as module
 from ssad.experiments.perception.physical.target_sheet import WIDTH, _square, target_sheet
 
+EDGE = 2  # px of white around an image
+
 
 @pytest.mark.parametrize(
     ("box", "square"),
@@ -43,18 +45,16 @@ def test_a_sheet_shows_the_target_with_its_detections(monkeypatch: pytest.Monkey
     detector: Any = SimpleNamespace(classes=("car",))
     truth = Truth(torch.tensor([0]), torch.tensor([[300.0, 220.0, 340.0, 260.0]]))
     sheet = target_sheet(detector, [(name, image) for name in "abc"], truth, "cpu", columns=2)
-    height = sheet.shape[0] // 2
-    assert sheet.shape == (2 * height, 2 * WIDTH, 3)
-    assert (sheet[height:, WIDTH:] == 255).all(), "no fourth image"
-    tile = sheet[:height, :WIDTH]
-    above = height - WIDTH  # the title
-    red = (tile[above:, :, 0] > 200) & (tile[above:, :, 1] < 50)
+    height, width = sheet.shape[0] // 2, WIDTH + 2 * EDGE
+    assert sheet.shape == (2 * height, 2 * width, 3)
+    assert (sheet[height:, width:] == 255).all(), "no fourth image"
+    shown = sheet[EDGE : EDGE + WIDTH, EDGE : EDGE + WIDTH]
+    red = (shown[..., 0] > 200) & (shown[..., 1] < 50)
     rows, columns = np.flatnonzero(red.any(1)), np.flatnonzero(red.any(0))
     assert [rows[0], rows[-1] + 1] == pytest.approx([240, 400], abs=4), "a quarter of the width, in the middle"
     assert [columns[0], columns[-1] + 1] == pytest.approx([240, 400], abs=4)
-    drawn = np.array(module.FOUND)
     for x, y in ((80, 320), (560, 320), (320, 160), (320, 480)):  # the middles of the sides of the box, times 4
-        assert (tile[above + y, x] == drawn).all(), (x, y)
+        assert (shown[y, x] == module.FOUND).all(), (x, y)
 
 
 def test_an_image_smaller_than_the_square_is_shown_whole() -> None:
