@@ -40,6 +40,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -192,7 +193,8 @@ def drawn(package: Path, root: Path, count: int, seed: int) -> list[Mutant]:
     return random.Random(seed).sample(every, min(count, len(every)))
 
 
-def imported_modules(test: Path) -> set[str]:
+@cache
+def imported_modules(test: Path) -> frozenset[str]:
     """Return the dotted names that a test file imports, those of `from package import name` with and without `name`."""
     names = set[str]()
     for node in ast.walk(ast.parse(test.read_bytes())):
@@ -200,7 +202,7 @@ def imported_modules(test: Path) -> set[str]:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+    return frozenset(names)
 
 
 def tests_of(file: Path, root: Path) -> tuple[str, ...]:
