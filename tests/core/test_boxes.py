@@ -12,7 +12,7 @@ from helpers import mono3d_case
 from ssad.core.boxes import TrackedBoxes, WorldBoxes, bottom_centre, camera_axes, camera_yaw, size_columns
 from ssad.core.detections import Solids
 from ssad.core.rotations import matrix_to_quaternion, quaternion_to_yaw, yaw_to_quaternion
-from ssad.detectors.mono3d.decode import corners
+from ssad.core.tensor_boxes import solid_corners
 
 STORED = Path(__file__).parent.parent / "data" / "mmdet3d" / "export.npz"
 # a car 4 m long, 2 m wide and 1.5 m high that looks along y; its middle is 0.75 m over (10, 20, 0)
@@ -74,7 +74,7 @@ def test_the_way_into_the_camera_and_back() -> None:
     assert np.cos(quaternion_to_yaw(matrix_to_quaternion(axes)) - yaw) == pytest.approx(np.ones(50))
     # the same corners as those that detectors are trained and drawn with
     solid = Solids(*map(torch.from_numpy, (centre, size_lhw, turned, np.zeros((50, 2)), np.zeros(50, int))))
-    seen = corners(solid.centre, solid.size_lhw, solid.yaw).numpy() @ CAMERA[:3, :3].T + CAMERA[:3, 3]
+    seen = solid_corners(solid.centre, solid.size_lhw, solid.yaw).numpy() @ CAMERA[:3, :3].T + CAMERA[:3, 3]
     for mine, theirs in zip(boxes.corners(), seen, strict=True):
         assert sorted(map(tuple, mine.round(6) + 0.0)) == sorted(map(tuple, theirs.round(6) + 0.0))
 

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from ssad.core.detections import Assignment, Dense, Solids, Truth
+from ssad.core.tensor_boxes import solid_corners
 from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import FCOS3D, PGD_DET, Mono3DConfig
-from ssad.detectors.mono3d.decode import corners, hull, project, vectors_of_yaw
+from ssad.detectors.mono3d.decode import hull, project, vectors_of_yaw
 from ssad.detectors.mono3d.detector import Mono3D
 
 TINY = replace(FCOS3D, name="tiny", trunk=18, width=8, channels=32, strides=(8, 16, 32), ranges=(48.0, 96.0, 1e8))
@@ -30,7 +31,7 @@ def truth_of(centre: Tensor, size: Tensor, yaw: Tensor, *, label: Tensor, intrin
     """Truth whose 2D boxes are the hulls of the corners, not cut at the border."""
     velocity = torch.stack([0.5 + yaw, 2.0 - yaw], 1)
     attribute = torch.arange(len(yaw)) % 9
-    box = hull(project(corners(centre, size, yaw), intrinsic))
+    box = hull(project(solid_corners(centre, size, yaw), intrinsic))
     return Truth(label, box, Solids(centre, size, yaw, velocity, attribute), intrinsic)
 
 

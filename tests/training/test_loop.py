@@ -20,8 +20,9 @@ from torch.multiprocessing.spawn import spawn
 
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError, UnknownNameError
+from ssad.core.tensor_boxes import solid_corners
 from ssad.core.types import U8
-from ssad.detectors.mono3d.decode import corners, hull, project
+from ssad.detectors.mono3d.decode import hull, project
 from ssad.training import loop
 from ssad.training.batches import (
     Change,
@@ -480,8 +481,8 @@ def test_solids_project_to_the_changed_places(change: Change) -> None:
 
     expected = moved(middles(truth.solid, k), change, SOLID_SIZE[1])
     torch.testing.assert_close(middles(after.solid, after.intrinsic), expected)
-    before = project(corners(truth.solid.centre, truth.solid.size_lhw, truth.solid.yaw), k)[..., :2]
-    now = project(corners(after.solid.centre, after.solid.size_lhw, after.solid.yaw), after.intrinsic)[..., :2]
+    before = project(solid_corners(truth.solid.centre, truth.solid.size_lhw, truth.solid.yaw), k)[..., :2]
+    now = project(solid_corners(after.solid.centre, after.solid.size_lhw, after.solid.yaw), after.intrinsic)[..., :2]
     apart = (moved(before, change, SOLID_SIZE[1])[:, :, None] - now[:, None]).norm(dim=-1)
     assert float(apart.amin(1).max()) < 1e-9  # every corner has become a corner
     assert float(apart.amin(2).max()) < 1e-9
@@ -496,7 +497,7 @@ def test_boxes_of_solids_follow_their_corners() -> None:
     after = change_truth(truth, Change(True, 0.6, (90.0, 40.0)), SOLID_SIZE, keep=0.0)
     assert after.solid is not None
     assert after.intrinsic is not None
-    box = hull(project(corners(after.solid.centre, after.solid.size_lhw, after.solid.yaw), after.intrinsic))
+    box = hull(project(solid_corners(after.solid.centre, after.solid.size_lhw, after.solid.yaw), after.intrinsic))
     torch.testing.assert_close(box, after.box)
 
 

@@ -14,7 +14,8 @@ from ssad.core.detections import Dense, Detections, Solids, Truth
 from ssad.core.nuscenes_names import NO_ATTRIBUTE
 from ssad.core.registry import describe
 from ssad.core.seeding import seed32
-from ssad.detectors.mono3d.decode import corners, hull, project
+from ssad.core.tensor_boxes import solid_corners
+from ssad.detectors.mono3d.decode import hull, project
 
 BATCH = 3
 
@@ -104,7 +105,7 @@ class CheckCase:
         yaw = torch.tensor([0.4, -2.0], device=device)[:count]
         velocity = torch.tensor([[1.0, -3.0], [torch.nan, torch.nan]], device=device)[:count]
         attribute = torch.tensor([5, NO_ATTRIBUTE], device=device)[:count]
-        box = hull(project(corners(centre, extent, yaw), intrinsics[0]))
+        box = hull(project(solid_corners(centre, extent, yaw), intrinsics[0]))
         limit = torch.tensor([width, height] * 2, dtype=box.dtype, device=device)
         solid = Solids(centre, extent, yaw, velocity, attribute)
         return Truth(label, box.clamp_min(0).minimum(limit), solid, intrinsics[0])

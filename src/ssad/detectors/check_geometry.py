@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from ssad.core.detections import Dense, Detections, Solids, Truth
+from ssad.core.tensor_boxes import area, iou, solid_corners
 from ssad.detectors.check_cases import CheckCase, usual_threshold
-from ssad.detectors.mono3d.decode import corners, hull, project
+from ssad.detectors.mono3d.decode import hull, project
 
 BEST = 20  # detections compared in an image
 FEW = 5  # of these, the number used as truth
@@ -193,22 +194,12 @@ def _fit(trial: CheckCase, everything: list[Detections], reading: Reading) -> fl
         if detections.solid is None or intrinsic is None:
             continue
         solid = reading.apply(detections.solid)
-        hulls = hull(project(corners(solid.centre, solid.size_lhw, solid.yaw), intrinsic[0].to(solid.centre)))
+        hulls = hull(project(solid_corners(solid.centre, solid.size_lhw, solid.yaw), intrinsic[0].to(solid.centre)))
         box, hulls = _cut(detections.box[:BEST], trial.size), _cut(hulls[:BEST], trial.size)
-        is_visible = _area(box) > 4
-        image_overlaps.append(_overlap(box[is_visible], hulls[is_visible]))
+        is_visible = area(box) > 4
+        image_overlaps.append(iou(box[is_visible], hulls[is_visible], least=1e-6))
     overlap = torch.cat(image_overlaps) if image_overlaps else torch.zeros(0)
     return float(overlap.double().mean()) if len(overlap) else 0.0
-
-
-def _area(box: Tensor) -> Tensor:
-    return (box[:, 2:] - box[:, :2]).clamp_min(0).prod(-1)
-
-
-def _overlap(a: Tensor, b: Tensor) -> Tensor:
-    """IoU [N] of boxes [N, 4] in pairs."""
-    intersection = _area(torch.cat([torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])], 1))
-    return intersection / (_area(a) + _area(b) - intersection).clamp_min(1e-6)
 
 
 def _better_for_losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> Reading | None:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ssad.core.detections import Detections, Solids
 from ssad.core.protocols import Detector
+from ssad.core.tensor_boxes import solid_corners
 from ssad.core.types import F64, U8
 from ssad.datasets.drawing import draw_edges
-from ssad.detectors.mono3d.decode import corners
 
 LEAST = {"2d": 0.25, "3d": 0.15}  # score of a box that is drawn; those of 3D detectors are lower
 TRUE, FOUND = (255, 255, 255), (255, 170, 30)
@@ -30,7 +30,7 @@ def draw_solids(
     """Draw the edges of 3D boxes in front of the camera into an image."""
     if solid is None or not len(solid.yaw):
         return
-    corner_points = corners(solid.centre.double(), solid.size_lhw.double(), solid.yaw.double()).cpu().numpy()
+    corner_points = solid_corners(solid.centre.double(), solid.size_lhw.double(), solid.yaw.double()).cpu().numpy()
     draw_edges(canvas, corner_points, intrinsic, scale, colour=colour, width=width)
 
 

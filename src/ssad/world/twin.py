@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.tensor_boxes import rectangle_corners, rotate
 from ssad.core.types import AgentKind, LaneType
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE, model
 from ssad.world.roads.query import DRIVABLE, LaneQuery
@@ -339,23 +340,14 @@ def _wrapped(angle: Tensor) -> Tensor:
     return angle - 2 * math.pi * torch.floor((angle.detach() + math.pi) / (2 * math.pi))
 
 
-def _turned(points: Tensor, yaw: Tensor) -> Tensor:
-    """Rotate vectors [..., 2] counter-clockwise by angles [...]."""
-    cos, sin = torch.cos(yaw), torch.sin(yaw)
-    x, y = points.unbind(-1)
-    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
-
-
 def _corners(boxes: Tensor) -> Tensor:
     """Return the corners [..., 4, 2] of boxes [..., 5]: front left, rear left, rear right, front right."""
-    along = 0.5 * boxes[..., 3:4] * boxes.new_tensor([1.0, -1.0, -1.0, 1.0])
-    across = 0.5 * boxes[..., 4:5] * boxes.new_tensor([1.0, 1.0, -1.0, -1.0])
-    return _turned(torch.stack([along, across], -1), boxes[..., 2:3]) + boxes[..., None, :2]
+    return rectangle_corners(boxes[..., :2], boxes[..., 3:5], boxes[..., 2])
 
 
 def _to_local(boxes: Tensor, points: Tensor) -> Tensor:
     """Transform world points [..., n, 2] into the frames of boxes [..., 5]."""
-    return _turned(points - boxes[..., None, :2], -boxes[..., 2:3])
+    return rotate(points - boxes[..., None, :2], -boxes[..., 2:3])
 
 
 def _beside(points: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:

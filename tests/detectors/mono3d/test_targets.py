@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.tensor_boxes import solid_corners
 from ssad.detectors.mono3d.config import FCOS3D, Mono3DConfig
 from ssad.detectors.mono3d.decode import (
     Places,
-    corners,
     global_yaw,
     places_of,
     project,
@@ -231,13 +231,13 @@ def test_a_bin_turns_what_lies_beside_its_border_and_vectors_do_not() -> None:
 def test_corners_are_half_the_diagonal_from_the_centre() -> None:
     solid = some_truth(4, seed=3).solid
     assert solid is not None
-    away = (corners(solid.centre, solid.size_lhw, solid.yaw) - solid.centre[:, None]).norm(dim=-1)
+    away = (solid_corners(solid.centre, solid.size_lhw, solid.yaw) - solid.centre[:, None]).norm(dim=-1)
     torch.testing.assert_close(away, 0.5 * solid.size_lhw.norm(dim=1)[:, None].expand(4, 8))
 
 
 def test_corners_follow_the_convention_of_yaw() -> None:
     """At yaw 0 the nose points along x, at a quarter turn against z."""
-    nose = corners(torch.zeros(3), torch.tensor([4.0, 1e-6, 1e-6]), torch.tensor(math.pi / 2)).round(decimals=4)
+    nose = solid_corners(torch.zeros(3), torch.tensor([4.0, 1e-6, 1e-6]), torch.tensor(math.pi / 2)).round(decimals=4)
     assert nose[4:].mean(0).tolist() == pytest.approx([0, 0, -2], abs=1e-4)
 
 

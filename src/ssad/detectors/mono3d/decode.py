@@ -149,18 +149,6 @@ def ray_angle(u: Tensor, lens: Tensor) -> Tensor:
     return torch.atan2(u - lens[..., 0, 2], lens[..., 0, 0])
 
 
-def corners(centre: Tensor, size: Tensor, yaw: Tensor) -> Tensor:
-    """Corners [..., 8, 3] of boxes in the camera frame: centre of gravity, (length, height, width), yaw."""
-    signs = torch.tensor(
-        [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], dtype=size.dtype, device=size.device
-    )
-    local = signs * size[..., None, :]
-    cos, sin = yaw.cos()[..., None], yaw.sin()[..., None]
-    x = cos * local[..., 0] + sin * local[..., 2]
-    z = -sin * local[..., 0] + cos * local[..., 2]
-    return torch.stack([x, local[..., 1], z], -1) + centre[..., None, :]
-
-
 def hull(points: Tensor) -> Tensor:
     """Return the bounding rectangle x0, y0, x1, y1 [..., 4] of points [..., K, 2]."""
     return torch.cat([points.amin(-2), points.amax(-2)], -1)

@@ -15,12 +15,12 @@ from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.eval_mode import evaluating
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.tensor_boxes import solid_corners
 from ssad.detectors.adapters.common import check_images, check_threshold, scale_of, size_inside
 from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (
     Flat,
-    corners,
     flatten,
     global_yaw,
     hull,
@@ -370,7 +370,7 @@ class Mono3D(nn.Module):
         if self.config.pgd:
             box = torch.cat([xy - flat.reg[..., 9:11], xy + flat.reg[..., 11:13]], -1)
         else:
-            box = hull(project(corners(*solids), lens[..., None, :, :]))
+            box = hull(project(solid_corners(*solids), lens[..., None, :, :]))
         limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
         box = box - box.new_tensor([0.0, self._above(size)]).repeat(2)
         return (box / self._scale(size, box).repeat(2)).clamp_min(0.0).minimum(limit)

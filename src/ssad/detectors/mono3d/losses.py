@@ -11,8 +11,9 @@ from torch.nn import functional
 
 from ssad.core.detections import Assignment
 from ssad.core.nuscenes_names import ALIKE, MMDET3D_CLASSES
+from ssad.core.tensor_boxes import intersection, solid_corners
 from ssad.detectors.mono3d.config import Mono3DConfig
-from ssad.detectors.mono3d.decode import Flat, Places, corners, global_yaw, hull, project, unproject, vectors_of_yaw
+from ssad.detectors.mono3d.decode import Flat, Places, global_yaw, hull, project, unproject, vectors_of_yaw
 
 BETA = 1.0 / 9.0  # of smooth L1
 _ALIKE = tuple(MMDET3D_CLASSES.index(name) for name in ALIKE)
@@ -142,17 +143,17 @@ def _consistency(
     # vectors have a loss that is smooth everywhere; the angle between them is steep where they are short
     local = reg[:, 6] if direction is not None else reg[:, 6].detach()
     yaw = global_yaw(local, direction, centre2d[:, 0], lens, offset=config.dir_offset)
-    projected_box = hull(project(corners(centre, reg[:, 3:6], yaw), lens[:, None], near=None))
+    projected_box = hull(project(solid_corners(centre, reg[:, 3:6], yaw), lens[:, None], near=None))
     return 1 - _generalised_iou(projected_box, torch.cat([xy - reg[:, 9:11], xy + reg[:, 11:13]], 1))
 
 
 def _generalised_iou(a: Tensor, b: Tensor) -> Tensor:
     """GIoU [M] (Rezatofighi et al. 2019) of boxes [M, 4] in pairs."""
-    intersection = (torch.minimum(a[:, 2:], b[:, 2:]) - torch.maximum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
+    common = intersection(a, b)
     enclosing = (torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
-    union = (a[:, 2:] - a[:, :2]).prod(1) + (b[:, 2:] - b[:, :2]).prod(1) - intersection
+    union = (a[:, 2:] - a[:, :2]).prod(1) + (b[:, 2:] - b[:, :2]).prod(1) - common
     union, enclosing = union.clamp_min(1e-6), enclosing.clamp_min(1e-6)
-    return intersection / union - (enclosing - union) / enclosing
+    return common / union - (enclosing - union) / enclosing
 
 
 class _Sum:

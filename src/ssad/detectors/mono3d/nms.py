@@ -5,19 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_UNIT = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+from ssad.core.tensor_boxes import intersection, rectangle_corners
+
 BLOCK = 64  # rectangles compared with all worse ones at once
 PAIRS = 1 << 16  # pairs intersected at once; bounds the memory
 
 
-def rectangle_corners(boxes: Tensor) -> Tensor:
+def _corners(boxes: Tensor) -> Tensor:
     """Return the corners [N, 4, 2], counter-clockwise, of rectangles x, y, dx, dy, angle [N, 5]."""
-    unit = torch.tensor(_UNIT, dtype=boxes.dtype, device=boxes.device)
-    local = unit * boxes[:, None, 2:4]
-    cos, sin = boxes[:, 4].cos()[:, None], boxes[:, 4].sin()[:, None]
-    x = cos * local[..., 0] - sin * local[..., 1] + boxes[:, None, 0]
-    y = sin * local[..., 0] + cos * local[..., 1] + boxes[:, None, 1]
-    return torch.stack([x, y], -1)
+    # From the rear right: areas are sums over the sides, and their order decides the last bits.
+    return rectangle_corners(boxes[:, :2], boxes[:, 2:4], boxes[:, 4]).roll(2, 1)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -32,8 +29,8 @@ def intersection_area(a: Tensor, b: Tensor) -> Tensor:
     a, b = a.double(), b.double()
     # Coordinates about the common centre: far from the origin, the areas would cancel.
     origin = 0.5 * (a[:, :2] + b[:, :2])
-    a = rectangle_corners(torch.cat([a[:, :2] - origin, a[:, 2:]], 1))
-    b = rectangle_corners(torch.cat([b[:, :2] - origin, b[:, 2:]], 1))
+    a = _corners(torch.cat([a[:, :2] - origin, a[:, 2:]], 1))
+    b = _corners(torch.cat([b[:, :2] - origin, b[:, 2:]], 1))
     return (0.5 * (_inside(a, b, shared=True) + _inside(b, a, shared=False))).clamp_min(0.0)
 
 
@@ -79,7 +76,7 @@ def rotated_nms(boxes: Tensor, score: Tensor, group: Tensor, *, threshold: float
     ranking = score.argsort(descending=True, stable=True)
     ranking = ranking[group[ranking].argsort(stable=True)]
     boxes, group = boxes[ranking].double(), group[ranking].contiguous()
-    area, corner_points = boxes[:, 2] * boxes[:, 3], rectangle_corners(boxes)
+    area, corner_points = boxes[:, 2] * boxes[:, 3], _corners(boxes)
     limits = torch.cat([corner_points.amin(1), corner_points.amax(1)], 1)
     alive = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
     ends = torch.searchsorted(group, group, right=True)
@@ -109,11 +106,8 @@ def _candidates(  # noqa: PLR0917
 ) -> tuple[Tensor, Tensor]:
     """Return pairs (better, worse) that may overlap enough, by their bounding boxes and areas."""
     row_limits, column_limits = limits[rows][:, None], limits[columns]
-    sides = (
-        torch.minimum(row_limits[..., 2:], column_limits[:, 2:])
-        - torch.maximum(row_limits[..., :2], column_limits[:, :2])
-    ).clamp_min(0.0)
-    max_intersection = torch.minimum(torch.minimum(sides[..., 0] * sides[..., 1], area[rows][:, None]), area[columns])
+    common = intersection(row_limits, column_limits)
+    max_intersection = torch.minimum(torch.minimum(common, area[rows][:, None]), area[columns])
     # IoU is at most intersection / (areas - intersection); a little slack for rounding
     may_overlap = max_intersection * (1 + threshold) >= threshold * (area[rows][:, None] + area[columns]) * (1 - 1e-9)
     is_pair = may_overlap & (group[rows][:, None] == group[columns]) & (rows[:, None] < columns)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
+from ssad.core.tensor_boxes import intersection
 from ssad.detectors.yolo.decode import Grid
 
 IGNORE_IOU = 0.5
@@ -240,10 +241,8 @@ def _settle(targets: Targets, place: Tensor, quality: Tensor, good: Tensor, plac
 
 def _touches(predicted: Tensor, box: Tensor, hiding: Tensor) -> Tensor:
     """Whether a predicted box [B, P, 4] overlaps one of the objects [B, Q, 4] that hide [B, Q] by IoU > 0.5. [B, P]."""
-    low = torch.maximum(predicted[:, :, None, :2], box[:, None, :, :2])
-    high = torch.minimum(predicted[:, :, None, 2:], box[:, None, :, 2:])
-    intersection = (high - low).clamp_(min=0).prod(-1)
+    common = intersection(predicted[:, :, None], box[:, None])
     area = (predicted[..., 2:] - predicted[..., :2]).prod(-1)
     object_area = (box[..., 2:] - box[..., :2]).prod(-1)
-    union = area[:, :, None] + object_area[:, None] - intersection
-    return ((intersection > IGNORE_IOU * union) & hiding[:, None]).any(-1)
+    union = area[:, :, None] + object_area[:, None] - common
+    return ((common > IGNORE_IOU * union) & hiding[:, None]).any(-1)

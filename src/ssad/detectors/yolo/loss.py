@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
+from ssad.core.tensor_boxes import intersection
 from ssad.detectors.adapters.common import sums
 from ssad.detectors.yolo.decode import Grid
 
@@ -47,10 +48,9 @@ class Answers:
 def ciou(box: Tensor, target: Tensor) -> Tensor:
     """Complete IoU [N] of pairs of boxes [N, 4] (Zheng et al. 2020): IoU less distance and difference of aspect."""
     eps = 1e-7
-    lower, upper = torch.maximum(box[:, :2], target[:, :2]), torch.minimum(box[:, 2:], target[:, 2:])
-    intersection = (upper - lower).clamp(min=0).prod(-1)
+    common = intersection(box, target)
     size, target_size = box[:, 2:] - box[:, :2], target[:, 2:] - target[:, :2]
-    overlap = intersection / (size.prod(-1) + target_size.prod(-1) - intersection + eps)
+    overlap = common / (size.prod(-1) + target_size.prod(-1) - common + eps)
     enclosing_size = torch.maximum(box[:, 2:], target[:, 2:]) - torch.minimum(box[:, :2], target[:, :2])
     centre_distance = ((box[:, :2] + box[:, 2:] - target[:, :2] - target[:, 2:]) ** 2).sum(-1) / 4
     angle = torch.atan(target_size[:, 0] / (target_size[:, 1] + eps)) - torch.atan(size[:, 0] / (size[:, 1] + eps))
