@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.core.detections import Detections, Solids, Truth
-from ssad.core.errors import ConfigError
+from ssad.core.detections import Detections, Truth
 from ssad.datasets.nuscenes.camera_truth import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
-from ssad.detectors.on_scenes import detect_scene, joined, match_boxes, score_2d, to_host
+from ssad.detectors.on_scenes import detect_scene, match_boxes, score_2d
 from ssad.metrics.detection_boxes import TP_METRICS
 from ssad.training.batches import PictureSet
 from ssad.training.data import nuscenes_items
@@ -145,39 +144,3 @@ def test_fewer_pictures_at_a_time_where_memory_is_short(recorded: Path) -> None:
         Small.room = 0
         with pytest.raises(torch.OutOfMemoryError):
             detect_scene(Small(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
-
-
-def test_tensors_are_changed_together_where_they_are_of_a_kind() -> None:
-    calls = []
-
-    def twice(value: torch.Tensor) -> torch.Tensor:
-        calls.append(value.shape)
-        return 2 * value
-
-    alike = [torch.rand(n, 3) for n in (2, 0, 5)]
-    for before, after in zip(alike, joined(alike, twice), strict=True):
-        assert (after == 2 * before).all()
-    assert calls == [(7, 3)]
-    for mixed in ([torch.rand(2, 3), torch.rand(2, 4)], [torch.rand(2), torch.arange(2)], [torch.tensor(1.0)]):
-        calls.clear()
-        for before, after in zip(mixed, joined(mixed, twice), strict=True):
-            assert (after == 2 * before).all()
-        assert len(calls) == len(mixed)
-
-
-def test_detections_come_to_the_host_as_they_are() -> None:
-    def some(count: int, *, three: bool) -> Detections:
-        score, label, box = torch.rand(count), torch.arange(count), torch.rand(count, 4)
-        solid = Solids(torch.rand(count, 3), torch.rand(count, 3), torch.rand(count), torch.rand(count, 2), label)
-        return Detections(score, label, box, solid if three else None)
-
-    before = [some(3, three=True), some(0, three=True), some(5, three=False), some(2, three=True)]
-    after = to_host(before)
-    assert [len(one.score) for one in after] == [3, 0, 5, 2]
-    assert [one.solid is None for one in after] == [False, False, True, False]
-    assert after[3].solid is not None
-    assert before[3].solid is not None
-    assert (after[3].solid.yaw == before[3].solid.yaw).all(), "solids stay with their detections"
-    assert not to_host([])
-    with pytest.raises(ConfigError, match="holds tensors"):
-        to_host([Detections(np.zeros(1), torch.zeros(1), torch.zeros(1, 4))])  # type: ignore[arg-type]

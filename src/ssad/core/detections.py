@@ -9,12 +9,14 @@ size is length, height, width (along x, y, z at yaw 0), yaw turns about the y ax
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssad.core.columns import concatenate
+from ssad.core.errors import ConfigError
 from ssad.core.types import U8
 
 if TYPE_CHECKING:
@@ -39,6 +41,11 @@ class Solids:
     yaw: Tensor
     velocity: Tensor
     attribute: Tensor
+
+    @staticmethod
+    def cat(parts: Sequence[Solids]) -> Solids:
+        """Concatenate boxes in order; at least one part is required."""
+        return concatenate(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +83,66 @@ class Detections:
     label: Tensor
     box: Tensor
     solid: Solids | None = None
+
+    @staticmethod
+    def cat(parts: Sequence[Detections]) -> Detections:
+        """Concatenate detections of one image in order; at least one part is required.
+
+        Raises:
+            ValueError: Some parts have 3D boxes and some have none.
+        """
+        solids = [part.solid for part in parts if part.solid is not None]
+        if solids and len(solids) < len(parts):
+            raise ValueError("detections with and without 3D boxes cannot be concatenated")
+        score, label, box = (_cat([getattr(part, name) for part in parts]) for name in ("score", "label", "box"))
+        return Detections(score, label, box, Solids.cat(solids) if solids else None)
+
+    @staticmethod
+    def cpu(images: Sequence[Detections]) -> list[Detections]:
+        """Copy the detections of images to the CPU, each column at once, since every copy waits for the device.
+
+        Raises:
+            ConfigError: The columns are not tensors.
+        """
+        flat = zip(
+            *(_cpu([getattr(image, name) for image in images]) for name in ("score", "label", "box")), strict=True
+        )
+        solids = [image.solid for image in images if image.solid is not None]
+        names = [column.name for column in fields(Solids)]
+        columns = zip(*(_cpu([getattr(solid, name) for solid in solids]) for name in names), strict=True)
+        # The images that have 3D boxes take theirs in order.
+        return [
+            Detections(*row, None if image.solid is None else Solids(*next(columns)))
+            for image, row in zip(images, flat, strict=True)
+        ]
+
+
+def _cat(parts: Sequence[Tensor]) -> Tensor:
+    import torch
+
+    return torch.cat(list(parts))
+
+
+def _cpu(parts: Sequence[Tensor]) -> Sequence[Tensor]:
+    import torch
+
+    if not all(isinstance(part, torch.Tensor) for part in parts):
+        raise ConfigError("broken promise: Detections holds tensors")
+    return parts if all(part.device.type == "cpu" for part in parts) else together(parts, torch.Tensor.cpu)
+
+
+def together(parts: Sequence[Tensor], change: Callable[[Tensor], Tensor]) -> list[Tensor]:
+    """Return the changed parts [N, ...], all changed in one call where they are of a kind.
+
+    Args:
+        parts: At least one.
+        change: Treats each row by itself.
+    """
+    import torch
+
+    if len({(part.dtype, part.shape[1:], part.device, part.ndim) for part in parts}) > 1 or not parts[0].ndim:
+        return [change(part) for part in parts]
+    return list(torch.split(change(torch.cat(list(parts))), [len(part) for part in parts]))
 
 
 @dataclass(frozen=True, slots=True)

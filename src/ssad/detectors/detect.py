@@ -23,7 +23,7 @@ from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.drawing import FOUND, draw_flat, draw_solids
 from ssad.detectors.images import as_images
-from ssad.detectors.on_scenes import SampleBoxes, detect_scene, to_host
+from ssad.detectors.on_scenes import SampleBoxes, detect_scene
 
 MODALITIES = dict.fromkeys(("use_lidar", "use_radar", "use_map", "use_external"), False)
 
@@ -125,7 +125,7 @@ def detect_pictures(
         intrinsic_batch = (
             torch.from_numpy(intrinsic.astype(np.float32))[None].to(device) if detector.task == "3d" else None
         )
-        (detections,) = to_host(detector.predict(loaded.tensor.to(device), intrinsic_batch, threshold=threshold))
+        (detections,) = Detections.cpu(detector.predict(loaded.tensor.to(device), intrinsic_batch, threshold=threshold))
         image = (loaded.tensor[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
         path = out / f"{file.stem}.jpg"
         if path.exists() and path.samefile(file):

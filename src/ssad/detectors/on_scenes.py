@@ -11,8 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ssad.core.detections import Detections, Solids, Truth, to_images
-from ssad.core.errors import ConfigError
+from ssad.core.detections import Detections, Truth, to_images
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES, MMDET3D_CLASSES
 from ssad.core.protocols import Detector
@@ -47,40 +46,6 @@ class SampleBoxes:
 
     token: str
     boxes: DetectedBoxes
-
-
-def to_host(found: Sequence[Detections]) -> list[Detections]:
-    """Detections of a batch on the CPU, in one copy for each column, since each copy waits for the device.
-
-    Raises:
-        ConfigError: They are not tensors.
-    """
-    columns = zip(
-        *(_host([getattr(single, name) for single in found]) for name in ("score", "label", "box")), strict=True
-    )
-    solid_parts = [single.solid for single in found if single.solid is not None]
-    solid_fields = ("centre", "size_lhw", "yaw", "velocity", "attribute")
-    host_solids = zip(*(_host([getattr(single, name) for single in solid_parts]) for name in solid_fields), strict=True)
-    solid_rows = [None if single.solid is None else Solids(*next(host_solids)) for single in found]
-    return [
-        Detections(score, label, box, solid) for (score, label, box), solid in zip(columns, solid_rows, strict=True)
-    ]
-
-
-def _host(parts: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    """Tensors on the CPU."""
-    if not all(isinstance(tensor, torch.Tensor) for tensor in parts):
-        raise ConfigError("broken promise: Detections holds tensors")
-    if all(tensor.device.type == "cpu" for tensor in parts):
-        return list(parts)
-    return joined(parts, torch.Tensor.cpu)
-
-
-def joined(parts: Sequence[torch.Tensor], change: Callable[[torch.Tensor], torch.Tensor]) -> list[torch.Tensor]:
-    """`change`, which works on each row by itself, of all tensors [N, ...] at once where they are of a kind."""
-    if len({(tensor.dtype, tensor.shape[1:], tensor.device, tensor.ndim) for tensor in parts}) > 1 or not parts[0].ndim:
-        return [change(tensor) for tensor in parts]
-    return list(torch.split(change(torch.cat(list(parts))), [len(tensor) for tensor in parts]))
 
 
 def detect_scene(
@@ -177,7 +142,7 @@ def _predict(
         )
         tensor = to_images([pictures[row] for row in rows], device)
         for detector_results, detector in zip(by_detector, detectors, strict=True):
-            for row, detections in zip(rows, to_host(_fitting(detector, tensor, intrinsics)), strict=True):
+            for row, detections in zip(rows, Detections.cpu(_fitting(detector, tensor, intrinsics)), strict=True):
                 detector_results[row] = detections
     return [[detector_results[row] for row in range(len(frames))] for detector_results in by_detector]
 

@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -336,15 +336,15 @@ def _changed_lens(
 def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
     """Return all solids in one table, those of mirrored images mirrored."""
     present = [solid for solid in solids if solid is not None]
-    solid_columns = {
-        column.name: torch.cat([getattr(solid, column.name) for solid in present]) for column in fields(Solids)
-    }
-    sign = torch.where(mirror, -1.0, 1.0).to(solid_columns["centre"])[:, None]
+    table = Solids.cat(present)
+    sign = torch.where(mirror, -1.0, 1.0).to(table.centre)[:, None]
     unchanged = torch.ones_like(sign)
-    solid_columns["centre"] = solid_columns["centre"] * torch.cat([sign, unchanged, unchanged], 1)
-    solid_columns["velocity"] = solid_columns["velocity"] * torch.cat([sign, unchanged], 1)
-    solid_columns["yaw"] = torch.where(mirror, torch.pi - solid_columns["yaw"], solid_columns["yaw"])
-    return Solids(**solid_columns)
+    return replace(
+        table,
+        centre=table.centre * torch.cat([sign, unchanged, unchanged], 1),
+        velocity=table.velocity * torch.cat([sign, unchanged], 1),
+        yaw=torch.where(mirror, torch.pi - table.yaw, table.yaw),
+    )
 
 
 def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:

@@ -19,7 +19,7 @@ from ssad.core.frames import Camera
 from ssad.core.traces import trace_hash
 from ssad.core.types import AgentKind, Episode, Limits
 from ssad.drivers.perceiving.driver import Perceiving, Sighting
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, on_host
+from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
 from ssad.drivers.perceiving.tracker import Tracking, tracking_of
 from ssad.simulators.closed_loop import system_version
@@ -230,23 +230,6 @@ def test_results_depend_on_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert after == f"{before.split()[0]} 0123456789ab"
     assert after != before
     assert " " not in system_version("perceiving-perfect")
-
-
-@pytest.mark.parametrize("flat", [False, True])
-def test_detections_that_are_brought_to_the_host_together_are_those_of_their_images(flat: bool) -> None:
-    draws = torch.Generator().manual_seed(0)
-    found = []
-    for n in (2, 0, 3):
-        parts = [torch.rand(n, k, generator=draws) for k in (3, 3, 1, 2, 1)]
-        solid = None if flat else Solids(parts[0], parts[1], parts[2][:, 0], parts[3], parts[4][:, 0].long())
-        found.append(Detections(torch.rand(n, generator=draws), torch.arange(n), torch.rand(n, 4), solid))
-    for one, other in zip(found, on_host(found), strict=True):
-        for name in ("score", "label", "box"):
-            assert torch.equal(getattr(one, name), getattr(other, name))
-        assert (other.solid is None) == flat
-        if one.solid is not None and other.solid is not None:
-            for name in ("centre", "size_lhw", "yaw", "velocity", "attribute"):
-                assert torch.equal(getattr(one.solid, name), getattr(other.solid, name))
 
 
 @pytest.mark.parametrize("system", [Fcos3d, PgdDet, Yolov5n])

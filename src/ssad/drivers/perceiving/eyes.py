@@ -198,7 +198,7 @@ class CameraEyes:
             detections += self.detector.predict(
                 pictures[start : start + batch_size].float() / 255.0, batch_intrinsics, threshold=self.threshold
             )
-        return on_host(detections) if pictures.is_cuda else detections
+        return Detections.cpu(detections) if pictures.is_cuda else detections
 
 
 def _room(pictures: torch.Tensor) -> int:
@@ -214,23 +214,6 @@ def _room(pictures: torch.Tensor) -> int:
 
 def _at(rows: I64, like: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(rows).to(like.device)
-
-
-def on_host(found: list[Detections]) -> list[Detections]:
-    """Detections of images [at least one] on the host, brought there in one go and not image by image."""
-    counts = [len(entry.score) for entry in found]
-
-    def transfer(values: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        return torch.split(torch.cat(list(values)).cpu(), counts)
-
-    flat_columns = [transfer([getattr(entry, name) for entry in found]) for name in ("score", "label", "box")]
-    solids = [entry.solid for entry in found if entry.solid is not None]
-    if len(solids) < len(found):
-        return [Detections(*part) for part in zip(*flat_columns, strict=True)]
-    names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
-    solid_columns = zip(*(transfer([getattr(entry, name) for entry in solids]) for name in names), strict=True)
-    parts = zip(*flat_columns, solid_columns, strict=True)
-    return [Detections(score, label, box, Solids(*solid)) for score, label, box, solid in parts]
 
 
 class PerfectEyes:
@@ -307,7 +290,7 @@ class PerfectEyes:
                     distance_factors[index][visible[index]],
                 )
                 scene = int(view.scene[row])
-                detections[name].append(_joined(projected_objects, self._invented(self._draws[scene], camera)))
+                detections[name].append(Detections.cat([projected_objects, self._invented(self._draws[scene], camera)]))
         return detections
 
     def snapshot(self) -> Any:
@@ -390,18 +373,3 @@ def _detections(  # noqa: PLR0917  # columns
     return Detections(
         torch.ones(len(rows), dtype=torch.float64), torch.tensor(label, dtype=torch.int64), columns[3], solid
     )
-
-
-def _joined(one: Detections, other: Detections) -> Detections:
-    first_solid, second_solid = one.solid, other.solid
-    assert first_solid is not None
-    assert second_solid is not None
-    solid = Solids(
-        torch.cat([first_solid.centre, second_solid.centre]),
-        torch.cat([first_solid.size_lhw, second_solid.size_lhw]),
-        torch.cat([first_solid.yaw, second_solid.yaw]),
-        torch.cat([first_solid.velocity, second_solid.velocity]),
-        torch.cat([first_solid.attribute, second_solid.attribute]),
-    )
-    score, label = torch.cat([one.score, other.score]), torch.cat([one.label, other.label])
-    return Detections(score, label, torch.cat([one.box, other.box]), solid)

@@ -10,6 +10,7 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.columns import concatenate
 from ssad.core.types import F64, AgentKind
 
 I64 = npt.NDArray[np.int64]
@@ -79,9 +80,7 @@ class Objects:
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Concatenate tables in order; at least one is required."""
-        return cls(
-            **{column.name: np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)}
-        )
+        return concatenate(parts)
 
 
 def no_objects() -> Objects:

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
+from ssad.core.columns import concatenate
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.registry import Reference
@@ -221,7 +222,7 @@ class Tracker:
         unmatched = np.setdiff1d(np.flatnonzero(found.score >= settings.high), hits)
         max_missed = np.where(tracks.hits >= settings.confirm, settings.reserve, settings.patience)
         tracks = tracks.take(tracks.missed <= max_missed)
-        self.tracks = _joined(tracks, self._begun(found.take(unmatched), look_times))
+        self.tracks = concatenate([tracks, self._begun(found.take(unmatched), look_times)])
 
     def _matched(self, tracks: Tracks, found: Objects, scenes: I64) -> tuple[I64, I64]:
         """Rows of tracks and of objects that belong together, scene by scene."""
@@ -369,12 +370,3 @@ def _looks(found: Objects) -> tuple[F64, F64, F64]:
     axis = weight * np.stack([np.cos(2 * yaw), np.sin(2 * yaw)], 1)
     heading = weight * np.stack([np.cos(yaw), np.sin(yaw)], 1)
     return axis, heading, found.score[:, None] * np.eye(len(AgentKind))[found.kind]
-
-
-def _joined(one: Tracks, other: Tracks) -> Tracks:
-    return Tracks(
-        **{
-            column.name: np.concatenate([getattr(one, column.name), getattr(other, column.name)])
-            for column in fields(one)
-        }
-    )

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ssad.core.boxes import TrackedBoxes
+from ssad.core.columns import concatenate
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera, Frame, SceneContext, camera_to_world
 from ssad.core.images import captioned, read_image, save_picture
@@ -65,14 +66,7 @@ def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
     frame = Frame(camera, "picture", "picture", 3.0)
     if not boxes_list:
         return frame
-    columns = {
-        field_name: np.concatenate([getattr(single_box, field_name) for single_box in boxes_list])
-        for field_name in ("centre", "size_lwh", "rotation", "velocity")
-    }
-    boxes = TrackedBoxes(
-        **columns, instance=tuple(single_box.instance[0] for single_box in boxes_list), visible=np.ones(len(boxes_list))
-    )
-    return replace(frame, boxes=boxes)
+    return replace(frame, boxes=concatenate(boxes_list))
 
 
 def pick_frame(

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.columns import concatenate
 from ssad.core.types import F64, Bool
 from ssad.metrics.rare_events import RareEstimate, weighted_estimate
 from ssad.world.noise import Keys
@@ -109,10 +110,7 @@ def sample(process: Process, proposal: Proposal, random: np.random.Generator, *,
         total, count = process.totals()
         weight = proposal.weights(total, count)
         parts.append(Sample(failed, weight, total, count, keys, component))
-    field_names = Sample.__dataclass_fields__
-    return Sample(
-        **{field_name: np.concatenate([getattr(part, field_name) for part in parts]) for field_name in field_names}
-    )
+    return concatenate(parts)
 
 
 def learn(
