@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import FormatError, MapError
+from ssad.core.rotations import wrap, wrap_angle
 from ssad.core.safeio import load_npz, save_npz
 from ssad.core.types import F32, F64, I32, U8, Bool, LaneType, array_dtypes
 
@@ -180,7 +181,7 @@ class LaneGraph:
         )
         point += lane_points.start
         x, y = (1.0 - t) * self.xy[point] + t * self.xy[point + 1]
-        yaw_change = (float(self.yaw[point + 1] - self.yaw[point]) + np.pi) % (2 * np.pi) - np.pi
+        yaw_change = wrap(float(self.yaw[point + 1] - self.yaw[point]))
         width = (1.0 - t) * float(self.width[point]) + t * float(self.width[point + 1])
         return float(x), float(y), float(self.yaw[point]) + t * yaw_change, width
 
@@ -196,7 +197,7 @@ class LaneGraph:
         # float32 weights: `at` multiplies float32 points by Python floats, which numpy does in float32.
         start_weight, end_weight = ((1.0 - t).astype(np.float32)[:, None], t.astype(np.float32)[:, None])
         xy = start_weight * self.xy[point] + end_weight * self.xy[point + 1]
-        yaw_change = ((self.yaw[point + 1] - self.yaw[point]).astype(np.float64) + np.pi) % (2 * np.pi) - np.pi
+        yaw_change = wrap_angle((self.yaw[point + 1] - self.yaw[point]).astype(np.float64))
         width = (1.0 - t) * self.width[point].astype(np.float64) + t * self.width[point + 1].astype(np.float64)
         return np.column_stack([xy, self.yaw[point].astype(np.float64) + t * yaw_change, width])
 

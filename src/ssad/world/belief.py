@@ -13,6 +13,7 @@ from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.geometry import to_local
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import wrap, wrap_angle
 from ssad.core.types import F32, F64, I32, AgentKind, Bool, LaneType, SignalState
 from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
@@ -197,7 +198,7 @@ class Lanes:
                 successor for successor in graph.successors(lane).tolist() if graph.kind[successor] == LaneType.DRIVING
             ]
             heading_changes = [
-                abs(_wrap(float(graph.yaw[last_vertices[successor]] - graph.yaw[last_vertices[lane]])))
+                abs(wrap(float(graph.yaw[last_vertices[successor]] - graph.yaw[last_vertices[lane]])))
                 for successor in successors
             ]
             if successors:
@@ -220,7 +221,7 @@ class Lanes:
         """For every lane: m from its start to the next junction (0 inside, FAR: none), and `TurnRank` there."""
         graph = self.graph
         in_junction = graph.junction >= 0
-        heading_change = _wrap((graph.yaw[last] - graph.yaw[first]).astype(np.float64))
+        heading_change = wrap_angle((graph.yaw[last] - graph.yaw[first]).astype(np.float64))
         turn_rank = np.where(
             np.abs(heading_change) < TURN,
             TurnRank.STRAIGHT,
@@ -331,11 +332,6 @@ class Lanes:
         forecasts[on_lane, :, 1] = y[vertex] + remainder * dy / length + left[on_lane, None] * dx / length
         forecasts[on_lane, :, 2] = yaw
         return forecasts
-
-
-def _wrap(angle: Any) -> Any:
-    """Wrap angles to [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def lanes_of(graphs: Mapping[str, LaneGraph], towns: Sequence[str], known: dict[str, Lanes]) -> list[Lanes]:

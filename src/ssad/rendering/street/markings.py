@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType
 from ssad.rendering.meshes.mesh import F64
 from ssad.rendering.street.free_ground import place, polygon_distance
@@ -162,7 +163,7 @@ def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, look: 
     directions = set()
     for successor in graph.successors(lane).tolist():
         points = graph.points(successor)
-        turn_angle = float((graph.yaw[points.stop - 1] - graph.yaw[points.start] + np.pi) % (2 * np.pi) - np.pi)
+        turn_angle = float(wrap_angle(graph.yaw[points.stop - 1] - graph.yaw[points.start]))
         directions.add("ahead" if abs(turn_angle) < 0.5 else "left" if turn_angle > 0 else "right")
     for distance in (9.0, 24.0):
         x, y, yaw, _ = graph.at(lane, s - distance)

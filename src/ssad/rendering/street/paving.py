@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import wrap_angle
 from ssad.rendering.meshes.mesh import F32, F64
 from ssad.rendering.street.palette import Look
 from ssad.rendering.street.region import WALK, Ground, region_mesh
@@ -57,7 +58,7 @@ def _bends(yaw: F32, s: F32, width: F32) -> list[int]:
     indices, last = [0], len(s) - 1
     for index in range(1, last):
         previous = indices[-1]
-        heading_change = abs(float((yaw[index + 1] - yaw[previous] + np.pi) % (2.0 * np.pi) - np.pi))
+        heading_change = abs(float(wrap_angle(yaw[index + 1] - yaw[previous])))
         # Long quads would make tiles draw too much, so straight lines are cut as well.
         if (
             heading_change > 0.003

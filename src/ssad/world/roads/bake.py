@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ssad.core.errors import MapError, install_extra
 from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
+from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
 from ssad.world.roads.signals import Approaches, place_signals, place_signs
@@ -156,7 +157,7 @@ def _shape(answer: Answer, part: slice, *, reverse: bool) -> _Shape | None:
         return None
     # On unwrapped yaw, which has no jump at pi.
     selected = _thin(arc_length, yaw, width)
-    yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
+    yaw = wrap_angle(yaw)
     return _Shape(xy[selected], z[selected], yaw[selected], np.maximum(width[selected], 0.0), arc_length[selected])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ssad.core.errors import MapError
 from ssad.core.lane_graph import LaneGraph, no_signals
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Bool, LaneType
 
 WIDTH: Final = 3.5  # m
@@ -117,6 +118,6 @@ def _covered(path: F64, lanes: Sequence[F64], beside: float) -> Bool:
     for lane in lanes:
         distance = np.hypot(path[:, None, 0] - lane[None, :, 0], path[:, None, 1] - lane[None, :, 1])
         nearest = distance.argmin(1)
-        heading_difference = np.remainder(_headings(lane)[nearest] - yaw + np.pi, 2 * np.pi) - np.pi
+        heading_difference = wrap_angle(_headings(lane)[nearest] - yaw)
         covered |= (distance.min(1) <= beside) & (np.abs(heading_difference) <= ALIGNED)
     return covered

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.errors import RouteError
-from ssad.core.rotations import wrap_angle
+from ssad.core.rotations import wrap
 from ssad.core.types import F64, Condition, Controller, EpisodeAgent, LaneType, Phase, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._remember import remembered
 
@@ -30,11 +30,6 @@ class Place:
 
     lane: int
     s: float
-
-
-def wrap(angle: float) -> float:
-    """Wrap an angle to [-pi, pi)."""
-    return float(wrap_angle(angle))
 
 
 def shifted(pose: Pose, forward: float, left: float, turn: float = 0.0) -> Pose:
