@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from ssad.core.geometry import corners
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.lane_strips import strips
 from ssad.core.types import F64, U8, EpisodeTrace
@@ -78,10 +79,5 @@ def found_view(
 
 def _corners(trace: EpisodeTrace, row: int, agent: int) -> F64:
     """Return the corners [4, 2] of a body: front left, rear left, rear right, front right."""
-    cos, sin = np.cos(trace.yaw[row, agent]), np.sin(trace.yaw[row, agent])
-    longitudinal = 0.5 * trace.length[agent] * np.array([1, -1, -1, 1])
-    lateral = 0.5 * trace.width[agent] * np.array([1, 1, -1, -1])
-    x, y = trace.x[row, agent], trace.y[row, agent]
-    return np.asarray(
-        np.stack([x + cos * longitudinal - sin * lateral, y + sin * longitudinal + cos * lateral], -1), np.float64
-    )
+    columns = trace.x[row, agent], trace.y[row, agent], trace.yaw[row, agent], trace.length[agent], trace.width[agent]
+    return corners(*(np.float64(column) for column in columns))

@@ -20,6 +20,7 @@ from torch.nn import functional
 from ssad.core.detections import Assignment, Dense
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.protocols import Detector
+from ssad.core.tensor_boxes import iou
 
 TERMS: Mapping[str, frozenset[str]] = {
     "classification": frozenset(
@@ -218,7 +219,7 @@ class Hide:
         total = dense.logit.new_zeros(len(dense.logit))
         for image_index, truth in enumerate(situation.assignment.truth):
             for object_index in objects_of(situation, image_index):
-                overlap = _overlap(dense.box[image_index], truth.box[object_index].to(dense.box))
+                overlap = iou(dense.box[image_index], truth.box[object_index].to(dense.box))
                 class_score = (
                     score[image_index].amax(-1) if self.every else score[image_index, :, int(truth.label[object_index])]
                 )
@@ -347,14 +348,6 @@ def objects_of(situation: Situation, image: int) -> list[int]:
         for object_index in candidates
         if object_index < len(labels) and (class_indices is None or labels[object_index] in class_indices)
     ]
-
-
-def _overlap(box: Tensor, real: Tensor) -> Tensor:
-    """IoU [P] of boxes [P, 4] with one box [4]."""
-    overlap_sides = (torch.minimum(box[:, 2:], real[2:]) - torch.maximum(box[:, :2], real[:2])).clamp_min(0.0)
-    intersection = overlap_sides.prod(1)
-    union = (box[:, 2:] - box[:, :2]).clamp_min(0.0).prod(1) + (real[2:] - real[:2]).prod() - intersection
-    return intersection / union.clamp_min(1e-9)
 
 
 def _on(place: Tensor, box: Tensor) -> Tensor:
