@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,25 @@ def make_detector(
         _check_hash(path, state)
     fit_state(detector, state, path)
     return detector.to(device)
+
+
+@lru_cache(maxsize=8)
+def loaded_detector(
+    name: str, *, weights: str | None = None, device: str = "cpu", input_width: int | None = None
+) -> Any:
+    """Return a detector by name, built once per process and shared: do not change it.
+
+    Args:
+        name: See `make_detector`.
+        weights: See `make_detector`.
+        device: Device of the detector.
+        input_width: Width of its input, px; None for the builder's default.
+
+    Raises:
+        SSADError: See `make_detector`.
+    """
+    options: dict[str, Any] = {} if input_width is None else {"input_width": input_width}
+    return make_detector(name, weights=weights, device=device, **options)
 
 
 def _classes_of(path: Path) -> dict[str, Any]:

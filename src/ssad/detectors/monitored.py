@@ -11,7 +11,6 @@ from torch import Tensor
 from ssad.core.detections import Detections, Solids
 from ssad.core.errors import SSADError
 from ssad.detectors.check import promises
-from ssad.detectors.on_scenes import to_host
 
 
 class Watched:
@@ -43,7 +42,7 @@ class Watched:
         """Return the detector's predictions, or empty ones after a failure."""
         if not self.reason:
             try:
-                detections = to_host(self.detector.predict(images, intrinsic, threshold=threshold))
+                detections = Detections.cpu(self.detector.predict(images, intrinsic, threshold=threshold))
                 self.reason = self._broken(detections, len(images))
                 if not self.reason:
                     return detections

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -218,10 +217,7 @@ def _paired(order: Order) -> str:
     return digest("gap", order.spec["scenario"]["name"], order.seed)[:16]
 
 
-@lru_cache(maxsize=4)
 def _detector(name: str, weights: str | None, width: int | None, device: str = "cpu") -> Any:
-    """Return a detector, built once per process."""
-    from ssad.detectors import make_detector
+    from ssad.detectors import loaded_detector
 
-    options: dict[str, Any] = {} if width is None else {"input_width": width}
-    return make_detector(name, weights=weights, device=device, **options)
+    return loaded_detector(name, weights=weights, device=device, input_width=width)

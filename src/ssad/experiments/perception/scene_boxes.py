@@ -27,7 +27,7 @@ from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
-from ssad.detectors import make_detector
+from ssad.detectors import loaded_detector, make_detector
 from ssad.detectors.image_scores import (
     PictureBoxes,
     PictureTruth,
@@ -151,15 +151,6 @@ def boxes_path(folder: Path, detector: str, scene: SceneCondition) -> Path:
     return folder / FOLDER / file_name(detector) / f"{scene.name}.npz"
 
 
-@lru_cache(maxsize=8)
-def _loaded(name: str, weights: str, device: str, threads: int) -> Any:
-    quiet_warp()  # it runs the shifts
-    torch.set_num_threads(threads)
-    if device == "cpu":
-        keep_memory()
-    return detector_of(name, weights, device)
-
-
 def system_of(examination: Examination, name: str) -> Any:
     """Return a system of a run by name: a detector, or one behind a defence; a detector is loaded once.
 
@@ -169,7 +160,11 @@ def system_of(examination: Examination, name: str) -> Any:
     """
     detector_name, defence = examination.defended.get(name, (name, None))
     weights = dict(examination.detectors)[detector_name]
-    detector = _loaded(detector_name, weights, examination.device, examination.threads)
+    quiet_warp()  # it runs the shifts
+    torch.set_num_threads(examination.threads)
+    if examination.device == "cpu":
+        keep_memory()
+    detector = loaded_detector(detector_name, weights=weights or None, device=examination.device)
     return detector if defence is None else Defended(detector, defence)
 
 

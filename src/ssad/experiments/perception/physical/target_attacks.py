@@ -18,7 +18,7 @@ from ssad.core.detections import Truth
 from ssad.core.machine import quiet_warp
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
-from ssad.detectors import make_detector
+from ssad.detectors import loaded_detector
 from ssad.engine.pool import open_pool, run_all
 from ssad.experiments.perception.physical.lit_images import LitPictures
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
@@ -65,7 +65,8 @@ class TargetAttacks:
 
     def detector(self, name: str) -> Detector:
         """Return a detector, loaded on first use."""
-        return _detector(name, self.device)
+        detector: Detector = loaded_detector(name, device=self.device)
+        return detector
 
     def clips(self, recording: str, count: int, detector: str) -> TargetClips:
         """Return the first images of a recording, clean or ready for a texture."""
@@ -239,13 +240,6 @@ def see_all(
 def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer | Decal, ...]]:
     """Where textures go, each alone, as `see_clips` takes them."""
     return [(surface_of(target, surface).layer,) for surface in surfaces]
-
-
-@lru_cache(maxsize=4)
-def _detector(name: str, device: str) -> Detector:
-    """Return a cached detector: trainings and tests leave it unchanged."""
-    loaded: Detector = make_detector(name, device=device)
-    return loaded
 
 
 @lru_cache(maxsize=16)
