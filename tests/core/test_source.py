@@ -53,6 +53,17 @@ def test_a_version_has_12_digits(write: Write) -> None:
         "if True:\n\timport own_b",
         "  from own_b import (\n  x as y,\n  z)",
         "from  own_b  import *",
+        "from own_b \\\n    import x",
+        "from \\\n    own_b import x, \\\n    y",
+        "import os, \\\n    own_b",
+        "import os; import own_b",
+        "import os; from own_b import x",
+        "if True: from own_b import x",
+        "try: import own_b  # (for speed)\nexcept ImportError: pass",
+        "from own_b import (  # noqa (x)\n    x,\n)",
+        "def f():\n    from own_b import (\n        x,  # the first (of all), no other\n        y,\n    )",
+        "from own_b import(x)",
+        "import own_b\r\nimport os\r\n",
         "X = 'own_b.thing:name'",
         'X = "own_b.thing"',
     ],
@@ -64,7 +75,21 @@ def test_imports_are_followed_wherever_they_stand(write: Write, text: str) -> No
     assert ("own_b.thing" in found) == ("thing" in text)
 
 
-@pytest.mark.parametrize("text", ["import_own_b = 1", "x = 'own_b'", "# no import own_b", "import own_bb", "x.own_b.y"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import_own_b = 1",
+        "x = 'own_b'",
+        "# no import own_b",
+        "import own_bb",
+        "x.own_b.y",
+        "from os import own_b",
+        "import os as own_b",
+        "x = 1 if x else from_own_b",
+        "'''\nfrom own_b (the second) import (\n    x\n'''",
+        "from os import (\n    path,  # import own_b, see there\n)",
+    ],
+)
 def test_what_only_looks_like_an_import_is_none(write: Write, text: str) -> None:
     write({"own_a.py": f"{text}\n", "own_b.py": ""})
     assert led_to("own_a") == {"own_a"}
@@ -88,6 +113,14 @@ PACKAGE = {
     [
         ("", set()),
         ("from . import other", {"sub.other"}),
+        ("from . import other as another, nothing", {"sub.other"}),
+        ("from . import (\n    # near) and\n    other,\n)", {"sub.other"}),
+        ("from . \\\n    import other", {"sub.other"}),
+        ("from .import other", {"sub.other"}),
+        ("from. import other", {"sub.other"}),
+        ("from .. import sub, top", {"top"}),
+        ("from ... import top", set()),
+        ("from .deep import (  # not top, but\n    far,\n)", {"sub.deep", "sub.deep.far"}),
         ("from .other import x", {"sub.other"}),
         ("from .. import top", {"top"}),
         ("from ..top import x", {"top"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib.util
 import re
@@ -11,8 +12,11 @@ from pathlib import Path
 
 from ssad.core.seeding import digest
 
-_FROM = re.compile(r"^[ \t]*from[ \t]+(\.*)([\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]+)", re.MULTILINE)
-_IMPORT = re.compile(r"^[ \t]*import[ \t]+([^\n]+)", re.MULTILINE)
+Import = tuple[int, str, tuple[str, ...]]
+"""The dots, the module and the names of an import."""
+# Where an import may begin; `ast` reads it. To parse whole files takes seconds, and each command needs hundreds.
+_START = re.compile(r"(?:^|[:;])[ \t]*((?:from|import)\b)", re.MULTILINE)
+_BRACKET = re.compile(r"from\b[\s.\w\\]+\bimport[\s\\]*\((?:[^)#]|#[^\n]*+)*+$")  # opened and not closed
 _STRING = re.compile(r"""["'](\w+(?:\.\w+)+)(?::\w+)?["']""")  # "package.module:object", as tables of names have it
 
 
@@ -25,7 +29,7 @@ def source_version(module: str, *, without: Sequence[str] = ()) -> str:
 def source_files(module: str, *, without: Sequence[str] = ()) -> dict[str, Path]:
     """Return the files of a module and of its dependencies, by module name.
 
-    Imports are followed anywhere in the text, and so are strings that name a module (for a package, all its
+    Imports are followed wherever they stand, and so are strings that name a module (for a package, all its
     modules). Code installed elsewhere than beside the module's own top-level package is left out: its version is
     in run.json.
 
@@ -86,31 +90,38 @@ def _file(base: Path, name: str) -> Path | None:
     return None
 
 
-def _scan(path: Path) -> tuple[str, tuple[tuple[int, str, tuple[str, ...]], ...], tuple[str, ...]]:
-    """Return the hash of a file, its imports (dots, module, names), and the modules that its strings name."""
+def _scan(path: Path) -> tuple[str, tuple[Import, ...], tuple[str, ...]]:
+    """Return the hash of a file, its imports, and the modules that its strings name."""
     status = path.stat()
     # Time and size are part of the cache's key: an edited file is scanned again.
     return _scanned(path, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4096)
-def _scanned(
-    path: Path, _changed: int, _size: int
-) -> tuple[str, tuple[tuple[int, str, tuple[str, ...]], ...], tuple[str, ...]]:
+def _scanned(path: Path, _changed: int, _size: int) -> tuple[str, tuple[Import, ...], tuple[str, ...]]:
     content = path.read_bytes()
     text = content.decode("utf-8", "replace")
-    imports = [
-        (
-            len(import_match[1]),
-            import_match[2],
-            tuple(re.findall(r"(\w+)(?:\s+as\s+\w+)?\s*(?:,|\)|$)", import_match[3])),
-        )
-        for import_match in _FROM.finditer(text)
-    ]
-    imports += [
-        (0, import_clause.split()[0], ())
-        for import_match in _IMPORT.finditer(text)
-        for import_clause in import_match[1].split(",")
-        if import_clause.split()
-    ]
+    imports: list[Import] = []
+    for start in _START.finditer(text):
+        for statement in _statements(text, start.start(1)):
+            if isinstance(statement, ast.ImportFrom):
+                names = tuple(alias.name for alias in statement.names)
+                imports.append((statement.level, statement.module or "", names))
+            elif isinstance(statement, ast.Import):
+                imports += [(0, alias.name, ()) for alias in statement.names]
     return hashlib.sha256(content).hexdigest(), tuple(imports), tuple(set(_STRING.findall(text)))
+
+
+def _statements(text: str, start: int) -> list[ast.stmt]:
+    """Return the statements on the logical line that begins at a position; none where the text is not Python."""
+    end = start
+    while end < len(text):
+        end = text.find("\n", end) + 1 or len(text)
+        lines = text[start:end]
+        try:
+            return ast.parse(lines).body
+        except (SyntaxError, ValueError):
+            # An open bracket or a backslash: the statement goes on in the next line.
+            if not (_BRACKET.match(lines) or lines.rstrip("\r\n").endswith("\\")):
+                return []
+    return []
