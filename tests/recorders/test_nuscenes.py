@@ -233,7 +233,7 @@ def test_four_drives_share_a_street_that_is_built_for_them(tmp_path: Path, monke
         asked.append(key)
         raise ConfigError("seen enough")
 
-    def tried(out: Path, identity: dict[str, Any], record: Any, tasks: list[Any], **options: Any) -> None:
+    def tried(pool: Any, record: Any, tasks: list[Any], **options: Any) -> None:
         for task in tasks:
             numbers = list(task[2])
             for number in numbers:
@@ -242,7 +242,7 @@ def test_four_drives_share_a_street_that_is_built_for_them(tmp_path: Path, monke
             asked.append(("together", *numbers))
 
     monkeypatch.setattr("ssad.recorders.nuscenes.drive_street", street)
-    monkeypatch.setattr("ssad.recorders.nuscenes.run_parts", tried)
+    monkeypatch.setattr("ssad.recorders.nuscenes.run_all", tried)
     monkeypatch.setattr("ssad.recorders.nuscenes._merge", lambda *what: None)
     small = {"scenes": 5, "seconds": 0.5, "width": 64, "streets": "any", "seed": 7}
     record_nuscenes(Recording(tmp_path, ("Twinford",), (), **small), workers=0)  # type: ignore[arg-type]

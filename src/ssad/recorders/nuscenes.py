@@ -7,7 +7,6 @@ stopped at any moment and resumed, and the bytes do not depend on the number of 
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
@@ -30,9 +29,9 @@ from ssad.core.seeding import digest, generator
 from ssad.core.types import F64, U8, Episode, EpisodeTrace
 from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.writer import NuScenesWriter, place_file
-from ssad.engine.pool import Pool, open_pool, run_all
-from ssad.engine.store import locked
+from ssad.engine.pool import open_pool, run_all
 from ssad.recorders.drives import check_streets, drive_street, make_drive
+from ssad.recorders.parts import TIME_LIMIT, PartsFolder
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
 from ssad.rendering.camera.labels import visible_share
 from ssad.rendering.camera.lamps import own_lamps
@@ -52,7 +51,6 @@ KEY: Final = 5  # steps of the world (0.1 s) from one key frame to the next
 START: Final = 1_600_000_000_000_000  # us
 REACH: Final = 80.0  # m within which things are annotated
 DRAWN: Final = 140.0  # m within which things are drawn
-PART: Final = "part.json"
 # s by which each camera fires before the LiDAR's sweep ends, as in nuScenes
 AHEAD: Final = {
     "CAM_FRONT_LEFT": 0.0431,
@@ -63,7 +61,6 @@ AHEAD: Final = {
     "CAM_BACK_LEFT": 0.0005,
 }
 FIRST: Final = 0.1  # s, when the first sweep ends
-PART_S: Final = 7200.0  # s that a part may take
 SHARED: Final = 4  # drives along one street where each street is built for the recording
 GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
@@ -112,6 +109,11 @@ class Recording:
             raise ConfigError("nothing to record: name a town, and one scene or more")
         if self.width < 64 or self.width % 16 or not 0 <= self.sweeps < KEY or not 0.5 <= self.seconds <= 3600:
             raise ConfigError("width: a multiple of 16 from 64; sweeps: 0 to 4; seconds: 0.5 to 3600")
+
+    @property
+    def parts(self) -> PartsFolder:
+        """The scenes of the recording."""
+        return PartsFolder(self.out, self.identity())
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that decide the bytes of the recording, as plain data."""
@@ -206,11 +208,10 @@ def _name(town: str, number: int) -> str:
 def _scene(recording: Recording, town: str, number: int) -> None:
     """Record one scene into its part; a finished part is left alone."""
     name = _name(town, number)
-    folder = recording.out / ".parts" / name
-    if (folder / PART).is_file():
+    parts = recording.parts
+    if parts.finished(name):
         return
-    # A part without its page was interrupted; its files are incomplete.
-    shutil.rmtree(folder, ignore_errors=True)
+    folder = parts.begin(name)
     quiet_warp()
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
@@ -258,7 +259,7 @@ def _scene(recording: Recording, town: str, number: int) -> None:
         "weather": weather_words(weather),
         "sensors": _sensors(cameras),
     }
-    safeio.write_atomic(folder / PART, safeio.dump_json(part_page) + "\n")
+    parts.finish(name, part_page)
 
 
 def _meshes_near(cast: SceneObjects, trace: EpisodeTrace, steps: Sequence[int]) -> set[int]:
@@ -481,48 +482,15 @@ def record_nuscenes(
         for first_scene in range(0, recording.scenes, scenes_per_task)
     ]
     if (out / recording.version / "splits.json").is_file():  # written last
-        if not (out / ".parts" / "recording.json").is_file():
+        if not recording.parts.claimed:
             raise StoreError(f"{out}: holds a data set, but not how it was recorded (.parts); choose another folder")
-        check_parts(out, recording.identity())
+        recording.parts.claim()
         return out
     pool = open_pool(len(tasks), workers=workers, ray=ray, device=recording.device)
-    with locked(out, "ssad record"):
-        run_parts(out, recording.identity(), _scenes, tasks, pool=pool, progress=progress)
+    with recording.parts.held("ssad record"):
+        run_all(pool, _scenes, tasks, timeout_s=TIME_LIMIT, progress=progress)
         _merge(recording, [_name(town, number) for _, town, numbers in tasks for number in numbers])
     return out
-
-
-def check_parts(out: Path, identity: dict[str, Any]) -> None:
-    """Write the settings of a recording, or compare them with those of the folder.
-
-    Raises:
-        StoreError: The folder holds another recording.
-    """
-    safeio.make_folder(out / ".parts")
-    page = out / ".parts" / "recording.json"
-    if page.is_file():
-        if safeio.read_json(page) != identity:
-            raise StoreError(f"{out}: holds another recording; choose another folder")
-    else:
-        safeio.write_atomic(page, safeio.dump_json(identity, indent=1) + "\n")
-
-
-def run_parts(
-    out: Path,
-    identity: dict[str, Any],
-    record: Callable[[Any], Any],
-    tasks: Sequence[Any],
-    *,
-    pool: Pool,
-    progress: Callable[[int, int], None],
-) -> None:
-    """Record every missing part.
-
-    Raises:
-        StoreError: Another recording, or parts that failed (see `run_all`).
-    """
-    check_parts(out, identity)
-    run_all(pool, record, tasks, timeout_s=PART_S, progress=progress)
 
 
 def _merge(recording: Recording, names: list[str]) -> None:
@@ -531,8 +499,7 @@ def _merge(recording: Recording, names: list[str]) -> None:
     splits: dict[str, list[str]] = {"train": [], "val": [], "all": []}
     with NuScenesWriter(out, recording.version) as writer:
         for name in names:
-            folder = out / ".parts" / name
-            part_page = safeio.read_json(folder / PART)
+            folder, part_page = recording.parts.part(name), recording.parts.page(name)
             description = f"{part_page['town']}, {part_page['weather']}"
             scene = writer.add_scene(name, description=description, location=part_page["town"])
             splits["val" if part_page["town"] in recording.held_out else "train"].append(name)

@@ -32,9 +32,9 @@ from ssad.core.seeding import digest, generator
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
 from ssad.engine.pool import open_pool, run_all
-from ssad.engine.store import locked
 from ssad.recorders.drives import drive_street, make_drive
-from ssad.recorders.nuscenes import PART_S, check_parts, draw_weather, drive
+from ssad.recorders.nuscenes import draw_weather, drive
+from ssad.recorders.parts import TIME_LIMIT, same_request
 from ssad.recorders.target_recording import BEHIND, FOCAL, SMALL, Clips
 from ssad.recorders.viewpoints import (
     AIM,
@@ -206,9 +206,10 @@ def _part(task: tuple[Clips, str, int, int, str]) -> str:
         ConfigError: The drives show too few views of the target.
     """
     recording, town, number, count, name = task
-    page = recording.out / ".parts" / name / "part.json"
-    if page.is_file():
+    parts = recording.parts
+    if parts.finished(name):
         return name
+    parts.begin(name)
     quiet_warp()
     cv2.setNumThreads(1)
     rows: dict[int, dict[str, Any]] = {}
@@ -242,10 +243,7 @@ def _part(task: tuple[Clips, str, int, int, str]) -> str:
         raise ConfigError(
             f"{town}: {len(rows)} of {count} pictures in {DRIVES} drives ({reasons}); choose smaller distances"
         )
-    safeio.write_atomic(
-        page,
-        safeio.dump_json({"images": [rows[image_index] for image_index in range(count)], "skipped": skipped}) + "\n",
-    )
+    parts.finish(name, {"images": [rows[image_index] for image_index in range(count)], "skipped": skipped})
     return name
 
 
@@ -424,10 +422,10 @@ def record_all(
     all_tasks = [task for recording_tasks in tasks for task in recording_tasks]
     with ExitStack() as locks:
         for recording in recordings:
-            locks.enter_context(locked(recording.out, "ssad record"))
-            check_parts(recording.out, recording.identity())
+            locks.enter_context(recording.parts.held("ssad record"))
+            safeio.remove_unfinished(recording.out / "images")
         pool = open_pool(len(all_tasks), workers=workers, ray=ray, device=recordings[0].device)
-        run_all(pool, _part, all_tasks, timeout_s=PART_S, progress=progress)
+        run_all(pool, _part, all_tasks, timeout_s=TIME_LIMIT, progress=progress)
         for recording, recording_tasks in zip(recordings, tasks, strict=True):
             _write_pages(recording, recording_tasks)
     return [recording.out for recording in recordings]
@@ -436,10 +434,10 @@ def record_all(
 def _check_other(clips: Clips) -> None:
     """StoreError: the folder holds another recording."""
     finished = clips.out / "annotations" / "all.json"
-    if finished.is_file() and not (clips.out / ".parts").is_dir():
+    if finished.is_file() and not clips.parts.claimed:
         data = safeio.read_json(finished)
         info = data.get("info") if isinstance(data, dict) else None
-        if not isinstance(info, dict) or info.get("recording") != clips.identity():
+        if not isinstance(info, dict) or not same_request(info.get("recording"), clips.identity()):
             raise StoreError(f"{clips.out}: holds another recording; choose another folder")
 
 
@@ -454,7 +452,7 @@ def _write_pages(clips: Clips, tasks: Sequence[tuple[Clips, str, int, int, str]]
         rows: list[dict[str, Any]] = []
         reject_counts: Counter[str] = Counter()
         for task in split_tasks:
-            part_page = safeio.read_json(clips.out / ".parts" / task[4] / "part.json")
+            part_page = clips.parts.page(task[4])
             rows += part_page["images"]
             reject_counts.update(part_page["skipped"])
         counts = Counter(CLASSES[entry["label"]] for row in rows for entry in row["objects"] if not entry["crowd"])

@@ -12,6 +12,7 @@ import numpy as np
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.recorders.drives import check_streets
 from ssad.recorders.nuscenes import HELD_OUT, WEATHERS
+from ssad.recorders.parts import PartsFolder
 from ssad.rendering.target import Target, TargetSign, TargetWalker
 from ssad.world.roads import is_town
 
@@ -114,6 +115,11 @@ class Clips:
                 f"pictures of {self.size} pixels: a {target_kind} {max_distance:g} m away needs "
                 f"{min_size}, and 4096 is the most"
             )
+
+    @property
+    def parts(self) -> PartsFolder:
+        """The parts of the recording."""
+        return PartsFolder(self.out, self.identity())
 
     def identity(self) -> dict[str, Any]:
         """Return the settings that decide the bytes of the recording, as plain data."""

@@ -11,19 +11,19 @@ from typing import Any
 import msgspec
 
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.errors import ConfigError, StoreError
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tables import stream, table_path
 from ssad.engine.pool import open_pool, run_all
 from ssad.engine.store import locked
+from ssad.recorders.parts import TIME_LIMIT, claim
 from ssad.recorders.shifted.manifest import FOLDER, PAGE, TABLE, Tally, digest_file, page, read_lines, shard_path
 from ssad.recorders.shifted.options import Options, Shard, Strength
 from ssad.recorders.shifted.scene_writer import UNFINISHED, check_folders, finished, link, make_shard
 from ssad.scenarios.static.shifts.sun import NO_SUN
 
 Progress = Callable[[int, int], None]
-SHARD_S = 7200.0  # time limit of a scene under a shift, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,11 @@ def materialise(
             _begin(options, shift, severity, source)
         shards = options.absolute().shards(scene_names)
         run_all(
-            open_pool(len(shards), workers=workers, ray=ray), make_shard, shards, timeout_s=SHARD_S, progress=progress
+            open_pool(len(shards), workers=workers, ray=ray),
+            make_shard,
+            shards,
+            timeout_s=TIME_LIMIT,
+            progress=progress,
         )
         written_roots, errors = [], []
         for shift, severity in conditions:
@@ -113,14 +117,9 @@ def _begin(options: Options, shift: str, severity: Strength, source: dict[str, A
     """Create a root, or resume one with the same identity. StoreError for a root of another identity."""
     root = options.root(shift, severity)
     check_folders(root, ("", FOLDER, options.version, UNFINISHED), options.source)
-    safeio.make_folder(root / FOLDER)
     identity = {"identity": dict(Shard(options, shift, severity, "").identity()), "source": source}
-    identity_path = root / FOLDER / "identity.json"
-    if identity_path.exists():
-        if _read_identity(identity_path) != identity:
-            raise StoreError(f"{root}: holds a shift of other data or options; choose another folder")
-    else:
-        safeio.write_atomic(identity_path, safeio.dump_json(identity, indent=1) + "\n")
+    refusal = f"{root}: holds a shift of other data or options; choose another folder"
+    claim(root / FOLDER / "identity.json", identity, refusal)
     try:
         (root / PAGE).unlink(missing_ok=True)  # the root is incomplete until this run finishes it
         _clear(root, options.version)
@@ -135,14 +134,6 @@ def _begin(options: Options, shift: str, severity: Strength, source: dict[str, A
     for table in sorted((options.source / options.version).glob("*.json")):
         if table.name not in annotation_tables:
             link(root, table, root / options.version / table.name)
-
-
-def _read_identity(path: Path) -> Any:
-    """Read the identity file of a root; None if it is damaged."""
-    try:
-        return safeio.read_json(path)
-    except FormatError:
-        return None
 
 
 def _clear(root: Path, version: str) -> None:
