@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from ssad.cli.importing import check_yaml, store_town
 from ssad.cli.options import Dir
 from ssad.core.errors import ConfigError
 
@@ -112,24 +113,16 @@ def import_drive(
 
     Where no town is known, lanes are made of the paths that were driven, and stored as a town beside OUT.yaml too.
     """
-    from ssad.core.lane_graph import save_graph
-    from ssad.core.safeio import home
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.interchange.drive_log import scenario_of_drive
     from ssad.scenarios.dynamic import save_scenarios
-    from ssad.world.roads import import_map as store
-    from ssad.world.roads import town_names
 
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"{out}: a scenario file ends in .yaml")
+    check_yaml(out)
     with NuScenes(root, version) as data:
         imported_drive = scenario_of_drive(data, scene, town=out.stem, map_name=on)
     town = imported_drive.scenario.town
     if not imported_drive.known:
-        if town_names().get(town) == "built-in":
-            raise ConfigError(f"'{town}' is a built-in town; choose another name for {out}")
-        save_graph(imported_drive.graph, out.with_suffix(".npz"))
-        store(out.with_suffix(".npz"), town, home())
+        store_town(imported_drive.graph, town, beside=out)
     save_scenarios(out, imported_drive.scenario)
     omissions = ", ".join(f"{count} {category}" for category, count in sorted(imported_drive.left_out.items()))
     print(

@@ -6,12 +6,15 @@ from collections.abc import Callable, Sequence
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from ssad.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ssad.core.lane_graph import LaneGraph
 
 
 class Format(StrEnum):
@@ -123,20 +126,14 @@ def import_commonroad(
 
     Lanelets that are no town's yet are stored as a town beside OUT.yaml too.
     """
-    from ssad.core.lane_graph import save_graph
-    from ssad.core.safeio import home
     from ssad.interchange.commonroad_reader import read_commonroad
     from ssad.scenarios.dynamic import save_scenarios
-    from ssad.world.roads import import_map, town_names
 
     check_yaml(out)
     imported = read_commonroad(file, town=out.stem, map_name=on)
     town = imported.scenario.town
     if not imported.known:
-        if town_names().get(town) == "built-in":
-            raise ConfigError(f"'{town}' is a built-in town; choose another name for {out}")
-        save_graph(imported.graph, out.with_suffix(".npz"))
-        import_map(out.with_suffix(".npz"), town, home())
+        store_town(imported.graph, town, beside=out)
     save_scenarios(out, imported.scenario)
     print(f"scenario {imported.scenario.name}: {len(imported.scenario.actors)} actors in {town}; written to {out}")
     told("not carried over", imported.lost)
@@ -187,6 +184,23 @@ def check_yaml(out: Path) -> None:
     """Raise ConfigError if a scenario file does not end in .yaml."""
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a scenario file ends in .yaml")
+
+
+def store_town(graph: LaneGraph, town: str, *, beside: Path) -> None:
+    """Store the lanes of an imported scenario as a town, and in a file beside that of the scenario.
+
+    Raises:
+        ConfigError: A built-in town has this name.
+    """
+    from ssad.core.lane_graph import save_graph
+    from ssad.core.safeio import home
+    from ssad.world.roads import import_map, town_names
+
+    if town_names().get(town) == "built-in":
+        raise ConfigError(f"'{town}' is a built-in town; choose another name for {beside}")
+    path = beside.with_suffix(".npz")
+    save_graph(graph, path)
+    import_map(path, town, home())
 
 
 def told(what: str, lines: Sequence[str]) -> None:
