@@ -18,8 +18,10 @@ def concatenate(tables: Sequence[Table]) -> Table:
     Args:
         tables: At least one. Their fields are arrays, tensors or tuples.
     """
-    names = [column.name for column in fields(tables[0])]  # type: ignore[arg-type]
-    return type(tables[0])(**{name: _column([getattr(table, name) for table in tables]) for name in names})
+    kind: Any = type(tables[0])
+    names = [column.name for column in fields(kind)]
+    table: Table = kind(**{name: _column([getattr(part, name) for part in tables]) for name in names})
+    return table
 
 
 def _column(parts: Sequence[Any]) -> Any:

@@ -80,4 +80,4 @@ def found_view(
 def _corners(trace: EpisodeTrace, row: int, agent: int) -> F64:
     """Return the corners [4, 2] of a body: front left, rear left, rear right, front right."""
     columns = trace.x[row, agent], trace.y[row, agent], trace.yaw[row, agent], trace.length[agent], trace.width[agent]
-    return corners(*(np.float64(column) for column in columns))
+    return np.asarray(corners(*(np.float64(column) for column in columns)), np.float64)
