@@ -112,8 +112,8 @@ class Detections:
         columns = zip(*(_cpu([getattr(solid, name) for solid in solids]) for name in names), strict=True)
         # The images that have 3D boxes take theirs in order.
         return [
-            Detections(*row, None if image.solid is None else Solids(*next(columns)))
-            for image, row in zip(images, flat, strict=True)
+            Detections(score, label, box, None if image.solid is None else Solids(*next(columns)))
+            for image, (score, label, box) in zip(images, flat, strict=True)
         ]
 
 

@@ -101,7 +101,9 @@ class Perception(DetectorKind):
         data = data_of(suite) if on_scenes or not targets else {}
         cells = []
         for detector in detectors:
-            conditions = [(SCENES, None, None), *((SCENES, *pair) for pair in on_scenes)] if data else []
+            conditions: list[tuple[str, Perturbation | None, Any]] = []
+            if data:
+                conditions += [(SCENES, None, None), *((SCENES, *pair) for pair in on_scenes)]
             for target, worn in targets.items():
                 self._check_target(suite, detector, target)
                 conditions += [(target, None, None), *((target, *pair) for pair in worn)]

@@ -157,8 +157,10 @@ def _shape(answer: Answer, part: slice, *, reverse: bool) -> _Shape | None:
         return None
     # On unwrapped yaw, which has no jump at pi.
     selected = _thin(arc_length, yaw, width)
-    yaw = wrap_angle(yaw)
-    return _Shape(xy[selected], z[selected], yaw[selected], np.maximum(width[selected], 0.0), arc_length[selected])
+    wrapped_yaw: F64 = wrap_angle(yaw)
+    return _Shape(
+        xy[selected], z[selected], wrapped_yaw[selected], np.maximum(width[selected], 0.0), arc_length[selected]
+    )
 
 
 def _thin(s: F64, yaw: F64, width: F64) -> list[int]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.errors import RouteError
+from ssad.core.rotations import wrap
 from ssad.core.types import F64, LaneType, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._placing import (
     Place,
@@ -16,7 +17,6 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     lane_path,
     pose_at,
     turn_of,
-    wrap,
 )
 from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model

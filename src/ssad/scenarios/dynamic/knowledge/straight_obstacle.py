@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssad.core.rotations import wrap
 from ssad.core.types import EpisodeAgent, LaneType, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
@@ -22,7 +23,6 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     to_outermost,
     trigger_place,
     width_at,
-    wrap,
 )
 
 if TYPE_CHECKING:
