@@ -1,4 +1,4 @@
-"""Tables of what generators found, from runs of suite `adversarial`: into docs/generators.md, between their markers.
+"""Tables of what generators found, from runs of suite `adversarial`: into docs/results, between markers.
 
     ssad run adversarial --out RUN ...
     python -m benchmarks.adversarial_page NAME=RUN,RUN ...  # keeps the records' metrics in benchmarks/results
@@ -28,7 +28,8 @@ from ssad.metrics import CaseValue, estimate, paired_difference
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "adversarial"
-DOCUMENT = ROOT / "docs" / "generators.md"
+DOCUMENT = ROOT / "docs" / "results" / "generators.md"
+LEARNED = ROOT / "docs" / "results" / "learned-adversaries.md"
 COLUMNS = {
     "CR": "CR",
     "CR_any": "any collision",
@@ -326,18 +327,26 @@ def main() -> None:
     for word in sys.argv[1:]:
         name, _, runs = word.partition("=")
         keep(name.removesuffix("+"), [Path(run) for run in runs.split(",")], add=name.endswith("+"))
-    whole = DOCUMENT.read_text(encoding="utf-8")
+    for document in (DOCUMENT, LEARNED):
+        before = document.read_text(encoding="utf-8")
+        after = filled(before, with_section=document == DOCUMENT)
+        if after != before:
+            document.write_text(after, encoding="utf-8")
+
+
+def filled(whole: str, *, with_section: bool) -> str:
+    """Return a page with the stored tables between its markers; with_section: a section for `WHOLE` is added."""
     for path in sorted(RESULTS.glob("*.json*")):
         name = path.name.partition(".")[0]
         begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-        lines = (whole_tables if name == WHOLE else tables)(stored(path))
-        if name == WHOLE and begin not in whole:
+        if with_section and name == WHOLE and begin not in whole:
             whole = whole.replace(BEFORE, SECTION + BEFORE)
-        print("\n".join(lines))
         if begin in whole:
+            lines = (whole_tables if name == WHOLE else tables)(stored(path))
+            print("\n".join(lines))
             before, _, rest = whole.partition(begin)
             whole = "\n".join([before + begin, *lines, end + rest.partition(end)[2]])
-    DOCUMENT.write_text(whole, encoding="utf-8")
+    return whole
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write docs/architecture.svg, with the rooms of pyproject.toml's import contract.
+"""Write docs/images/architecture.svg, with the rooms of pyproject.toml's import contract.
 
 python benchmarks/architecture_picture.py
 
@@ -12,7 +12,7 @@ from html import escape
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PICTURE = ROOT / "docs" / "architecture.svg"
+PICTURE = ROOT / "docs" / "images" / "architecture.svg"
 WIDTH, TOP, PITCH, HEIGHT = 1200, 78, 40, 34  # pixels: picture, first row, from row to row, a box
 GREY = "#7d8590"
 COLOURS = {  # fill and border, by what a package is for

@@ -1,4 +1,4 @@
-"""Which trainings of Adv.PPO bring about collisions that a careful driver avoids? The table of docs/generators.md.
+"""Collisions of trainings of Adv.PPO that a careful driver avoids: the table of docs/results/learned-adversaries.md.
 
 `python -m benchmarks.avoidable all` trains each variant of `TRIALS` with the recipe of `ssad train adversary`, about
 two minutes of processor time each, lets it loose on 120 scenarios of random towns that no set uses, against the
@@ -46,7 +46,7 @@ from ssad.world.selection import FreaSelection, Note
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "avoidable.json"
-DOCUMENT = ROOT / "docs" / "generators.md"
+DOCUMENT = ROOT / "docs" / "results" / "learned-adversaries.md"
 BEGIN, END = "<!-- trials: begin -->", "<!-- trials: end -->"
 TOWNS = {"Random21": 12, "Random24": 12, "Random25": 12, "Random3": 12, "Random5": 12}
 """Town -> number of junction routes; the first three have two lanes a direction."""
@@ -256,7 +256,7 @@ def table(data: dict[str, Any]) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("trials", nargs="*", help="names, or all: those that are not kept yet")
-    parser.add_argument("--page", action="store_true", help="write docs/generators.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/learned-adversaries.md")
     given = parser.parse_args()
     data: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
     names = [name for name in TRIALS if name not in data] if given.trials == ["all"] else given.trials

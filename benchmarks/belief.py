@@ -3,7 +3,7 @@
 `python -m benchmarks.belief` drives the 32 pre-crash and the 150 natural scenarios; `--scenarios safebench,frea` the
 imported ones instead; `crowd` is dense traffic: 40 vehicles in Oldmarket and Crossgate for 90 s, 32 scenes each.
 `--repetitions 5` draws five episodes of each scenario. Intervals count episodes of a scenario as one
-cluster. `--json FILE` writes the figures, `--page` the table of docs/loop.md.
+cluster. `--json FILE` writes the figures, `--page` the table of docs/results/traffic.md.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def page(figures: dict[str, dict[str, Any]]) -> None:
         rows = [figures[name][system] for name in sets]
         cells = [f"{text(row['CR'])} | {text(row['RC'])}" for row in rows]
         lines.append(f"| {title} | {' | '.join(cells)} | {sum(row['other'] for row in rows)} of {total} |")
-    insert("loop.md", "beliefs", lines)
+    insert("results/traffic.md", "beliefs", lines)
 
 
 def main() -> None:
@@ -140,7 +140,7 @@ def main() -> None:
     parser.add_argument("--scenarios", default="precrash,natural", help="sets, with commas")
     parser.add_argument("--repetitions", type=int, default=1)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--page", action="store_true", help="write docs/loop.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/traffic.md")
     given = parser.parse_args()
     figures: dict[str, dict[str, Any]] = {}
     for name in given.scenarios.split(","):

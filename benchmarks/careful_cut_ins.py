@@ -1,8 +1,8 @@
 """Cut-in sweeps of the four careful drivers beside the shares that the Joint Research Centre's grids give.
 
 `python benchmarks/careful_cut_ins.py` drives every model through both grids and prints which share of the encounters
-ends in a crash. `--write` puts the tables into docs/careful.md; `--lateral M` is the room between the two cars at the
-start.
+ends in a crash. `--write` puts the tables into docs/results/careful-drivers.md; `--lateral M` is the room between the
+two cars at the start.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ssad.core.types import Bool
 from ssad.drivers.careful.cut_in import CutIns, crashes, grid, slower
 from ssad.drivers.careful.models import FSM, RSS, CarefulHuman, Reg157
 
-PAGE = Path(__file__).parents[1] / "docs" / "careful.md"
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "careful-drivers.md"
 BEGIN, END = "<!-- cut-ins: begin -->", "<!-- cut-ins: end -->"
 PUBLISHED = {
     "low": {"CC": 23.40, "Reg157": 14.14, "FSM": 5.66, "RSS": 5.52, "all four": 4.11, "cases": 15930},
@@ -67,7 +67,7 @@ def main() -> None:
     """Print the tables, or write them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lateral", type=float, nargs="+", default=[1.6, 1.85], help="m between the cars at the start")
-    parser.add_argument("--write", action="store_true", help="put the tables into docs/careful.md")
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/results/careful-drivers.md")
     given = parser.parse_args()
     began = time.process_time()
     text = tables(given.lateral)

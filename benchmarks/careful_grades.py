@@ -1,7 +1,7 @@
 """How avoidable are the collisions of a system in the pre-crash set? `python benchmarks/careful_grades.py --write`
 
 Drives a system (default: the blind follower) through scenarios (default: the pre-crash set), grades each collision and
-prints how many each careful driver avoids. `--write` puts the table into docs/careful.md.
+prints how many each careful driver avoids. `--write` puts the table into docs/results/careful-drivers.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 
-PAGE = Path(__file__).parents[1] / "docs" / "careful.md"
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "careful-drivers.md"
 BEGIN, END = "<!-- grades: begin -->", "<!-- grades: end -->"
 
 
@@ -59,7 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--system", default="blind", help="what drives")
     parser.add_argument("--scenarios", default="precrash", help="a set, a type, a name or a YAML file")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/careful.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/results/careful-drivers.md")
     given = parser.parse_args()
     quiet_warp()
     text = table(given.system, given.scenarios)

@@ -1,4 +1,4 @@
-"""Five encounters from above, as docs/scenarios.md shows them: python -m benchmarks.class_views
+"""Five encounters from above, as docs/reference/scenarios.md shows them: python -m benchmarks.class_views
 
 One scenario of each class is driven by the blind follower up to the collision, and by the Autopilot, which avoids it,
 up to where both are nearest to each other.
@@ -19,7 +19,7 @@ from ssad.training.driver import draw_episodes, find_scenarios
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 
-OUT = Path(__file__).resolve().parents[1] / "docs" / "encounters.png"
+OUT = Path(__file__).resolve().parents[1] / "docs" / "images" / "encounters.png"
 VIEWS = {
     "cut-in": "LaneChanging",
     "left turn": "UnprotectedLeftTurn",

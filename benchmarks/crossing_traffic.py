@@ -1,7 +1,7 @@
 """How much traffic crosses the ego's way, counted without an ego, and what becomes of those who drive there.
 
 `python -m benchmarks.crossing_traffic --scenarios natural,natural-unselected` prints a table; `frea` too, once it has
-been imported. `--page` writes the table into docs/scenarios.md.
+been imported. `--page` writes the table into docs/results/traffic.md.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenarios", default="natural,natural-unselected", help="sets, with commas")
     parser.add_argument("--repetitions", type=int, default=1)
-    parser.add_argument("--page", action="store_true", help="write docs/scenarios.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/traffic.md")
     given = parser.parse_args()
     heads = ["set", "episodes", "crossing vehicles", "share with one", "with two"]
     heads += [f"{kind}, {name}" for name in _drivers() for kind in ("CR", "RC")]
@@ -109,7 +109,7 @@ def main() -> None:
         lines.append(row(name, given.repetitions))
         print(lines[-1], flush=True)
     if given.page:
-        insert("scenarios.md", "crossing traffic", ["", *lines])
+        insert("results/traffic.md", "crossing traffic", ["", *lines])
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """How well the shipped detectors see, by class, size, distance and light, in towns that they never saw.
 
     python benchmarks/detector_accuracy.py [--clips CLIPS ...] [--drives DRIVES] [--device cuda] [--out FILE]
-    python benchmarks/detector_accuracy.py --page      # docs/accuracy.md from benchmarks/results/accuracy.json
+    python benchmarks/detector_accuracy.py --page      # docs/results/accuracy.md from benchmarks/results/accuracy.json
 
 CLIPS: folders that `ssad record --clips` wrote; DRIVES: a folder that `ssad record` wrote. Only pictures of held-out
 towns count (splits test and val). What is not named stays as it was measured before.
@@ -43,7 +43,7 @@ from ssad.rendering.camera.sensor import BRIGHTEST, noise_levels
 from ssad.training.detector import describe_data
 
 ROOT = Path(__file__).parents[1]
-RESULT, PAGE = ROOT / "benchmarks" / "results" / "accuracy.json", ROOT / "docs" / "accuracy.md"
+RESULT, PAGE = ROOT / "benchmarks" / "results" / "accuracy.json", ROOT / "docs" / "results" / "accuracy.md"
 FLAT, SOLID = ("yolov3-tiny", "yolov5n"), ("fcos3d-light", "pgd-det-light")
 CLEAR = 0.25  # least score of a detection that counts for recall
 SIZES, DISTANCES = (8.0, 16.0, 24.0, 32.0, 64.0, 1e9), (0.0, 10.0, 20.0, 30.0, 50.0, 1e9)
@@ -435,21 +435,21 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
 
 
 def page() -> str:
-    """docs/accuracy.md, from what was measured."""
+    """docs/results/accuracy.md, from what was measured."""
     data = json.loads(RESULT.read_text())
     flat, solid = data["flat"], data["solid"]
     lines = [
         "# Accuracy of the shipped detectors",
         "",
-        "`benchmarks/detector_accuracy.py` measures it and makes this page. All pictures show towns that were not used",
-        "for training (Oldmarket and Larkhill):",
+        "`benchmarks/detector_accuracy.py` measures it and makes this page. The stored file names neither commit nor",
+        "versions nor weights. All images show towns that were not used for training (Oldmarket and Larkhill):",
         "```",
         *data["clips"],
         *data["drives"],
         "```",
         "",
         "## 2D detectors",
-        "AP50 in percent. *Target*: only the car or sign that each picture is about counts. *Objects*: how many there",
+        "AP50 in percent. *Target*: only the car or sign that each image is about counts. *Objects*: how many there",
         "are (8 px and more on each side, a quarter visible).",
         "",
     ]
@@ -582,7 +582,7 @@ def main() -> None:
     parser.add_argument("--drives", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=RESULT)
-    parser.add_argument("--page", action="store_true", help="write docs/accuracy.md from what was measured")
+    parser.add_argument("--page", action="store_true", help="write docs/results/accuracy.md from what was measured")
     given = parser.parse_args()
     if given.page:
         PAGE.write_text(page())

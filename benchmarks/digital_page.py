@@ -1,4 +1,4 @@
-"""Write docs/digital.md from the tables of `ssad run digital`: python -m benchmarks.digital_page [RUN...]
+"""Write docs/results/digital.md from the tables of `ssad run digital`: python -m benchmarks.digital_page [RUN...]
 
 benchmarks/results/digital holds the tables of runs, and run.json without its cells. With runs (folders) these are
 stored first; several of them, such as the rest of one on another device, are joined.
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.joined_runs import joined, summary_of
+from benchmarks.provenance import origin, warning
 from ssad.core.checkpoints import state_hash
 from ssad.experiments.perception.digital.page import section
 from ssad.experiments.perception.digital.run import Setting, setting_of
@@ -22,7 +23,7 @@ from ssad.report.tables import to_markdown
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "digital"
-PAGE = ROOT / "docs" / "digital.md"
+PAGE = ROOT / "docs" / "results" / "digital.md"
 TABLES = (
     "digital",
     "lost",
@@ -87,6 +88,8 @@ def page() -> str:
     old = outdated()
     towns = " and ".join(data["towns"])
     lines = ["# The shipped 3D detectors under digital attacks", ""]
+    if outside := warning(about):
+        lines += [f"> {outside}", ""]
     if old:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.** Compare these numbers with each other,"]
         lines += ["> not with a new run.", ""]
@@ -97,9 +100,9 @@ def page() -> str:
         *about["command"],
         "```",
         f"Data: {data['scenes']} drives of {data['seconds']:g} s in each of {towns}, which were not used for training;",
-        f"six cameras, {data['width']} pixels wide. Software: torch {' and '.join(about['torch'])}. Weights:",
+        f"six cameras, {data['width']} pixels wide. {origin(about)} Weights:",
         ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
-        "What the attacks, losses and rules of the audit are: [attacks.md](attacks.md).",
+        "What the attacks, losses and rules of the audit are: [digital attacks](../reference/attacks.md).",
     ]
     if len(about["ran"]) > 1:
         lines.append(f"{' and '.join(f'{count} cells on {device}' for device, count in about['ran'].items())}.")

@@ -1,10 +1,10 @@
-"""What learned drivers do, and what adversaries do to them: the tables of docs/drivers.md.
+"""What learned drivers do, and what adversaries do to them: the tables of docs/results/drivers.md.
 
 `python -m benchmarks.drivers --sets precrash,natural` measures driving systems, `--adversaries natural,frea` egos with
-and without adversaries; `safebench` and `frea` must have been imported (docs/scenarios.md). Each set is kept in
-benchmarks/results/drivers.json, and `--page` writes the tables of what is there into docs/drivers.md. Intervals are of
-95 %; each scenario is a cluster, as in reports, but where all towns of a set are taken together, each route with its
-draws of traffic.
+and without adversaries; `safebench` and `frea` must have been imported (docs/how-to/import-scenarios.md). Each set is
+kept in benchmarks/results/drivers.json, and `--page` writes the tables of what is there into docs/results/drivers.md
+and adversaries.md. Intervals are of 95 %; each scenario is a cluster, as in reports, but where all towns of a set are
+taken together, each route with its draws of traffic.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.insert import insert
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import Episode
 from ssad.drivers import LEARNED, make_system
@@ -31,7 +32,6 @@ from ssad.world.world import World
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "drivers.json"
-DOCUMENT = ROOT / "docs" / "drivers.md"
 SYSTEMS = ("autopilot", "blind", *(name for name in LEARNED if name in REGISTERED))
 EGOS = ("autopilot", "ppo")
 PUBLISHED = {
@@ -171,13 +171,9 @@ def adversary_table(data: dict[str, Any]) -> list[str]:
 
 def page(data: dict[str, Any]) -> None:
     """Write the tables between their markers in the document."""
-    whole = DOCUMENT.read_text()
     for part, make in (("drivers", driver_table), ("adversaries", adversary_table)):
         if part in data:
-            begin, end = f"<!-- {part}: begin -->", f"<!-- {part}: end -->"
-            before, _, rest = whole.partition(begin)
-            whole = "\n".join([before + begin, *make(data[part]), end + rest.partition(end)[2]])
-    DOCUMENT.write_text(whole)
+            insert(f"results/{part}.md", part, make(data[part]))
 
 
 def main() -> None:
@@ -186,7 +182,7 @@ def main() -> None:
     parser.add_argument("--sets", default="", help="sets to drive, with commas")
     parser.add_argument("--adversaries", default="", help="sets of natural traffic to put adversaries into")
     parser.add_argument("--json", type=Path, default=RESULTS, help="where the results are kept")
-    parser.add_argument("--page", action="store_true", help="write docs/drivers.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/drivers.md")
     given = parser.parse_args()
     data: dict[str, Any] = json.loads(given.json.read_text()) if given.json.is_file() else {}
     shipped = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))

@@ -1,7 +1,7 @@
-"""Write the results in docs/gap.md, and its figure, from stored runs: python -m benchmarks.gap_page [NAME=DIR...]
+"""Write docs/results/gap.md, and its figure, from stored runs: python -m benchmarks.gap_page [NAME=DIR...]
 
     python -m benchmarks.gap_page benign=runs/gap-benign damage=runs/gap-damage confirm=... signs=... speed=FILE.json
-    python benchmarks/gap_page.py --pick runs/gap-damage        # keys of drives worth a replay
+    python -m benchmarks.gap_page --pick runs/gap-damage        # keys of drives worth a replay
 
 With folders that `ssad run benchmarks/gap-benign.yaml`, gap-damage.yaml and `ssad run gap-signs` wrote, what the page
 needs of them is stored first, in benchmarks/results/gap; without any, the page is made of what is stored. NAME+=DIR
@@ -25,6 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from benchmarks.provenance import origin, warning
 from ssad.experiments.gap.page import (
     COLOURS,
     Condition,
@@ -43,7 +44,7 @@ from ssad.report.tables import Cell, Row, Table, to_markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "gap"
-FIGURE = ROOT / "docs" / "gap.png"
+FIGURE = ROOT / "docs" / "images" / "gap.png"
 RUNS = ("benign", "damage", "confirm", "signs")
 HALVED, SMALL = 0.5, 0.1  # falls of AP, as shares of the clean one
 UNCHANGED = 0.03  # CR within which an interval must lie
@@ -325,7 +326,7 @@ def _damages(run: Run, runs: Mapping[str, Run]) -> list[str]:
         "",
         f"{_measured(run)} {len(under)} conditions of {len({c[1] for c in under})} perturbations.{fewer(run)}",
         "",
-        f"![Share of AP lost against rise of the collision rate]({FIGURE.name})",
+        f"![Share of AP lost against rise of the collision rate](../images/{FIGURE.name})",
         "",
         _smaller(rank_table(run)),
         "",
@@ -396,6 +397,8 @@ def _measured(run: Run) -> str:
     return (
         f"`{run.command}`{in_runs}, {len(run.lines):,} of {run.planned:,} drives on {' and '.join(_devices(run))}"
         f"{f', {failed} of them failed' if failed else ''}, {drives} scenarios."
+        f" {origin(run.header)}"
+        f"{f' {outside}' if (outside := warning(run.header)) else ''}"
         f"{f' **Driven with earlier weights of {old}.**' if (old := ' and '.join(outdated(run))) else ''}"
     )
 
@@ -461,7 +464,7 @@ def main() -> None:
     damage = stored("damage")
     if damage is not None:
         figure(damage, FIGURE)
-    insert("gap.md", "results", page())
+    insert("results/gap.md", "results", page())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write docs/how_often.md from what was measured: python -m benchmarks.how_often_page
+"""Write docs/results/how-often.md from what was measured: python -m benchmarks.how_often_page
 
 It reads benchmarks/results/how-often-*.json: brute force, and the estimates of one or several processes.
 """
@@ -17,50 +17,12 @@ from ssad.scenarios.dynamic import load_scenarios
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-TEXT = """# How often does it crash?
+TEXT = """# Rare failures: results
 
-A failure probability of 1 in 10,000 drives or less cannot be measured by driving 100 scenarios. `ssad run how-often`
-estimates it in traffic with chance in it, by three methods that check each other:
-
-| method | what it does | what it needs |
-|---|---|---|
-| `monte-carlo` | drives many episodes and counts | 400 collisions for 10 % |
-| `splitting` | branches those that come nearest to a collision, again and again | a score; no model of the chance |
-| `importance` | leads chance towards collisions and weighs each by how likely it was | a learned proposal |
-
-```
-ssad run how-often                                    # a minute or two on two cores
-ssad run how-often --set noise.lapse=0.02 --set episodes=20000
-ssad replay runs/how-often importance/autopilot/lane-traffic/05
-```
-A suite of this kind names systems, scenarios, `noise`, `methods` and how many `episodes`, `particles` and `repeats`
-they get
-([failure_rate.py](../src/ssad/experiments/how_often/failure_rate.py)). The table shows collisions in
-a million episodes with 95 % limits, the effective number of collisions, agent-steps simulated and those of them that
-went into learning, and collisions in 1,000 h and 1,000 km. A collision of each method is kept and driven again by
-`ssad replay`.
-
-## Chance
-`World(noise=Noise(...))` brings it in ([src/ssad/world/noise.py](../src/ssad/world/noise.py)); without, nothing
-changes, to the bit. Background Autopilots accelerate unevenly (an Ornstein-Uhlenbeck process of `accel` m/s^2 that
-forgets in `accel_time` s) and, for the share `careless` of the time, would change lane without looking. The ego, if
-the world drives it, has lapses for the share `lapse` of the time: it steers on, but leaves its pedals as they are. All
-of it comes from a key of each scene (`World.rekey`) and is part of snapshots and hashes. A scene restored with another
-key has another future.
-
-## Estimators
-[src/ssad/world/rare](../src/ssad/world/rare/process.py) holds them as functions over any batched `Process`.
-
-* **Splitting** keeps N particles, gives up the quarter with the least score (ties included) and branches the others
-  from where they passed that score. The mean of its estimate is the probability for any N and score. The interval comes
-  from independent repeats (Student's, with room for skew), at least 8 of them.
-* **Importance sampling** moves the means of the normal numbers behind the noise, by stretches of time. The proposal is
-  a mixture of the noise as it is (10 %, so that no weight exceeds 10), of moved ones, learned from the failures that
-  splitting finds and then by the cross-entropy method from those of all its rounds, of copies of these that begin
-  later, and of copies moved half as far. A failure that no component covers is drawn very seldom, and then its weight
-  exceeds that of all others together. Learning counts as work. Intervals are gamma limits of a compound Poisson sum
-  (Fay and Feuer), whose upper end leaves room for one event more of the largest weight; n is the effective number.
-* Drivers must not remember anything between steps: those inside the world and learned policies do not.
+Failure probabilities of the Autopilot, measured by brute force and estimated by the suite `how-often`.
+[How to measure them](../how-to/measure-failure-rates.md) and [how the estimators work](../explanation/failure-rates.md)
+stand on pages of their own. `python -m benchmarks.how_often_page` makes this page from
+`benchmarks/results/how-often-*.json`. These files name the device and the settings, but neither commit nor versions.
 
 """
 
@@ -179,4 +141,4 @@ def coverage(data: dict[str, Any], brutes: list[dict[str, Any]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    (ROOT / "docs" / "how_often.md").write_text(page(), encoding="utf-8")
+    (ROOT / "docs" / "results" / "how-often.md").write_text(page(), encoding="utf-8")

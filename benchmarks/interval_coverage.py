@@ -1,7 +1,8 @@
 """How often the 95 % intervals hold, by simulation: python benchmarks/interval_coverage.py [--quick]
 
 Draws data sets whose true mean is known, of the shapes that occur in a run, and counts how often the interval that
-`ssad.metrics` gives holds it. Writes the tables between the markers in docs/metrics.md; with --quick it prints them.
+`ssad.metrics` gives holds it. Writes the tables between the markers in docs/results/intervals.md; with --quick it prints
+them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy.typing as npt
 from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, mean_limits, replicate_limits
 
 F64 = npt.NDArray[np.float64]
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "metrics.md"
+DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "results" / "intervals.md"
 MARKERS = ("<!-- coverage: begin -->", "<!-- coverage: end -->")
 SHARES = (0.01, 0.05, 0.1, 0.3, 0.5, 0.8, 0.95)
 # clusters, cases in each

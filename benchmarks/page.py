@@ -1,4 +1,4 @@
-"""Write docs/benchmarks.md from the measurements in benchmarks/results: python benchmarks/page.py"""
+"""Write docs/results/speed.md from the measurements in benchmarks/results: python benchmarks/page.py"""
 
 from __future__ import annotations
 
@@ -309,7 +309,8 @@ def page() -> str:
     lines = [
         "# Benchmarks",
         "",
-        "`benchmarks/page.py` makes this page from the measurements in `benchmarks/results`.",
+        "`benchmarks/page.py` makes this page from the measurements in `benchmarks/results`. Only some of these files",
+        "name the commit or the versions that they were measured with; sections say so where they do.",
         "",
         "## Speed of the world",
         "",
@@ -326,4 +327,4 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    (ROOT / "docs" / "benchmarks.md").write_text(page())
+    (ROOT / "docs" / "results" / "speed.md").write_text(page())

@@ -1,4 +1,4 @@
-"""Write docs/physical_results.md from stored runs: python -m benchmarks.physical_page [--as NAME] [RUN...]
+"""Write docs/results/physical*.md from stored runs: python -m benchmarks.physical_page [--as NAME] [RUN...]
 
 With runs (folders that `ssad run physical` or another of `SUITES` wrote) the tables and run.json without its cells are
 stored first, in benchmarks/results/NAME (of the suite, if none is said). Several runs of one suite, such as of one pair
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.joined_runs import joined, summary_of
+from benchmarks.provenance import origin, warning
 from ssad.core.checkpoints import state_hash
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.page import section
@@ -23,7 +24,9 @@ from ssad.report.tables import to_markdown
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGE = ROOT / "docs" / "physical_results.md"
+PAGES = ROOT / "docs" / "results"
+LIMITS = "physical-limits"
+"""Name of the page on what limits patches and lights, and on what a step costs."""
 SUITES = {
     "physical": "ssad run physical --device cuda",
     "physical-quick": "ssad run physical-quick",
@@ -70,15 +73,16 @@ def part(name: str) -> list[str]:
     """What the page says of a suite."""
     folder = RESULTS / name
     if not (folder / "run.json").is_file():
-        return [f"## `{name}`", "", f"`{SUITES[name]}` has not run yet.", ""]
+        return [f"`{SUITES[name]}` has not run yet.", ""]
     about = json.loads((folder / "run.json").read_text())
     suite, old = about["suite"], outdated(about)
-    lines = [f"## `{name}`", "", suite["description"], "", *([NOTES[name], ""] if name in NOTES else [])]
+    lines = [f"> {outside}", ""] if (outside := warning(about)) else []
     if old:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.**", ""]
+    lines += [suite["description"], "", *([NOTES[name], ""] if name in NOTES else [])]
     commands = ", then ".join(f"`{one}`" for one in about["command"])
     lines += [
-        f"Command: {commands}. Software: torch {' and '.join(about['torch'])}. "
+        f"Command: {commands}. {origin(about)} "
         "Weights: " + ", ".join(f"`{key}` {digest}" for key, digest in about["weights"].items()) + ".",
         "",
     ]
@@ -93,7 +97,7 @@ def part(name: str) -> list[str]:
     tables = [*sorted(folder.glob(f"{FIRST}*.md")), *(folder / f"{other}.md" for other in OTHERS)]
     for table in tables:
         if table.is_file() and table.read_text().count("\n| ") > 1:  # one is its head
-            lines += [table.read_text().replace("## ", "### ", 1).strip(), ""]
+            lines += [table.read_text().strip(), ""]
     return lines
 
 
@@ -199,18 +203,23 @@ def percent(value: float | None) -> str:
     return "n/a" if value is None else f"{100 * value:.1f}"
 
 
-def page() -> str:
-    """The page."""
-    lines = [
-        "# The shipped detectors under physical attacks",
+def pages() -> dict[str, str]:
+    """Return the pages, by name: one for each suite, and one on limits and costs."""
+    made = {name: "\n".join([*_head(name), *part(name)]) for name in SUITES}
+    lines = [*_head("what limits them, and what a step costs"), *patch(), *light(), *speed()]
+    return made | {LIMITS: "\n".join(lines)}
+
+
+def _head(what: str) -> list[str]:
+    name = f"`{what}`" if what in SUITES else what
+    return [
+        f"# Physical attacks: {name}",
         "",
-        "`benchmarks/physical_page.py` makes this page from the tables that the commands below wrote, which are kept",
-        "in `benchmarks/results`. What the attacks, carriers and scores are: [physical.md](physical.md).",
+        "`python -m benchmarks.physical_page` makes this page from tables that are kept in `benchmarks/results`. The",
+        "reference explains [attacks, carriers and scores](../reference/physical.md), and",
+        "[what the runs say](physical-findings.md) sums up all suites.",
         "",
     ]
-    for name in SUITES:
-        lines += part(name)
-    return "\n".join(lines + patch() + light() + speed())
 
 
 if __name__ == "__main__":
@@ -220,4 +229,5 @@ if __name__ == "__main__":
     given = parser.parse_args()
     if given.runs:
         store(given.runs, given.name)
-    PAGE.write_text(page())
+    for name, text in pages().items():
+        (PAGES / f"{name}.md").write_text(text)

@@ -1,4 +1,6 @@
-"""The six panels of the paper's figure of physical attacks, as docs/physical.jpg: python benchmarks/physical_picture.py
+"""The six panels of the paper's figure of physical attacks: python benchmarks/physical_picture.py
+
+It writes docs/images/physical.jpg.
 
 One picture of a drive in Oldmarket, where no texture was trained: clean, under a random patch and camouflage, and under
 the shipped textures of Adv. Patch, DAS and TPA, each with what YOLOv5n finds.
@@ -24,7 +26,7 @@ from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.physical import albedo_of, control, make_carrier
 from ssad.scenarios.static.physical.textures.card import load_texture
 
-OUT = Path(__file__).parents[1] / "docs" / "physical.jpg"
+OUT = Path(__file__).parents[1] / "docs" / "images" / "physical.jpg"
 TOWN, DETECTOR = "Oldmarket", "yolov5n"
 PANELS = {
     "benign": None,

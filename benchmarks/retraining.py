@@ -1,7 +1,7 @@
 """Does an ego that was trained on generated scenarios collide less? Generated, trained and tested anew, with intervals.
 
     python -m benchmarks.retraining --out DIR --workers 8        # resumes what DIR has; also --small, --tiny
-    python -m benchmarks.retraining --page                       # the table of docs/drivers.md from the kept results
+    python -m benchmarks.retraining --page                       # the table of docs/results/retraining.md
 
 1. `before`: PPO on the set `training`, with several seeds.
 2. Generators search for collisions of these egos: in the bases of `training` to learn from, in those of `precrash` and
@@ -30,7 +30,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "retraining.json"
-DOCUMENT = ROOT / "docs" / "drivers.md"
+DOCUMENT = ROOT / "docs" / "results" / "retraining.md"
 BEGIN, END = "<!-- retraining: begin -->", "<!-- retraining: end -->"
 ARMS = ("before", "control", "after")
 LEARN, HELD = ("training",), ("precrash", "natural")
@@ -334,7 +334,7 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="half an hour of one core")
     parser.add_argument("--tiny", action="store_true", help="only to try it")
     parser.add_argument("--json", type=Path, default=RESULTS)
-    parser.add_argument("--page", action="store_true", help="write docs/drivers.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/retraining.md")
     given = parser.parse_args()
     size = TINY if given.tiny else SMALL if given.small else Size(seeds=given.seeds, steps=given.steps)
     if given.out is not None:

@@ -6,7 +6,7 @@
 as its users do; its step is one decision, as ours. torch takes one thread: networks this small lose by a second one.
 Wall clock, medians over interleaved repeats; processor time beside it, which counts also where the machine has other
 things to do. `--adversary` also trains Adv.PPO from nothing, as `ssad train adversary` does; `--page` writes what is
-kept into docs/drivers.md.
+kept into docs/results/drivers.md.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ssad.training.adversary import AdversaryPlan, run_adversary_training
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "rl-speed.json"
-DOCUMENT = ROOT / "docs" / "drivers.md"
+DOCUMENT = ROOT / "docs" / "results" / "drivers.md"
 BEGIN, END = "<!-- speed: begin -->", "<!-- speed: end -->"
 
 
@@ -94,7 +94,7 @@ def main() -> None:
     parser.add_argument("--no-highway", action="store_true")
     parser.add_argument("--adversary", action="store_true", help="train Adv.PPO, too")
     parser.add_argument("--json", type=Path, default=RESULTS)
-    parser.add_argument("--page", action="store_true", help="write docs/drivers.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/drivers.md")
     args = parser.parse_args()
     torch.set_num_threads(1)
     began = time.perf_counter()

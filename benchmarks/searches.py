@@ -1,4 +1,4 @@
-"""Do searches that learn find collisions sooner than random points? The table of docs/generators.md.
+"""Do searches that learn find collisions sooner than random points? The table of docs/results/generators.md.
 
 `python -m benchmarks.searches --generators random,cma-es,bayesian,l2c` lets each search the pre-crash scenarios that
 the system survives as they are, with the same seeds and the same budget, and keeps what came of it in
@@ -23,7 +23,7 @@ from ssad.world.roads import load_town
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "searches.json"
-DOCUMENT = ROOT / "docs" / "generators.md"
+DOCUMENT = ROOT / "docs" / "results" / "generators.md"
 BEGIN, END = "<!-- searches: begin -->", "<!-- searches: end -->"
 
 
@@ -97,7 +97,7 @@ def main() -> None:
     parser.add_argument("--set", default="precrash", dest="set_name")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--budget", type=int, default=32)
-    parser.add_argument("--page", action="store_true", help="write docs/generators.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/generators.md")
     given = parser.parse_args()
     about = {"system": given.system, "set": given.set_name, "seeds": given.seeds, "budget": given.budget}
     data: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}

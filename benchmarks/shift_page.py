@@ -1,4 +1,4 @@
-"""Write docs/results.md from the tables of `ssad run shifts` and `shifts-paper`: python benchmarks/shift_page.py
+"""Write docs/results/shifts.md from the tables of `ssad run shifts` and `shifts-paper`: python -m benchmarks.shift_page
 
 benchmarks/results/shifts and shifts-paper hold what those runs wrote: DIR/tables/*.csv, and run.json without its cells.
 """
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.provenance import origin, warning
 from ssad.core.checkpoints import state_hash
 from ssad.experiments.perception.scene_boxes import detector_of
 from ssad.experiments.perception.shifts.page import title_of
@@ -20,7 +21,7 @@ from ssad.scenarios.static.shifts import VERSIONS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGE = ROOT / "docs" / "results.md"
+PAGE = ROOT / "docs" / "results" / "shifts.md"
 RUNS = ("shifts", "shifts-paper")  # the physical calibration, and the paper's
 NAMES = {"fcos3d-light": ("light FCOS3D", "FCOS3D"), "pgd-det-light": ("light PGD-Det", "PGD")}  # ours, the paper's
 PLACE = {"mAP": 0, "NDS": 1}
@@ -149,7 +150,7 @@ def notice() -> list[str]:
 def page() -> str:
     """The page."""
     about = header(RUNS[0])
-    data, versions, weights = about["data"], about["versions"], about["weights"]
+    data, weights = about["data"], about["weights"]
     with (RESULTS / RUNS[0] / "shifts.csv").open(newline="") as file:
         samples = next(iter(csv.DictReader(file)))["n"]
     towns = " and ".join(data["towns"])
@@ -157,8 +158,9 @@ def page() -> str:
         [
             "# Results of the shipped 3D detectors, clean and under distribution shifts",
             "",
+            *([f"> {outside}", ""] if (outside := warning(about)) else []),
             *notice(),
-            "`benchmarks/shift_page.py` makes this page from `benchmarks/results/shifts` and",
+            "`python -m benchmarks.shift_page` makes this page from `benchmarks/results/shifts` and",
             "`benchmarks/results/shifts-paper`. These folders contain the tables that two commands wrote:",
             "```",
             *(
@@ -168,17 +170,17 @@ def page() -> str:
             "```",
             f"Data of the first: {data['scenes']} drives of {data['seconds']:g} s each in {towns}, not used for",
             f"training; {samples} samples of six cameras, {data['width']} pixels wide.",
-            f"Software: torch {versions['torch']}. Weights:",
+            f"{origin(about)} Weights:",
             ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
             "",
-            "* Brackets: 95 % intervals, from how the drives vary (how: [metrics.md](metrics.md)).",
+            "* Brackets: 95 % intervals, from how the drives vary ([how](../explanation/intervals.md)).",
             "* *Published*: results of the paper on nuScenes val with full-size detectors. Images and detectors",
             "  differ, so do not compare absolute values. The share of its own clean score that a detector keeps can",
             "  be compared.",
             "* Physical: SSAD's default calibration, with severities in units such as metres of visibility. Each drive",
             "  has one severity from 1 to 5, and the five are distributed evenly over the drives.",
             "* Paper's severities: the published tables of 3D_Corruptions_AD, applied image by image. The severity is",
-            "  drawn from 1 to 5 for each sample. See [shifts.md](shifts.md).",
+            "  drawn from 1 to 5 for each sample. See [distribution shifts](../reference/shifts.md).",
             "",
             "## mAP, percent",
             "",

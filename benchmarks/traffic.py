@@ -3,8 +3,8 @@
 `python -m benchmarks.traffic --hours 50` drives 50 vehicle-hours in every town that is here, imported ones too;
 `--towns` takes names and files (.xodr, .npz), `--signals green` switches all real signals to green, as in recorded
 drives, so that priority alone decides. Prints a table and where it happened. `--json FILE` keeps both after every batch
-of scenes; run again, it goes on to `--hours`. `--page` writes the table of docs/loop.md, with what other files hold
-(`--also FILE`; `--first` numbers their scenes, so that they are other traffic).
+of scenes; run again, it goes on to `--hours`. `--page` writes the table of docs/results/traffic.md, with what other
+files hold (`--also FILE`; `--first` numbers their scenes, so that they are other traffic).
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first scene: others are other traffic")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--also", type=Path, nargs="*", default=[], help="files of --json whose towns are added")
-    parser.add_argument("--page", action="store_true", help="write docs/loop.md")
+    parser.add_argument("--page", action="store_true", help="write docs/results/traffic.md")
     given = parser.parse_args()
     quiet_warp()
     traffic_of = {"world": VERSION, "vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
@@ -257,7 +257,7 @@ def together(name: str, rows: Sequence[Row]) -> Row:
 
 
 def page(rows: Sequence[dict[str, Any]]) -> None:
-    """Write the table of docs/loop.md; the last two rows hold several towns."""
+    """Write the table of docs/results/traffic.md; the last two rows hold several towns."""
     lines = [
         "| town | vehicle-hours | contacts | per 100 h | upper 95 % limit | off the road | in a lasting queue |",
         "|---" * 7 + "|",
@@ -270,7 +270,7 @@ def page(rows: Sequence[dict[str, Any]]) -> None:
         )
     towns = [rate(row)[0] for row in rows[:-2]]
     lines.append(f"| all, each town alike | | | {sum(towns) / len(towns):.2f} | | | |")
-    insert("loop.md", "traffic", lines)
+    insert("results/traffic.md", "traffic", lines)
 
 
 def _line(row: dict[str, Any]) -> str:

@@ -150,7 +150,7 @@ def test_fields_and_document_know_every_metric():
         assert f"| {metric.symbol} |" in text
 
 
-# field, unit, better, kind, upper bound, what a failed episode counts as: docs/metrics.md
+# field, unit, better, kind, upper bound, what a failed episode counts as: docs/reference/metrics.md
 PUBLISHED = {
     "CR": ("collision", "", "lower", "share", 1.0, None),
     "OR": ("off_road", "m", "lower", "mean", 1.0, None),

@@ -56,7 +56,7 @@ def shift(
 ) -> None:
     """Apply distribution shifts to a nuScenes folder (nuScenes-N), or to one image as a contact sheet.
 
-    In any other folder, such as KITTI's or COCO's, each picture is shifted by itself (docs/shifts.md).
+    In any other folder, such as KITTI's or COCO's, each picture is shifted by itself (docs/how-to/shift-data.md).
 
     To resume, repeat the command. Exit code 1: some files failed, or --verify found files that differ.
     """

@@ -78,22 +78,23 @@ def _attack_list() -> dict[str, str]:
         if name not in ATTACKS:
             return where
         if needs(name):
-            return f"made in Python: needs {', '.join(needs(name))} (docs/attacks.md)"
+            return f"made in Python: needs {', '.join(needs(name))} (docs/how-to/attack-detectors.md)"
         access = make_attack(name).access
         return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
 
     rows = {name: describe(name, origin) for name, origin in attack_names().items()}
-    rows |= {name: f"physical: trains a {default_carrier(name)} (docs/physical.md)" for name in physical_names()}
-    rows |= dict.fromkeys(LIGHTS, "physical: light on a target, not on its paint (docs/physical.md)")
-    return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
+    guide = "docs/how-to/paint-a-car.md"
+    rows |= {name: f"physical: trains a {default_carrier(name)} ({guide})" for name in physical_names()}
+    rows |= dict.fromkeys(LIGHTS, f"physical: light on a target, not on its paint ({guide})")
+    return rows | {"module:object": "an attack of your own (docs/how-to/attack-detectors.md)"}
 
 
 def _generator_list() -> dict[str, str]:
     from ssad.scenarios.dynamic.generate import generator_list
 
     templates = {
-        "scenic:FILE.scenic": "samples of a Scenic program (docs/interchange.md)",
-        "module:object": "a generator of your own (docs/generators.md)",
+        "scenic:FILE.scenic": "samples of a Scenic program (docs/how-to/import-scenic.md)",
+        "module:object": "a generator of your own (docs/how-to/search-for-collisions.md)",
     }
     return generator_list() | templates
 
@@ -108,7 +109,7 @@ def _detector_list() -> dict[str, str]:
         return where
 
     rows = {name: describe(name, origin) for name, origin in detector_names().items()}
-    return rows | {"module:object": "a detector of your own (docs/detectors.md)"}
+    return rows | {"module:object": "a detector of your own (docs/how-to/use-detectors.md)"}
 
 
 def _recipe_list() -> dict[str, str]:

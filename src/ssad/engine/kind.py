@@ -210,8 +210,8 @@ class Kind(ABC):
         """In a worker: the result of a cell; a kind brings this or `execute`.
 
         A result is plain data: metrics (name -> number, None where it was not measured); n; artefacts (name -> path in
-        the folder, or list of them; on disk when this returns); case and cluster (see docs/metrics.md); episode (a
-        line for episodes.jsonl); and whatever else the record shall have.
+        the folder, or list of them; on disk when this returns); case and cluster (docs/explanation/intervals.md);
+        episode (a line for episodes.jsonl); and whatever else the record shall have.
         """
         raise NotImplementedError
 

@@ -1,7 +1,7 @@
 """Driving metrics of one episode: SafeBench's ten metrics, CARLA's driving score and their components.
 
-Definitions, units and sources of all metrics: docs/metrics.md. All metrics are functions of an `EpisodeTrace`. Row 0
-of a trace is the start, before anything was driven, so means over steps leave it out.
+Definitions, units and sources of all metrics: docs/reference/metrics.md. All metrics are functions of an
+`EpisodeTrace`. Row 0 of a trace is the start, before anything was driven, so means over steps leave it out.
 """
 
 from __future__ import annotations

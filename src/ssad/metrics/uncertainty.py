@@ -2,7 +2,7 @@
 
 Every estimate takes values with their case and cluster. Copies of one case count once, cases of one cluster are
 dependent, and the interval follows from the variation of the clusters. Nothing is drawn at random, so the same data
-give the same interval in any order. The methods in plain words: docs/metrics.md.
+give the same interval in any order. The methods in plain words: docs/explanation/intervals.md.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class Recording:
         seed: Root of the random numbers.
         quality: Quality of JPEG files.
         version: Version of the data set.
-        device: Device that renders (it decides bits, though few: see docs/camera.md).
+        device: Device that renders (it decides bits, though few: see docs/how-to/record-data.md).
         streets: See `drive_street`.
 
     Raises:

@@ -46,7 +46,7 @@ class AdversarialSuite(ScenarioSuite):
         batch: Rollouts that it proposes at once.
         repetitions: Searches of each, with seeds of their own.
         keep: Collisions that are saved of each search, the most distinct first.
-        grade: Whether to grade which careful drivers avoid each of these (docs/careful.md).
+        grade: Whether to grade which careful drivers avoid each of these (docs/explanation/careful-drivers.md).
         transfer: Systems that the saved scenarios are also driven with.
         chunk: Base scenarios that one generator works on side by side.
     """

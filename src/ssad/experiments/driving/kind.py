@@ -42,11 +42,13 @@ class DrivingSuite(ScenarioSuite):
 
     Attributes:
         systems: names, or module:object; arguments and a label may follow, as in mine:Mine?checkpoint=a.pt@first.
-        simulator: embedded, SSAD's own world; or carla://HOST:PORT, a CARLA server (docs/carla.md).
+        simulator: SSAD's own world, embedded, or a CARLA server, carla://HOST:PORT (docs/how-to/use-carla.md).
         repetitions: episodes of each pair; the first is the nominal case.
-        spread: how far the other repetitions are drawn around it, 1 being the natural spread (docs/scenarios.md); 0:
-            not at all, then scenarios without traffic of their own give copies, which count once.
-        witness: grade each collision: which careful drivers avoid it, and could anybody (docs/careful.md).
+        spread: how far the other repetitions are drawn around it, 1 being the natural spread
+            (docs/reference/scenarios.md); 0: not at all, then scenarios without traffic of their own give copies,
+            which count once.
+        witness: whether each collision is graded by the careful drivers that avoid it, and by a search for any way to
+            avoid it (docs/explanation/careful-drivers.md).
         pictures: what the report shows besides (shifts: contact sheets of the distribution shifts; camera: what the
             camera sees).
     """

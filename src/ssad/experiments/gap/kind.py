@@ -49,7 +49,7 @@ class GapSuite(ScenarioSuite, PerturbationTable):
     Attributes:
         systems: Perceiving systems; names must differ.
         ceilings: Systems that receive the ground truth, without perturbations (`ssad list systems`).
-        perturbations: Perturbations (docs/gap.md); the clean condition always runs.
+        perturbations: Perturbations (docs/reference/gap.md); the clean condition always runs.
         severities: Severities 1 to 5 of the perturbations that set none of their own.
         repetitions: As in suites of kind driving.
         spread: As in suites of kind driving.

@@ -25,7 +25,15 @@ SETTINGS = ("episodes", "particles", "repeats", "components", "batch")  # of the
 
 
 class NoiseSuite(Schema):
-    """Random behaviour of traffic: the parameters of `ssad.world.noise.Noise`."""
+    """Random behaviour of traffic: the parameters of `ssad.world.noise.Noise`.
+
+    Attributes:
+        accel: Standard deviation of the acceleration of background vehicles, m/s^2.
+        accel_time: Time constant of that acceleration, s.
+        lapse: Share of the time in which the ego leaves its pedals as they are.
+        careless: Share of the time in which background vehicles change lanes without looking.
+        choice_time: Time constant of lapses and carelessness, s: about how long they last.
+    """
 
     accel: float = Field(default=0.0, ge=0.0, le=10.0)
     accel_time: float = Field(default=1.0, gt=0.0)

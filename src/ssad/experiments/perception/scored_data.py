@@ -29,7 +29,7 @@ class Recorded(Schema):
     """Validation set that is recorded by default: drives in towns that the shipped detectors never saw.
 
     Attributes:
-        towns: names.
+        towns: towns of the drives.
         scenes: number of scenes in each town.
         seconds: length of a scene, with two samples a second.
         width: width of the images.
@@ -49,8 +49,9 @@ class DetectorTable(Schema):
     Attributes:
         name: of the suite.
         detectors: names, with weights of your own as NAME=FILE, or module:object.
-        data: "recorded", or the root of a data set in the nuScenes schema, with version (default: the only one in
-            the folder) and split.
+        data: "recorded", or the root of a data set in the nuScenes schema.
+        version: version of that data set; default: the only one in the folder.
+        split: split of that data set.
         recorded: settings of the recording.
     """
 
@@ -95,7 +96,7 @@ def detectors_of(
         if not path and detector_name in DETECTORS and not (SHIPPED / f"{detector_name}.json").is_file():
             raise ConfigError(
                 f"suite {table.name}: no weights of {detector_name} are shipped; give a file, {detector_name}=FILE "
-                f"(docs/detectors.md: ssad train detector {detector_name}, or official ones)"
+                f"(docs/how-to/train-detectors.md: ssad train detector {detector_name}, or official ones)"
             )
         detector = detector_of(name, path, "cpu")
         tasks[name] = str(getattr(detector, "task", ""))

@@ -256,7 +256,7 @@ def test_names_and_options() -> None:
 def test_all_names_are_listed_with_what_they_need() -> None:
     rows = LISTS["attacks"]()
     assert rows.keys() == {*ATTACKS, *PHYSICAL, *LIGHTS, "module:object"}
-    assert rows["adv-patch"] == "physical: trains a patch (docs/physical.md)"
+    assert rows["adv-patch"] == "physical: trains a patch (docs/how-to/paint-a-car.md)"
     assert rows["pgd"] == "white-box, loss full"
     assert rows["transfer"].startswith("made in Python: needs surrogate, inner")
     assert [name for name in ATTACKS if needs(name)] == ["transfer", "expected"]

@@ -31,11 +31,11 @@ class Method(Schema):
     """Attack as a suite names it.
 
     Attributes:
-        name: of the attack (`ssad list attacks`).
+        name: name of the attack (`ssad list attacks`).
         loss: objective of the ascent (default: that of the attack).
-        norm: of the budget.
+        norm: norm of the budget.
         options: further settings, such as restarts.
-        precision: of the gradients, if it differs from the suite's.
+        precision: precision of the gradients, if it differs from the suite's.
     """
 
     name: str = Field(min_length=1)
@@ -60,7 +60,12 @@ class Row(Method):
 
 
 class Guard(Schema):
-    """A defence before the detector: its name (jpeg, bits, blur, resize) and further settings."""
+    """A defence before the detector.
+
+    Attributes:
+        name: jpeg, bits, blur or resize.
+        options: Further settings, such as quality.
+    """
 
     name: str = Field(min_length=1)
     options: dict[str, Any] = Field(default={})
@@ -78,7 +83,7 @@ class Entry(Row):
         becomes: class -> target class of its objects.
         object: the attacked object of each moment: "nearest" (of `classes`, or of the classes in `becomes`, if
             they are given), or the token of an instance; None: all.
-        members: of the attack `ensemble`: the attacks of which the worst is kept at each moment.
+        members: for the attack `ensemble`: the attacks of which the worst is kept at each moment.
     """
 
     defence: Guard | None = None
@@ -97,7 +102,13 @@ class Entry(Row):
 
 
 class Sweep(Method):
-    """A curve: an attack over radii at the suite's steps, and over steps at the suite's radius; scenes as in `Row`."""
+    """A curve: an attack over radii at the suite's steps, and over steps at the suite's radius.
+
+    Attributes:
+        radii: Radii in 8-bit code values.
+        steps: Numbers of steps.
+        scenes: The attack runs on this many first scenes of each town; None: on all.
+    """
 
     radii: list[Radius] = Field(default=[])
     steps: list[Steps] = Field(default=[])
@@ -122,7 +133,7 @@ class AttackTable(Schema):
         radius: maximum change of an image in 8-bit code values, unless an attack sets it.
         steps: gradient steps, likewise.
         batch: camera images that are attacked at once on a GPU; fewer if memory does not suffice.
-        precision: of the gradients: bfloat16 is faster on a GPU. Losses that decide, and scores, are exact.
+        precision: precision of the gradients; bfloat16 is faster on a GPU. Losses that decide, and scores, are exact.
     """
 
     name: str

@@ -30,7 +30,14 @@ VIEWS = ("drive", GRID)
 
 
 class Pair(Schema):
-    """Two towns, for the training and the test of textures, and their numbers of images."""
+    """Two towns, for the training and the test of textures, and their numbers of images.
+
+    Attributes:
+        train: Town of the training.
+        test: Town of the test, another.
+        train_images: Number of images of the training.
+        test_images: Number of images of the test.
+    """
 
     train: str
     test: str
@@ -49,10 +56,10 @@ class Grid(Schema):
     """Views from all around the target: each combination once in each town of a test.
 
     Attributes:
-        distances: m.
-        azimuths: degrees from the front to the left of the target.
-        elevations: degrees.
-        weathers: kinds (`ssad.recorders.nuscenes.WEATHERS`).
+        distances: distances from the camera to the target, m.
+        azimuths: angles of the camera, degrees from the front to the left of the target.
+        elevations: angles of the camera above the target, degrees.
+        weathers: kinds of weather (`ssad.recorders.nuscenes.WEATHERS`).
         towns: towns of the tests with a grid; None: all.
     """
 
@@ -73,8 +80,8 @@ class Entry(Schema):
 
     Attributes:
         name: an attack (`ssad.scenarios.static.physical`), or a control: random, noise, grey, shuffled.
-        carrier: patch, camouflage or road, with its settings as `options`; default: the attack's own.
-        options: of the carrier.
+        carrier: what the texture covers, with settings in `options`; default: the attack's own.
+        options: settings of the carrier.
         settings: fields of `TextureAttack` that differ; titles name those in which two rows of one attack differ.
         around: number of images from all around the target, in the town of the training, that the texture is
             trained on beside those from behind.
@@ -99,9 +106,9 @@ class LightEntry(Schema):
 
     Attributes:
         name: an attack (`ssad.scenarios.static.physical.lights`).
-        hour: noon, low_sun, night, or recorded: as the images were.
+        hour: hour of the day: noon, low_sun, night, or recorded for that of each image.
         options: fields of the attack that differ.
-        settings: of its search (`Budget`); of a projector, of `TextureAttack`.
+        settings: settings of its search (`Budget`); for a projector, of `TextureAttack`.
     """
 
     name: str = Field(min_length=1)
@@ -122,13 +129,13 @@ class TargetTable(Schema):
         transfer: whether a texture is shown to the other detectors too.
         target: a car, stop_sign or pedestrian, as for `ssad record --target`; the latter two are seen from all
             around.
-        pairs: towns.
+        pairs: pairs of towns.
         attacks: names, or mappings with the keys of a texture entry.
         lights: names of light attacks, or mappings with the keys of `LightEntry`.
-        epochs: of all trained textures, in place of their own; None: their own.
+        epochs: epochs of all trained textures, in place of their own; None: their own.
         window: side of the part around the target that trainings show to a 2D detector, px, a multiple of 32; None:
             whole images, as for 3D detectors always. A window of 192 takes a sixth of the time.
-        seeds: of each control that is drawn at random.
+        seeds: draws of each control that is random.
         grid: views from all around, beside those from behind; None: none.
         behind: distance from the camera to a driving car, m.
         distances: distances from the camera to any other target, m.

@@ -68,7 +68,9 @@ def make_attack(name: str, **options: Any) -> Any:
             )
     missing = [option for option in needs(name) if option not in options]
     if missing:
-        raise ConfigError(f"attack {name}: it needs {' and '.join(missing)}: make it in Python (docs/attacks.md)")
+        raise ConfigError(
+            f"attack {name}: it needs {' and '.join(missing)}: make it in Python (docs/how-to/attack-detectors.md)"
+        )
     return make("attack", name, factory, options, required_attributes)
 
 
