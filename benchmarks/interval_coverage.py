@@ -1,8 +1,8 @@
 """How often the 95 % intervals hold, by simulation: python benchmarks/interval_coverage.py [--quick]
 
 Draws data sets whose true mean is known, of the shapes that occur in a run, and counts how often the interval that
-`ssad.metrics` gives holds it. Writes the tables between the markers in docs/results/intervals.md; with --quick it prints
-them.
+`ssad.metrics` gives holds it. Writes the tables between the markers in docs/results/intervals.md; with --quick it
+prints them.
 """
 
 from __future__ import annotations

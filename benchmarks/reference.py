@@ -76,9 +76,9 @@ def name_page() -> str:
     lines = [
         "# Registered names",
         "",
-        "The names that commands and suites accept, as `ssad list WHAT` prints them. In place of each, a suite takes an",
-        "entry point of an installed package or `module:object`. `ssad list scenarios` and `ssad list towns` also show",
-        "what has been imported on a machine. `python -m benchmarks.reference` makes this page.",
+        "The names that commands and suites accept, as `ssad list WHAT` prints them. In place of each, a suite takes",
+        "an entry point of an installed package or `module:object`. `ssad list scenarios` and `ssad list towns` also",
+        "show what has been imported on a machine. `python -m benchmarks.reference` makes this page.",
         "",
     ]
     for what in STABLE:
@@ -152,7 +152,8 @@ def _command_section(name: str, command: Any) -> list[str]:
         lines += ["| Option | Default | Description |", "|---|---|---|"]
         for option in options:
             names = ", ".join(f"`{one}`" for one in (*option.opts, *option.secondary_opts))
-            value = "" if option.is_flag else f" `{_cell(str(option.metavar or option.display_type()))}`"
+            kind = option.metavar or option.display_type(command.context_class(command))
+            value = "" if option.is_flag else f" `{_cell(str(kind).strip('<>').removesuffix(' range').upper())}`"
             lines.append(f"| {names}{value} | {_option_default(option)} | {_option_help(option)} |")
         lines.append("")
     return lines

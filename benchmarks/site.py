@@ -15,20 +15,29 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import ssad
 
 ROOT = Path(__file__).parents[1]
-TOP = ("ARCHITECTURE", "CONTRIBUTING", "CHANGELOG", "SECURITY")  # pages at the top of the repository, besides README
+TOP = ("ARCHITECTURE", "CONTRIBUTING", "CHANGELOG", "SECURITY")  # pages at the top of the repository; no README
 PARTS = {
-    "Start": ("index", "install", "concepts", "python", "notebooks/drive", "notebooks/perceive"),
-    "Drive": ("loop", "drivers", "scenarios", "generators", "how_often", "careful", "gap"),
-    "Perceive": ("detectors", "shifts", "attacks", "physical", "camera"),
-    "What the numbers are": ("metrics", "results", "accuracy", "digital", "physical_results", "benchmarks"),
-    "Other programs": ("interchange", "carla"),
-    "Reference": ("api", "stability", *TOP),
+    "Home": ("index",),
+    "Tutorials": ("tutorials/*",),
+    "How-to guides": ("how-to/*",),
+    "Reference": ("reference/*", "SECURITY", "CHANGELOG"),
+    "Explanation": ("explanation/*", "ARCHITECTURE", "CONTRIBUTING"),
+    "Results": ("results/*",),
 }
+"""Part of the site -> its pages in order; a star stands for the pages of a folder that are not named, by name."""
+ORDER = {
+    "tutorials/*": ("first-run", "my-driver", "my-detector", "camera-to-collision", "drive", "perceive"),
+    "how-to/*": ("install",),
+    "explanation/*": ("concepts", "intervals"),
+    "results/*": ("index",),
+}
+"""Pages of a folder that come first."""
 MORE = (  # beside the names of `ssad`
     "ssad.core.driving.Driver",
     "ssad.core.driving.Observation",
@@ -67,30 +76,73 @@ nav:
 
 
 def write_pages(folder: Path) -> list[str]:
-    """All pages into a folder, their links as they are there; names of the pages."""
+    """Write all pages into a folder, with their links as they are there; return the names of the pages."""
     shutil.copytree(ROOT / "docs", folder, ignore=shutil.ignore_patterns("*.ipynb"))
-    (folder / "index.md").write_text((ROOT / "README.md").read_text())
     for name in TOP:
         (folder / f"{name}.md").write_text((ROOT / f"{name}.md").read_text())
-    for notebook in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
-        (folder / "notebooks" / f"{notebook.stem}.md").write_text(as_page(notebook))
-    (folder / "api.md").write_text(api_page())
-    for page in folder.rglob("*.md"):
-        parts = re.split(r"\]\(([^)\s]+)\)", page.read_text())  # text, target, text, target, ...
-        page.write_text("".join(moved(part, page, folder) if k % 2 else part for k, part in enumerate(parts)))
-    return sorted(page.relative_to(folder).with_suffix("").as_posix() for page in folder.rglob("*.md"))
+    for notebook in sorted((ROOT / "docs").rglob("*.ipynb")):
+        (folder / notebook.relative_to(ROOT / "docs")).with_suffix(".md").write_text(as_page(notebook))
+    (folder / "reference" / "api.md").write_text(api_page())
+    pages = sorted(page.relative_to(folder) for page in folder.rglob("*.md"))
+    for page in pages:
+        source = ROOT / page.name if page.stem in TOP else ROOT / "docs" / page
+        parts = re.split(r"\]\(([^)\s]+)\)", (folder / page).read_text())  # text, target, text, target, ...
+        moved = (moved_link(part, source, page, folder) if k % 2 else part for k, part in enumerate(parts))
+        (folder / page).write_text("".join(moved))
+    return [page.with_suffix("").as_posix() for page in pages]
 
 
-def moved(target: str, page: Path, folder: Path) -> str:
-    """A link as it is on the site; what is not there (source, licence) is left as text."""
+def moved_link(target: str, source: Path, page: Path, folder: Path) -> str:
+    """Return a link as it is on the site; the text alone if its target is not there (source, licence).
+
+    Args:
+        target: Target of the link, relative to the page's source.
+        source: The page in the repository.
+        page: The page on the site, relative to the folder.
+        folder: Folder of the site's pages.
+    """
     file, mark, anchor = target.partition("#")
     if target.startswith("http") or not file:
         return f"]({target})"
-    file = file.removeprefix("docs/").removeprefix("../").replace("README.md", "index.md")
-    if file.endswith(".ipynb"):
-        file = file.removesuffix(".ipynb") + ".md"
-    found = (page.parent / file).exists() or (folder / file).exists()
-    return f"]({file}{mark}{anchor})" if found else "]"
+    place = (source.parent / file).resolve()
+    docs = ROOT / "docs"
+    if place == ROOT / "README.md":
+        inside = Path("index.md")
+    elif place.parent == ROOT:
+        inside = Path(place.name)
+    elif place.is_relative_to(docs):
+        inside = place.relative_to(docs)
+    else:
+        return "]"
+    if inside.suffix == ".ipynb":
+        inside = inside.with_suffix(".md")
+    if not (folder / inside).is_file():
+        return "]"
+    return f"]({os.path.relpath(folder / inside, (folder / page).parent)}{mark}{anchor})"
+
+
+def navigation(pages: Sequence[str]) -> dict[str, list[str]]:
+    """Return part -> its pages in order.
+
+    Raises:
+        SystemExit: A page has no place, or a place has no page.
+    """
+    named = {name for names in PARTS.values() for name in names if not name.endswith("*")}
+    parts: dict[str, list[str]] = {}
+    for part, names in PARTS.items():
+        found: list[str] = []
+        for name in names:
+            if name.endswith("*"):
+                inside = [page for page in pages if page.startswith(name[:-1]) and page not in named]
+                first = [name[:-1] + page for page in ORDER.get(name, ())]
+                found += [*first, *(page for page in inside if page not in first)]
+            else:
+                found.append(name)
+        parts[part] = found
+    listed = [page for found in parts.values() for page in found]
+    if sorted(listed) != sorted(pages):
+        sys.exit(f"error: pages without a place in PARTS, or the other way: {sorted(set(listed) ^ set(pages))}")
+    return parts
 
 
 def as_page(notebook: Path) -> str:
@@ -103,7 +155,7 @@ def as_page(notebook: Path) -> str:
 
 
 def api_page() -> str:
-    """Every public name, with the rest of `Results` and the protocols."""
+    """Return the page of every public name, with the protocols."""
     lines = ["# API", "", "The names of `ssad`, and the protocols that your own objects keep.", ""]
     named = {name: getattr(ssad, name) for name in ssad.__all__ if name != "__version__"}
     for name, value in sorted(named.items(), key=lambda item: item[0].lower()):
@@ -114,11 +166,11 @@ def api_page() -> str:
     return "\n".join(lines)
 
 
-def settings() -> str:
-    """mkdocs.yml."""
+def settings(pages: Sequence[str]) -> str:
+    """Return mkdocs.yml."""
     lines = [SETTINGS.replace("SOURCE", str(ROOT / "src")).rstrip()]
-    for part, pages in PARTS.items():
-        lines += [f"  - {part}:", *(f"      - {page}.md" for page in pages)]
+    for part, found in navigation(pages).items():
+        lines += [f"  - {part}:", *(f"      - {page}.md" for page in found)]
     return "\n".join(lines) + "\n"
 
 
@@ -130,10 +182,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         work = asked.out if asked.pages else Path(place)
         pages = write_pages(work / "pages")
-        (work / "mkdocs.yml").write_text(settings())
-        listed = [page for part in PARTS.values() for page in part]
-        if sorted(listed) != pages:
-            sys.exit(f"error: pages without a place in PARTS, or the other way: {sorted(set(listed) ^ set(pages))}")
+        (work / "mkdocs.yml").write_text(settings(pages))
         if asked.pages:
             return
         words = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--config-file", str(work / "mkdocs.yml")]

@@ -15,7 +15,7 @@ from helpers.run_folder import driving_lines, write_run
 import ssad
 
 ROOT = Path(__file__).resolve().parent.parent
-NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = sorted((ROOT / "docs" / "tutorials").glob("*.ipynb"))
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_settings_may_be_a_mapping_and_keep_their_types() -> None:
 
 def test_every_public_name_is_there() -> None:
     assert [name for name in ssad.__all__ if getattr(ssad, name, None) is None] == []
-    page = (ROOT / "docs" / "python.md").read_text()
+    page = (ROOT / "docs" / "reference" / "python.md").read_text()
     table = page[page.index("| Names |") : page.index("## Run a suite")]
     table = "\n".join(line for line in table.splitlines() if line.startswith("|"))
     assert set(re.findall(r"`(\w+)`", table)) == set(ssad.__all__) - {"__version__"}
@@ -97,7 +97,7 @@ def test_every_public_name_is_there() -> None:
 
 def examples(*, perceive: bool) -> str:
     """The page's code, that of the section on perception or all other; what needs pandas left out."""
-    page = (ROOT / "docs" / "python.md").read_text()
+    page = (ROOT / "docs" / "reference" / "python.md").read_text()
     page = re.sub(r"<!-- pandas -->\n```.*?```", "", page, flags=re.DOTALL)
     parts = [part for part in page.split("\n## ") if part.startswith("Perceive") is perceive]
     return "import ssad\n" + "\n".join(re.findall(r"```python\n(.*?)```", "\n".join(parts), re.DOTALL))

@@ -1,4 +1,4 @@
-"""The detector of docs/detectors.md: short, and it keeps every promise."""
+"""The detector of docs/how-to/use-detectors.md: short, and it keeps every promise."""
 
 import importlib.util
 from dataclasses import replace
@@ -14,7 +14,7 @@ from ssad.detectors import make_detector
 from ssad.detectors.check import check_detector
 from ssad.training.loop import train
 
-FILE = Path(__file__).resolve().parents[2] / "docs" / "own_detector.py"
+FILE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own_detector.py"
 
 
 @pytest.fixture

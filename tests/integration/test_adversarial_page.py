@@ -1,4 +1,4 @@
-"""Tables of docs/generators.md: of the whole suite, from records as a run writes them, also if not all has run."""
+"""Tables of docs/results/generators.md: of the whole suite, from records as a run writes them, also if not all has run."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ def test_the_whole_suite_has_a_section_of_its_own(tmp_path: Path, monkeypatch: p
     (run / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     monkeypatch.setattr(adversarial_page, "RESULTS", tmp_path / "kept")
     monkeypatch.setattr(adversarial_page, "DOCUMENT", page)
+    monkeypatch.setattr(adversarial_page, "LEARNED", page)
     monkeypatch.setattr("sys.argv", ["adversarial_page", f"whole+={run}"])  # to nothing, at first
     page.write_text(f"# Title\n\n{adversarial_page.BEFORE}\nothers\n")
     adversarial_page.main()
@@ -61,12 +62,14 @@ def test_the_whole_suite_has_a_section_of_its_own(tmp_path: Path, monkeypatch: p
 
 def test_the_page_is_what_its_command_makes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     page = tmp_path / "generators.md"
-    before = adversarial_page.DOCUMENT.read_text(encoding="utf-8")
-    page.write_text(before, encoding="utf-8")
-    monkeypatch.setattr(adversarial_page, "DOCUMENT", page)
+    pages = {"DOCUMENT": page, "LEARNED": tmp_path / "learned.md"}
+    before = {name: getattr(adversarial_page, name).read_text(encoding="utf-8") for name in pages}
+    for name, path in pages.items():
+        path.write_text(before[name].replace("| `frea` |", "| `other` |"), encoding="utf-8")
+        monkeypatch.setattr(adversarial_page, name, path)
     monkeypatch.setattr("sys.argv", ["adversarial_page"])
     adversarial_page.main()
-    assert page.read_text(encoding="utf-8") == before
+    assert {name: path.read_text(encoding="utf-8") for name, path in pages.items()} == before
 
 
 def test_the_table_of_trainings_is_what_its_command_makes() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDER = ROOT / "docs"
+FOLDER = ROOT / "docs" / "how-to"
 
 
 def examples(page: Path) -> list[str]:
@@ -41,13 +41,13 @@ def test_gymnasium_in_the_readme() -> None:
 
 
 def test_shifts(street: np.ndarray) -> None:
-    names = run(FOLDER / "shifts.md", images=street[None])
+    names = run(FOLDER / "shift-data.md", images=street[None])
     assert names["shifted"].shape == (1, *street.shape)
     assert (names["shifted"] != street).any()
 
 
 def test_adversaries_by_selection() -> None:
-    names = run(FOLDER / "drivers.md")
+    names = run(FOLDER / "use-adversaries.md")
     assert [trace.driven[-1] > 5.0 for trace in names["traces"]] == [True] * 3
 
 
@@ -57,7 +57,7 @@ def test_a_generator_of_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
     from ssad.world.roads import load_town
 
-    (block,) = examples(FOLDER / "generators.md")
+    (block,) = examples(FOLDER / "search-for-collisions.md")
     (tmp_path / "later.py").write_text(block)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -80,7 +80,7 @@ def test_attacks(street: np.ndarray) -> None:
     solid = some_truth(3, size=street.shape[:2], focal=125.0)
     flat, most = Truth(solid.label * 0, solid.box), 5 / 255 + 1e-6
     assert solid.intrinsic is not None
-    names = run(FOLDER / "attacks.md")
+    names = run(FOLDER / "attack-detectors.md")
     names["attacked"].__globals__["make_detector"] = lambda name: lively(TINY)  # of the same build, and quick
 
     moved, before, after = names["attacked"](images, [solid], solid.intrinsic[None].float())
@@ -99,7 +99,7 @@ def test_detectors(street: np.ndarray, tmp_path: Path, monkeypatch: pytest.Monke
 
     from ssad.detectors import make_detector
 
-    first, *_, last = examples(FOLDER / "detectors.md")
+    first, *_, last = examples(FOLDER / "use-detectors.md")
     save_file(make_detector("yolov5s", weights="random").state_dict(), tmp_path / "my.safetensors")
     cv2.imwrite(str(tmp_path / "street.jpg"), street)
     monkeypatch.chdir(tmp_path)

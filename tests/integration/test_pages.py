@@ -24,17 +24,23 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.parametrize(
     ("script", "name"),
     [
-        ("page", "benchmarks"),
-        ("shift_page", "results"),
+        ("page", "speed"),
+        ("shift_page", "shifts"),
         ("digital_page", "digital"),
-        ("physical_page", "physical_results"),
         ("detector_accuracy", "accuracy"),
-        ("how_often_page", "how_often"),
+        ("how_often_page", "how-often"),
     ],
 )
 def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
     page = runpy.run_path(str(ROOT / "benchmarks" / f"{script}.py"))["page"]()
-    assert page == (ROOT / "docs" / f"{name}.md").read_text(), f"run python -m benchmarks.{script}"
+    assert page == (ROOT / "docs" / "results" / f"{name}.md").read_text(), f"run python -m benchmarks.{script}"
+
+
+def test_the_pages_of_physical_attacks_are_made_from_the_measurements() -> None:
+    pages = runpy.run_path(str(ROOT / "benchmarks" / "physical_page.py"))["pages"]()
+    assert {"physical", "physical-3d", "physical-limits"} <= set(pages)
+    for name, page in pages.items():
+        assert page == (ROOT / "docs" / "results" / f"{name}.md").read_text(), "run python -m benchmarks.physical_page"
 
 
 @pytest.mark.parametrize("kind", WEATHERS)
@@ -52,25 +58,27 @@ def test_a_page_says_which_results_are_older_than_weights_and_shifts(run: str) -
     current &= told["weights"] == {
         name: state_hash(detector_of(name, "", "cpu")) for name in ("fcos3d-light", "pgd-det-light")
     }
-    warnings = [line for line in (ROOT / "docs" / "results.md").read_text().splitlines() if line.startswith("> **")]
+    warnings = [line for line in (ROOT / "docs" / "results" / "shifts.md").read_text().splitlines() if line.startswith("> **")]
     assert any(f"`{run}` with" in line for line in warnings) is not current
 
 
 def test_the_page_of_attacks_says_whether_weights_have_changed() -> None:
     told = json.loads((ROOT / "benchmarks" / "results" / "digital" / "run.json").read_text())
     current = told["weights"] == {name: state_hash(detector_of(name, "", "cpu")) for name in told["weights"]}
-    assert ("**Measured with earlier weights" in (ROOT / "docs" / "digital.md").read_text()) is not current
+    assert ("**Measured with earlier weights" in (ROOT / "docs" / "results" / "digital.md").read_text()) is not current
 
 
 def test_every_page_has_a_place_on_the_site_and_its_links_lead_somewhere(tmp_path: Path) -> None:
     site = runpy.run_path(str(ROOT / "benchmarks" / "site.py"))
     pages = site["write_pages"](tmp_path / "pages")
-    assert sorted(page for part in site["PARTS"].values() for page in part) == pages
+    parts = site["navigation"](pages)
+    assert list(parts) == ["Home", "Tutorials", "How-to guides", "Reference", "Explanation", "Results"]
+    assert sorted(page for part in parts.values() for page in part) == pages
     for page in pages:
         path = tmp_path / "pages" / f"{page}.md"
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", path.read_text()):
             assert target.startswith("http") or (path.parent / target).exists(), f"{page}: {target}"
-    api = (tmp_path / "pages" / "api.md").read_text()
+    api = (tmp_path / "pages" / "reference" / "api.md").read_text()
     assert "::: ssad.results.run" in api
     assert "::: ssad.core.protocols.Detector" in api
 
@@ -83,5 +91,5 @@ def test_the_site_is_built_without_a_network(tmp_path: Path) -> None:
     blocked = os.environ | {"http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
     done = subprocess.run(words, capture_output=True, text=True, check=False, env=blocked)
     assert done.returncode == 0, done.stderr
-    assert "Results" in (tmp_path / "site" / "api.html").read_text()
+    assert "Results" in (tmp_path / "site" / "reference" / "api.html").read_text()
     assert "https://fonts" not in (tmp_path / "site" / "index.html").read_text()

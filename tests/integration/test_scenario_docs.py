@@ -12,10 +12,12 @@ from ssad.scenarios.dynamic.knowledge._kind import EGO_START, TARGET_SPEED_SPREA
 from ssad.world.models import MODELS
 from ssad.world.roads import load_town
 
-PAGE = (Path(__file__).parents[2] / "docs" / "scenarios.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+GUIDE = (DOCS / "how-to" / "write-scenarios.md").read_text()
+PAGE = (DOCS / "reference" / "scenarios.md").read_text()
 
 
-@pytest.mark.parametrize("text", re.findall(r"```yaml\n(.*?)```", PAGE, re.S))
+@pytest.mark.parametrize("text", re.findall(r"```yaml\n(.*?)```", GUIDE, re.S))
 def test_the_examples_become_episodes(text: str, tmp_path: Path) -> None:
     path = tmp_path / "example.yaml"
     path.write_text(text)
@@ -40,4 +42,4 @@ def test_the_table_has_the_egos_start() -> None:
 
 
 def test_the_models_are_listed() -> None:
-    assert f"Models: {', '.join(MODELS)}." in PAGE
+    assert f"Models: {', '.join(MODELS)}." in GUIDE

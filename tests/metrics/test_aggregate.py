@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ssad.metrics import METRICS, Outcome, aggregate, aggregate_groups, episode_metrics, overall_score
 from ssad.metrics.intervals import share_limits
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "metrics.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "reference" / "metrics.md"
 
 
 def episode(hit: bool = False, complete: float = 100.0, distance: float = 0.0, steps: int = 11):

@@ -390,9 +390,10 @@ def test_check_driver_names_the_broken_promise(make, promise) -> None:
 
 
 def test_the_examples_of_the_page_run() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "loop.md").read_text()
+    folder = Path(__file__).parents[2] / "docs" / "how-to"
+    text = "".join((folder / f"{page}.md").read_text() for page in ("drive-agents", "plan-over-beliefs"))
     names: dict[str, object] = {}
-    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, names)
         assert len(names["traces"]) == 4
     assert all(trace.driven[-1] > 20.0 for trace in names["traces"])

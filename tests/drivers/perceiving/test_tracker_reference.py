@@ -31,7 +31,7 @@ def test_the_association_is_as_good_as_bytetracks_on_the_same_boxes(reference: d
 
 
 def test_the_stored_scores_of_the_others_are_those_of_the_package(reference: dict[str, Any]) -> None:
-    pytest.importorskip("trackers", reason="trackers is not installed (docs/gap.md)")
+    pytest.importorskip("trackers", reason="trackers is not installed (docs/results/gap.md)")
     found = reference["compare"](reference["load"]())
     for name in ("ByteTrack", "SORT"):
         for score in ("hota", "mota", "idf1"):

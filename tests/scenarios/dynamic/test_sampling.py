@@ -430,7 +430,7 @@ def test_every_seed_is_a_dangerous_episode_of_its_own() -> None:
 @pytest.mark.slow
 def test_the_page_says_how_dangerous_the_draws_are() -> None:
     rates = check_danger(50)
-    page = (ROOT / "docs" / "scenarios.md").read_text()
+    page = (ROOT / "docs" / "results" / "traffic.md").read_text()
     for name, systems in rates.items():
         row = next(line for line in page.splitlines() if line.startswith(f"| {name} |") and line.count("|") == 6)
         told = [float(cell) for cell in row.strip("|").split("|")[1:]]

@@ -88,7 +88,8 @@ def careful_table(run: Run) -> Table | None:
         return None
     note = (
         "Of the saved collisions of each base in which one was found. Careful drivers "
-        "(docs/explanation/careful-drivers.md) take the wheel when the danger begins; a collision that one of them avoids is attributable to the system. Who has stopped is "
+        "(docs/explanation/careful-drivers.md) take the wheel when the danger begins; "
+        "a collision that one of them avoids is attributable to the system. Who has stopped is "
         f"often hit all the same: see the columns with the ego moving. {METHODS}"
     )
     heads = ("Generator", "System")
