@@ -1,4 +1,4 @@
-"""Tables of docs/results/generators.md: of the whole suite, from records as a run writes them, also if not all has run."""
+"""Tables of docs/results/generators.md: of the whole suite, from records of a run, also of an incomplete one."""
 
 from __future__ import annotations
 

@@ -145,18 +145,19 @@ def test_every_part_of_the_documentation_has_pages() -> None:
 BANNED = {
     "a line of contents": r"^\*?\*?Contents:",
     "he, him or his": r"\b(?:he|him|his)\b|(?:^|[.!?] )(?:He|His)\b",
-    "a table cell with more than three links": r"^\|(?:.*\|)?(?:[^|\n]*\]\([^|\n]*){4,}\|",
 }
 
 
 @page
-@pytest.mark.parametrize("what", BANNED)
-def test_a_page_has_none_of_what_is_banned(page: str, what: str) -> None:
+def test_a_page_has_nothing_that_is_banned(page: str) -> None:
     if page == "CHANGELOG.md":
         return
     prose = re.sub(r"`[^`\n]*`", "", FENCE.sub("", TEXTS[page]))
-    found = re.search(BANNED[what], prose, re.MULTILINE)
-    assert not found, f"{what}: {found[0] if found else ''}"
+    for what, pattern in BANNED.items():
+        found = re.search(pattern, prose, re.MULTILINE)
+        assert not found, f"{what}: {found[0] if found else ''}"
+    cells = [cell for line in prose.splitlines() if line.startswith("|") for cell in line.split("|")]
+    assert [cell for cell in cells if cell.count("](") > 3] == []
 
 
 def test_a_result_says_where_it_comes_from() -> None:

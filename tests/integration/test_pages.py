@@ -58,7 +58,9 @@ def test_a_page_says_which_results_are_older_than_weights_and_shifts(run: str) -
     current &= told["weights"] == {
         name: state_hash(detector_of(name, "", "cpu")) for name in ("fcos3d-light", "pgd-det-light")
     }
-    warnings = [line for line in (ROOT / "docs" / "results" / "shifts.md").read_text().splitlines() if line.startswith("> **")]
+    warnings = [
+        line for line in (ROOT / "docs" / "results" / "shifts.md").read_text().splitlines() if line.startswith("> **")
+    ]
     assert any(f"`{run}` with" in line for line in warnings) is not current
 
 

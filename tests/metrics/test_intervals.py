@@ -170,7 +170,7 @@ def test_replicates_of_few_clusters_are_widened():
 
 
 def by_hand(sums, size, stratum, assumed=None):
-    """Mean, variance, degrees of freedom, skewness, and what each cluster adds (docs/explanation/intervals.md); no arrays."""
+    """Mean, variance, degrees of freedom, skewness, and the part of each cluster, without arrays."""
     strata = sorted(set(stratum))
     cases = {h: sum(n for n, g in zip(size, stratum, strict=True) if g == h) for h in strata}
     total = {h: sum(x for x, g in zip(sums, stratum, strict=True) if g == h) for h in strata}
