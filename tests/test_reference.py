@@ -1,4 +1,4 @@
-"""The pages of commands, of keys of suites and of names are those that the code makes, also for the kind of a plug-in."""
+"""Pages of commands, keys and names are those that the code makes; the kind of a plug-in gets the same section."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class WheelSuite(SuiteBase):
     kind: Literal["wheels"]
     chunk: int = 8
     carts: list[Annotated[int, Field(ge=1, le=5)] | Literal["random"]] = Field(min_length=1)
-    wheels: list[Wheel] = [Wheel(radius=0.5)]
+    wheels: list[Wheel] = Field(default=[Wheel(radius=0.5)])
 
 
 class Wheels(Kind):
@@ -65,8 +65,8 @@ def test_the_kind_of_a_plug_in_gets_the_same_section() -> None:
     assert lines[0] == "## Kind `wheels`"
     assert "Wheels of some carts." in lines
     assert (
-        "| `carts` | list of integer (at least 1, at most 5) or `random` | required | not empty | Names of carts, which "
-        "may go on in another line ([install.md](../how-to/install.md)). |"
+        "| `carts` | list of integer (at least 1, at most 5) or `random` | required | not empty "
+        "| Names of carts, which may go on in another line ([install.md](../how-to/install.md)). |"
     ) in lines
     assert "| `wheels` | list of mapping: Wheel | `[{radius: 0.5}]` |  | Wheels of each cart. |" in lines
     assert "| `radius` | number | `0.3` | more than 0 | Its size, m. |" in lines
