@@ -28,6 +28,7 @@ from ssad.experiments.suites import KINDS, kind_of
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference"
 STABLE = ("suites", "kinds", "generators", "systems", "detectors", "recipes", "shifts", "attacks")
 """Lists of `ssad list` that depend on the installed package alone, not on what has been imported."""
+KINDS_OF_VALUE = {"str": "text", "int": "integer", "float": "number"}
 BOUNDS = {"ge": "at least {}", "gt": "more than {}", "le": "at most {}", "lt": "less than {}"}
 
 
@@ -153,7 +154,8 @@ def _command_section(name: str, command: Any) -> list[str]:
         for option in options:
             names = ", ".join(f"`{one}`" for one in (*option.opts, *option.secondary_opts))
             kind = option.metavar or option.display_type(command.context_class(command))
-            value = "" if option.is_flag else f" `{_cell(str(kind).strip('<>').removesuffix(' range').upper())}`"
+            kind = str(kind).strip("<>").removesuffix(" range")
+            value = "" if option.is_flag else f" `{_cell(KINDS_OF_VALUE.get(kind, kind).upper())}`"
             lines.append(f"| {names}{value} | {_option_default(option)} | {_option_help(option)} |")
         lines.append("")
     return lines
@@ -190,12 +192,10 @@ def _help(text: str) -> list[str]:
 def _option_default(option: Any) -> str:
     if option.required:
         return "required"
-    value = option.default
+    value = option.default.value if isinstance(option.default, Enum) else option.default
     if option.is_flag:
         return "on" if value is True else ""
-    if value is None or value in ([], ()) or callable(value) or not isinstance(value, str | int | float | Path | Enum):
-        return ""
-    return f"`{_cell(str(value.value if isinstance(value, Enum) else value))}`"
+    return f"`{_cell(str(value))}`" if isinstance(value, str | int | float | Path) and value != "" else ""
 
 
 def _key_table(model: type[BaseModel], keys: list[str]) -> list[str]:
@@ -301,7 +301,9 @@ def _summary(model: type[BaseModel]) -> str:
 
 def _linked(text: str) -> str:
     """Return text in which paths of pages are links."""
-    return re.sub(r"\bdocs/((?:[\w-]+/)+([\w-]+)\.md)", r"[\2](../\1)", text)
+    return re.sub(
+        r"\bdocs/((?:[\w-]+/)+([\w-]+)\.md)", lambda found: f"[{found[2].replace('-', ' ')}](../{found[1]})", text
+    )
 
 
 def _cell(text: str) -> str:

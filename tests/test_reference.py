@@ -66,7 +66,7 @@ def test_the_kind_of_a_plug_in_gets_the_same_section() -> None:
     assert "Wheels of some carts." in lines
     assert (
         "| `carts` | list of integer (at least 1, at most 5) or `random` | required | not empty "
-        "| Names of carts, which may go on in another line ([install.md](../how-to/install.md)). |"
+        "| Names of carts, which may go on in another line ([install](../how-to/install.md)). |"
     ) in lines
     assert "| `wheels` | list of mapping: Wheel | `[{radius: 0.5}]` |  | Wheels of each cart. |" in lines
     assert "| `radius` | number | `0.3` | more than 0 | Its size, m. |" in lines
