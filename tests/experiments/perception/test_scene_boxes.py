@@ -13,7 +13,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors.on_scenes import SampleBoxes, detect_scene
 from ssad.experiments.perception import scene_boxes
-from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, distinct_scenes, score_scenes
+from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, distinct_scenes, score_scenes
 from ssad.metrics.detection_boxes import BoxTable
 
 
@@ -57,7 +57,7 @@ def test_copies_never_narrow_an_interval(recorded: Path, monkeypatch: pytest.Mon
     results = []
     for told in (truth, twice(truth)):
         monkeypatch.setattr(scene_boxes, "_truth", lambda *parts, told=told: told)
-        scenes = [ShiftedScene(None, 0, name) for name in told.scenes]
+        scenes = [SceneCondition(name) for name in told.scenes]
         results.append(score_scenes(examination, "oracle", scenes, replicates=40))
     once, doubled = results
     assert once["metrics"] == doubled["metrics"]

@@ -88,16 +88,16 @@ class Perception(DetectorKind):
         weights, detectors, tasks = detectors_of(suite, flat=True)
         if not is_town(suite.target_town):
             raise ConfigError(f"suite {suite.name}: unknown town '{suite.target_town}' (see: ssad list towns)")
-        perturbations = [
-            (perturbation, entry.model_dump(mode="json"))
+        pairs = [
+            (made, entry.model_dump(mode="json"))
             for entry in suite.perturbations
-            for perturbation in entry.at(suite.severities)
+            for made in entry.at(suite.severities)
         ]
-        on_scenes = [pair for pair in perturbations if not pair[0].needs_target]
+        on_scenes = [pair for pair in pairs if not pair[0].needs_target]
         targets: dict[str, list[tuple[Perturbation, Any]]] = {}
-        for perturbation, entry in perturbations:
-            if perturbation.needs_target:
-                targets.setdefault(perturbation.target, []).append((perturbation, entry))
+        for pair in pairs:
+            if pair[0].needs_target:
+                targets.setdefault(pair[0].target, []).append(pair)
         data = data_of(suite) if on_scenes or not targets else {}
         cells = []
         for detector in detectors:

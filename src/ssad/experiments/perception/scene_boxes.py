@@ -168,6 +168,11 @@ def system_of(examination: Examination, name: str) -> Any:
     return detector if defence is None else Defended(detector, defence)
 
 
+def samples_at_once(presentation: PerturbedScene) -> int:
+    """Return the samples to ask a scene for together: enough to fill a batch, of one sample's cameras or of several."""
+    return max(AT_ONCE, math.ceil(presentation.images_at_once / CAMERAS))
+
+
 def find_boxes(examination: Examination, scene: SceneCondition, detectors: Sequence[str]) -> None:
     """Write the boxes that detectors find in a scene, unless the files exist.
 
@@ -192,7 +197,7 @@ def find_boxes(examination: Examination, scene: SceneCondition, detectors: Seque
             device=examination.device,
             look=presentation.look,
             ahead=presentation.ahead,
-            at_once=max(AT_ONCE, math.ceil(presentation.images_at_once / CAMERAS)),
+            at_once=samples_at_once(presentation),
         )
     for name, samples, monitored_detector in zip(missing_names, boxes_by_detector, monitored, strict=True):
         _write(

@@ -157,7 +157,7 @@ def _shape(answer: Answer, part: slice, *, reverse: bool) -> _Shape | None:
         return None
     # On unwrapped yaw, which has no jump at pi.
     selected = _thin(arc_length, yaw, width)
-    wrapped_yaw: F64 = wrap_angle(yaw)
+    wrapped_yaw = np.asarray(wrap_angle(yaw), np.float64)
     return _Shape(
         xy[selected], z[selected], wrapped_yaw[selected], np.maximum(width[selected], 0.0), arc_length[selected]
     )

@@ -19,11 +19,11 @@ from rich.console import Console
 from ssad.core.errors import SSADError
 from ssad.core.images import read_image
 from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.detectors.monitored import Watched
 from ssad.engine.command import command_of
 from ssad.engine.kind import Job, Plan, Resources
 from ssad.engine.run import run
 from ssad.experiments.perception import scored_data
-from ssad.experiments.perception.digital import attacked_scenes
 from ssad.experiments.perception.digital import kind as digital
 from ssad.experiments.perception.digital.attack_sheet import magnified
 from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
@@ -38,17 +38,22 @@ from ssad.experiments.perception.digital.page import (
 from ssad.experiments.perception.digital.page import summary as kind_summary
 from ssad.experiments.perception.scene_boxes import (
     Examination,
-    Watched,
+    SceneCondition,
     boxes_path,
     detector_of,
     find_boxes,
     read_boxes,
+    recorded_scene,
+    samples_at_once,
 )
 from ssad.experiments.runs import summary, write_report
 from ssad.experiments.suites import load_suite
 from ssad.report.load import load_run
 from ssad.report.paper import DIGITAL as PUBLISHED
-from ssad.scenarios.static.digital.scene_attacker import AttackedScene, AttackSpec, SceneAttacker
+from ssad.scenarios.static.digital import scene_attacker
+from ssad.scenarios.static.digital.perturbation import DigitalAttack
+from ssad.scenarios.static.digital.scene_attacker import SceneAttacker
+from ssad.scenarios.static.digital.spec import AttackSpec
 from ssad.scenarios.static.digital.tally import sum_notes
 from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.training.data import nuscenes_items
@@ -259,7 +264,7 @@ def test_what_is_there_is_not_run_again_and_what_failed_is_if_asked(
     gone = [k for k, line in enumerate(kept) if json.loads(line)["attack"] == "fgsm"]
     (out / "results.jsonl").write_text("".join(f"{line}\n" for k, line in enumerate(kept) if k not in gone))
     asked: list[Any] = []
-    monkeypatch.setattr(attacked_scenes, "run_attack", lambda *given, **named: asked.append(given))
+    monkeypatch.setattr(scene_attacker, "run_attack", lambda *given, **named: asked.append(given))
     records = run_digital(Digital().plan(suite_of(root)), out)
     assert not asked, "the boxes were kept"
 
@@ -274,10 +279,10 @@ def test_what_is_there_is_not_run_again_and_what_failed_is_if_asked(
 def attacker(root: Path, *, batch: int, device: str = "cpu", seed: int = 0) -> tuple[SceneAttacker, list[Any]]:
     with NuScenes(root) as data:
         name = data.scenes()[0].name
-        scene = data.scene(name)
-    examination = Examination(Path(), root, "v1.0-mini", ((LINEAR, ""),), seed, device, 1)
-    found = SceneAttacker(AttackedScene(PGD, name, batch), examination, scene, Watched(detector_of(LINEAR, "", "cpu")))
-    return found, [f for f in scene.frames if f.modality == "camera" and f.key_frame][:4]
+        examination = Examination(Path(), root, "v1.0-mini", ((LINEAR, ""),), seed, device, 1)
+        recorded = recorded_scene(examination, data, SceneCondition(name, batch=batch))
+    found = SceneAttacker(PGD, recorded, Watched(detector_of(LINEAR, "", "cpu")))
+    return found, [f for f in recorded.data.frames if f.modality == "camera" and f.key_frame][:4]
 
 
 def test_an_image_is_attacked_alike_in_any_batch_and_order(root: Path) -> None:
@@ -298,9 +303,10 @@ def test_several_samples_fill_a_batch_on_a_gpu(root: Path) -> None:
     base, _ = attacker(root, batch=1)
     with NuScenes(root) as data:
         for batch, samples in ((12, 6), (36, 6), (40, 7), (96, 16)):
-            view = AttackedScene(PGD, base.view.scene, batch, LINEAR)
-            shown = view.shown(base.examination, data, [Watched(base.watched.detector, LINEAR)])
-            assert shown.at_once == samples
+            examination = Examination(Path(), root, "v1.0-mini", ((LINEAR, ""),), 0, "cpu", 1)
+            condition = SceneCondition(base.recorded.data.record.name, DigitalAttack(PGD), LINEAR, batch)
+            shown = condition.present(examination, data, [Watched(base.watched.detector, LINEAR)])
+            assert samples_at_once(shown) == samples
 
 
 def test_where_memory_does_not_suffice_batches_are_halved(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -308,7 +314,7 @@ def test_where_memory_does_not_suffice_batches_are_halved(root: Path, monkeypatc
     whole.batch = 4
     expected = whole.look(frames)
     sizes: list[int] = []
-    real = attacked_scenes.run_attack
+    real = scene_attacker.run_attack
 
     def narrow(attack: Any, detector: Any, images: torch.Tensor, *given: Any, **named: Any) -> Any:
         sizes.append(len(images))
@@ -316,7 +322,7 @@ def test_where_memory_does_not_suffice_batches_are_halved(root: Path, monkeypatc
             raise torch.OutOfMemoryError("no memory")
         return real(attack, detector, images, *given, **named)
 
-    monkeypatch.setattr(attacked_scenes, "run_attack", narrow)
+    monkeypatch.setattr(scene_attacker, "run_attack", narrow)
     short, _ = attacker(root, batch=4)
     short.batch = 4
     found = short.look(frames)
@@ -329,7 +335,7 @@ def test_a_universal_change_is_fitted_to_fewer_images_at_once_where_memory_does_
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sizes: list[int] = []
-    real = attacked_scenes.Victim
+    real = scene_attacker.Victim
 
     def narrow(detector: Any, images: torch.Tensor, *given: Any, **named: Any) -> Any:
         sizes.append(len(images))
@@ -337,10 +343,10 @@ def test_a_universal_change_is_fitted_to_fewer_images_at_once_where_memory_does_
             raise torch.OutOfMemoryError("no memory")
         return real(detector, images, *given, **named)
 
-    monkeypatch.setattr(attacked_scenes, "Victim", narrow)
+    monkeypatch.setattr(scene_attacker, "Victim", narrow)
     base, _ = attacker(root, batch=4)
     spec = AttackSpec("universal", "full", "linf", 5.0, (("frames", 4), ("over", "drive"), ("steps", 1)))
-    own = SceneAttacker(AttackedScene(spec, base.view.scene), base.examination, base.scene, base.watched)
+    own = SceneAttacker(spec, base.recorded, base.watched)
     own.batch = 4
     own._fit()
     assert sizes == [4, 2, 1, 1, 1, 1]
@@ -363,9 +369,9 @@ def test_a_scene_that_is_cut_off_goes_on_from_its_pictures(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     base, _ = attacker(root, batch=1)
-    view = AttackedScene(PGD, base.view.scene, source=LINEAR)
+    view = SceneCondition(base.recorded.data.record.name, DigitalAttack(PGD), LINEAR)
     asked: list[str] = []
-    real = attacked_scenes.run_attack
+    real = scene_attacker.run_attack
     stop_at = 3
 
     def counted(*given: Any, **named: Any) -> Any:
@@ -375,7 +381,7 @@ def test_a_scene_that_is_cut_off_goes_on_from_its_pictures(
         asked.append(key[1])
         return real(*given, **named)
 
-    monkeypatch.setattr(attacked_scenes, "run_attack", counted)
+    monkeypatch.setattr(scene_attacker, "run_attack", counted)
     out = [Examination(tmp_path / name, root, "v1.0-mini", ((LINEAR, ""),), 0, "cpu", 1) for name in ("cut", "whole")]
     with pytest.raises(KeyboardInterrupt):
         find_boxes(out[0], view, [LINEAR])
@@ -384,7 +390,7 @@ def test_a_scene_that_is_cut_off_goes_on_from_its_pictures(
     kept[0].write_bytes(b"cut off in the middle")
     stop_at = 1000
     find_boxes(out[0], view, [LINEAR])
-    many = len([f for f in base.scene.frames if f.modality == "camera" and f.key_frame])
+    many = len([f for f in base.recorded.data.frames if f.modality == "camera" and f.key_frame])
     assert len(asked) == many + 1, "of three one was broken"
     find_boxes(out[1], view, [LINEAR])
     boxes, notes = zip(*(read_boxes(boxes_path(one.folder, LINEAR, view)) for one in out), strict=True)
@@ -396,8 +402,8 @@ def test_a_scene_that_is_cut_off_goes_on_from_its_pictures(
 def test_an_image_without_objects_is_left_as_it_is_by_a_loss_that_needs_some(root: Path) -> None:
     spec = AttackSpec("fgsm", "mislabel", "linf", 5.0)
     base, _ = attacker(root, batch=1)
-    own = SceneAttacker(AttackedScene(spec, base.view.scene), base.examination, base.scene, base.watched)
-    every = [f for f in base.scene.frames if f.modality == "camera" and f.key_frame]
+    own = SceneAttacker(spec, base.recorded, base.watched)
+    every = [f for f in base.recorded.data.frames if f.modality == "camera" and f.key_frame]
     empty = [f for f in every if not len(own._truth(f).label)]
     assert empty, "the tiny set has such pictures"
     found = own.look(empty[:1])
@@ -522,13 +528,13 @@ def test_the_suite_digital_takes_100_000_passes_of_a_detector_at_most() -> None:
     towns = {f"{town} {number}": town for town in suite.recorded.towns for number in range(suite.recorded.scenes)}
     job = Job(Path(), "cuda", {"scenes": towns, "towns": towns, "batch": 12})
     every = {
-        one.name + one.source: one
+        one.name + one.source: one.perturbation.spec
         for cell in plan.cells
         for one in Digital().scenes(cell, job)
-        if isinstance(one, AttackedScene)
+        if isinstance(one.perturbation, DigitalAttack)
     }
     images = 6 * int(2 * suite.recorded.seconds)
-    passes = sum(one.spec.passes_in(images) for one in every.values())
+    passes = sum(one.passes_in(images) for one in every.values())
     assert 50_000 < passes / len(suite.detectors) <= 100_000
 
 

@@ -23,7 +23,7 @@ from ssad.datasets.nuscenes.truth import GroundTruth
 from ssad.detectors.on_scenes import SampleBoxes, match_boxes
 from ssad.engine.kind import Job, Resources
 from ssad.engine.run import run
-from ssad.experiments.perception.digital import attack_scores, attacked_scenes
+from ssad.experiments.perception.digital import attack_scores
 from ssad.experiments.perception.digital.attack_scores import by_distance, target_success, worst_by_sample, worst_of
 from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
 from ssad.experiments.perception.digital.page import attempts_of, load_digital_run, main_table
@@ -35,12 +35,14 @@ from ssad.experiments.perception.digital.tables import (
     target_table,
     transfer_table,
 )
-from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
+from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, boxes_path, read_scenes, truth_of
 from ssad.experiments.perception.shifts.page import interval_note
 from ssad.experiments.runs import write_report
 from ssad.report.load import load_run
+from ssad.scenarios.static.digital import scene_attacker
 from ssad.scenarios.static.digital.chosen_object import NEAREST, chosen_first, chosen_object, chosen_places
-from ssad.scenarios.static.digital.scene_attacker import AttackedScene
+from ssad.scenarios.static.digital.perturbation import DigitalAttack
+from ssad.scenarios.static.digital.spec import AttackSpec
 
 ONE, OTHER = "helpers.linear3d:build", "helpers.linear3d:build_other"
 BLIND = "helpers.linear3d:build_blind"
@@ -87,7 +89,7 @@ def suite_of(root: Path, **changes: Any) -> DigitalSuite:
 def folder(root: Path, shared: Shared) -> Path:
     def make(out: Path) -> None:
         attacked: Counter[str] = Counter()
-        real = attacked_scenes.run_attack
+        real = scene_attacker.run_attack
 
         def counted(attack: Any, detector: Any, images: Any, *given: Any, **named: Any) -> Any:
             about = f"{attack.name} on {detector.name}"
@@ -98,7 +100,7 @@ def folder(root: Path, shared: Shared) -> Path:
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("LINEAR_DATA", str(root))
-            patch.setattr(attacked_scenes, "run_attack", counted)
+            patch.setattr(scene_attacker, "run_attack", counted)
             console = Console(file=io.StringIO(), width=200)
             run(Digital().plan(suite_of(root)), out, Resources(0, console=console))
             write_report(out)
@@ -278,9 +280,9 @@ def boxes_of(folder: Path, root: Path) -> tuple[list[SampleBoxes], list[SampleBo
     examination = Examination(folder, root, "v1.0-mini", (), 0, "cpu", 1)
     with NuScenes(root) as data:
         names = [scene.name for scene in data.scenes()]
-    spec = attacked_scenes.AttackSpec("fgsm", "full", "linf", 5.0)
-    clean, _ = read_scenes(examination, ONE, [ShiftedScene(None, 0, name) for name in names])
-    attacked, _ = read_scenes(examination, ONE, [AttackedScene(spec, name, 1, ONE) for name in names])
+    spec = AttackSpec("fgsm", "full", "linf", 5.0)
+    clean, _ = read_scenes(examination, ONE, [SceneCondition(name) for name in names])
+    attacked, _ = read_scenes(examination, ONE, [SceneCondition(name, DigitalAttack(spec), ONE, 1) for name in names])
     return clean, attacked, truth_of(examination, names)
 
 
@@ -384,8 +386,11 @@ def test_records_of_older_versions_can_be_read(folder: Path) -> None:
 
 
 def test_pictures_against_different_systems_lie_apart(tmp_path: Path) -> None:
-    spec = attacked_scenes.AttackSpec("fgsm", "full", "linf", 5.0)
-    paths = {boxes_path(tmp_path, "eye", AttackedScene(spec, "s", 1, source)) for source in ("a", "b", "a+jpeg")}
+    spec = AttackSpec("fgsm", "full", "linf", 5.0)
+    paths = {
+        boxes_path(tmp_path, "eye", SceneCondition("s", DigitalAttack(spec), source, 1))
+        for source in ("a", "b", "a+jpeg")
+    }
     assert len(paths) == 3
 
 

@@ -16,10 +16,10 @@ from rich.console import Console
 from ssad.core.errors import ConfigError, FormatError
 from ssad.engine.kind import Job, Plan, Resources
 from ssad.experiments.perception import detector_kind
-from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, boxes_path
+from ssad.experiments.perception.scene_boxes import Examination, boxes_path
 from ssad.experiments.perception.scored_data import Recorded, recording_of
 from ssad.experiments.perception.shifts import kind as shifts_kind
-from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
+from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite, shifted_scene
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
 
@@ -187,7 +187,7 @@ def test_scenes_of_a_cell(tmp_path: Path) -> None:
     assert of(dealt) == [["fog", severities[token], scene] for scene, token in SCENES.items()]
     *_, drawn = plan_of(detectors=["one"], calibration="paper").cells
     assert of(drawn) == [["fog", "random", scene] for scene in SCENES], "drawn by sample"
-    there = boxes_path(tmp_path, "one", ShiftedScene("fog", 3, "scene-2"))
+    there = boxes_path(tmp_path, "one", shifted_scene("fog", 3, "physical", "scene-2"))
     there.parent.mkdir(parents=True)
     there.touch()
     assert of(fog) == [["fog", 3, scene] for scene in SCENES if scene != "scene-2"]
@@ -203,11 +203,11 @@ def test_boxes_are_found_and_scored_with_what_the_job_says(tmp_path: Path, monke
 
     replace_name(monkeypatch, "score_scenes", score)
     kind, cell = Detection(), plan_of(detectors=["one"]).cells[2]
-    expected = Examination(tmp_path, Path("/data"), "v1.0-mini", (("one", "one.pth"),), 7, "cuda", 3, "physical")
-    kind.make("name", ["fog", 3, "scene-1"], ["one", "two"], job(tmp_path))
-    assert found == [(expected, ShiftedScene("fog", 3, "scene-1"), ["one", "two"])]
+    expected = Examination(tmp_path, Path("/data"), "v1.0-mini", (("one", "one.pth"),), 7, "cuda", 3)
+    kind.make("name", ["fog", 3, "physical", "scene-1"], ["one", "two"], job(tmp_path))
+    assert found == [(expected, shifted_scene("fog", 3, "physical", "scene-1"), ["one", "two"])]
     results = kind.execute([cell], job(tmp_path))
-    assert found[1:] == [(expected, ShiftedScene("fog", 3, scene), ["one"]) for scene in SCENES]
+    assert found[1:] == [(expected, shifted_scene("fog", 3, "physical", scene), ["one"]) for scene in SCENES]
     assert results == {
         cell.key: {
             "metrics": {"scenes": 5},
@@ -324,7 +324,9 @@ def test_boxes_that_could_not_be_found_are_forgotten_when_they_are_tried_again(
     plan = plan_of()
     given = Plan(plan.kind, suite(data=str(tmp_path)), "cpu", plan.cells, plan.inputs, {}, plan.details)
     Detection().prepare(given, tmp_path / "out", quiet(), retry=[plan.cells[2]])
-    assert forgotten == [boxes_path(tmp_path / "out", "one", ShiftedScene("fog", 3, scene)) for scene in SCENES]
+    assert forgotten == [
+        boxes_path(tmp_path / "out", "one", shifted_scene("fog", 3, "physical", scene)) for scene in SCENES
+    ]
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from ssad.engine.local import WORKER_MEMORY
 from ssad.engine.replay import difference
 from ssad.engine.run import run, run_json
 from ssad.experiments.perception import detector_kind as detection
-from ssad.experiments.perception.scene_boxes import ShiftedScene, boxes_path, find_boxes, forget_failures, read_boxes
+from ssad.experiments.perception.scene_boxes import SceneCondition, boxes_path, find_boxes, forget_failures, read_boxes
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
 from ssad.experiments.perception.shifts.page import left_table, load_detection_run, main_table, robustness_table
 from ssad.experiments.runs import write_report
@@ -170,7 +170,7 @@ def test_cells_are_scored_as_soon_as_their_boxes_are_there(
     """Clean first, then what the main table tells, shift by shift; what is scored by then outlives a stop."""
     todo, order = plan_detection(suite_of(root)), []
 
-    def make(examination: Any, scene: ShiftedScene, detectors: Any) -> None:
+    def make(examination: Any, scene: SceneCondition, detectors: Any) -> None:
         if not boxes_path(examination.folder, ORACLE, scene).is_file():
             if len(order) == 7:
                 raise KeyboardInterrupt

@@ -13,7 +13,7 @@ from ssad.core.schema import Schema
 from ssad.engine.kind import Kind, SuiteBase
 from ssad.experiments.suites import KINDS, kind_of
 
-PAGES = Path(__file__).resolve().parents[1] / "docs" / "reference"
+PAGES = Path(__file__).resolve().parents[2] / "docs" / "reference"
 
 
 @pytest.mark.parametrize(("name", "make"), [("cli", "command_page"), ("suites", "suite_page"), ("names", "name_page")])
