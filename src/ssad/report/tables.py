@@ -5,12 +5,18 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from ssad.core import safeio
 from ssad.metrics import Estimate
+
+Record = TypeVar("Record")
+Column = TypeVar("Column")
+Result = TypeVar("Result")
 
 METHODS = (
     "[a, b]: 95 % interval, from how the clusters (scenarios, routes, drives) vary: beta limits for shares and other "
@@ -36,6 +42,11 @@ class Cell:
     def of(cls, e: Estimate) -> Cell:
         """Return the cell of an estimate."""
         return cls(e.mean, e.low, e.high, e.n, e.failed, e.clusters, e.method)
+
+    @classmethod
+    def value(cls, number: float | None, *, digits: int = 2) -> Cell:
+        """Return the cell of a number without an interval; None: it was not measured."""
+        return cls(math.nan if number is None else number, digits=digits)
 
     @property
     def text(self) -> str:
@@ -79,6 +90,11 @@ class Row:
     cells: tuple[Cell, ...]
     published: bool = False
 
+    @classmethod
+    def of_published(cls, head: Sequence[str], numbers: Iterable[float | None]) -> Row:
+        """Return a row of published numbers; None: the publication has no number there."""
+        return cls(tuple(head), tuple(Cell.value(number) for number in numbers), published=True)
+
 
 @dataclass(frozen=True)
 class Table:
@@ -91,6 +107,87 @@ class Table:
     rows: tuple[Row, ...]
     note: str = ""
     source: str = ""
+
+    @classmethod
+    def pivot(
+        cls,
+        name: str,
+        title: str,
+        records: Iterable[Record],
+        *,
+        rows: Mapping[str, Callable[[Record], object]],
+        columns: Mapping[Column, str],
+        metric: Callable[[Sequence[Record], Column], Cell],
+        key: Callable[[Record], Hashable] | None = None,
+        having: Callable[[Sequence[Record]], bool] | None = None,
+        published: Callable[[Record], Iterable[Row]] | None = None,
+        below: Iterable[Row] = (),
+        note: str = "",
+        source: str = "",
+    ) -> Table:
+        """Return a table with a row for each combination of the row factors, in the order of the records.
+
+        Args:
+            name: Name of the table's files.
+            title: Title of the table.
+            records: Records of a run, such as its lines; a generator expression selects and sorts them.
+            rows: Heads of the leading columns -> factor: its value for a record, shown as text.
+            columns: Names of metrics, or values of a column factor -> heads of the other columns.
+            metric: Function of a row's records and a column, which estimates the number there and its interval.
+            key: Key that the records of a row share; None: the values of the row factors.
+            having: Condition on the records of a row; other rows are left out.
+            published: Rows of published numbers that follow the row of a record (the first of its row).
+            below: Rows of published numbers at the end.
+            note: Text under the table.
+            source: Source of the published numbers.
+        """
+        groups: dict[Hashable, list[Record]] = {}
+        for record in records:
+            group = key(record) if key else tuple(str(factor(record)) for factor in rows.values())
+            groups.setdefault(group, []).append(record)
+        table_rows: list[Row] = []
+        for group_records in groups.values():
+            if having is None or having(group_records):
+                first = group_records[0]
+                head = tuple(str(factor(first)) for factor in rows.values())
+                table_rows.append(Row(head, tuple(metric(group_records, column) for column in columns)))
+                table_rows += published(first) if published else ()
+        return cls(name, title, tuple(rows), tuple(columns.values()), (*table_rows, *below), note, source)
+
+    @classmethod
+    def listing(
+        cls,
+        name: str,
+        title: str,
+        records: Iterable[Record],
+        *,
+        rows: Mapping[str, Callable[[Record], object]],
+        columns: Mapping[Column, str],
+        metric: Callable[[Record, Column], Cell],
+        published: Callable[[Record], Iterable[Row]] | None = None,
+        below: Iterable[Row] = (),
+        note: str = "",
+        source: str = "",
+    ) -> Table:
+        """Return a table with a row for each record; the arguments are those of `pivot`."""
+        return Table.pivot(
+            name,
+            title,
+            enumerate(records),
+            rows={head: partial(_of_second, factor) for head, factor in rows.items()},
+            columns=columns,
+            metric=lambda entries, column: metric(entries[0][1], column),
+            key=lambda entry: entry[0],
+            published=partial(_of_second, published) if published else None,
+            below=below,
+            note=note,
+            source=source,
+        )
+
+
+def _of_second(function: Callable[[Record], Result], entry: tuple[int, Record]) -> Result:
+    """Return a function of the record of a numbered record."""
+    return function(entry[1])
 
 
 def to_csv(table: Table) -> str:

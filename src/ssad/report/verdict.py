@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 from ssad.metrics import CaseValue, estimate
 from ssad.report.load import Run
-
-Line = Mapping[str, Any]
+from ssad.report.records import Line
 
 
 def complete_verdict(run: Run, sentences: Sequence[str]) -> list[str]:
@@ -37,12 +35,6 @@ def lines_by(run: Run, field: str, *, failed: bool = False) -> dict[str, list[Li
         if line["status"] == "ok" or failed:
             lines_by_value.setdefault(str(line.get(field) or ""), []).append(line)
     return lines_by_value
-
-
-def metric_of(line: Line, name: str) -> float:
-    """Return a metric of a line; NaN where it was not measured."""
-    value = (line.get("metrics") or {}).get(name)
-    return math.nan if value is None else float(value)
 
 
 def mean_of(values: Iterable[float]) -> float:

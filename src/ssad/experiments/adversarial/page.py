@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 
@@ -16,11 +16,12 @@ from ssad.core.lane_graph import load_graph, town_file
 from ssad.core.traces import load_trace
 from ssad.experiments.adversarial.collision_view import found_view
 from ssad.metrics import CaseValue, estimate
-from ssad.metrics.uncertainty import paired_difference
+from ssad.metrics.uncertainty import Kind, paired_difference
 from ssad.report.default import result_table
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import NATURAL, SOURCE
+from ssad.report.records import Line, field, metric_of
 from ssad.report.tables import METHODS, Cell, Row, Table
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -40,7 +41,7 @@ GRADES = {
 }
 NOTE = "CR: survived bases in which a collision is found; avoidable: of the saved collisions, by a careful driver"
 VIEWS = 24
-Line = Mapping[str, Any]
+SEARCH = {"Generator": field("generator"), "System": field("system")}
 
 
 def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
@@ -65,7 +66,7 @@ def summary(run: Run) -> Table:
 
 def main_table(run: Run) -> Table:
     """Return every column over all bases, by generator and system."""
-    full_table = result_table(replace(run, header={**run.header, "factors": ["generator", "system"]}))
+    full_table = result_table(run, ("generator", "system"))
     note = (
         f"Over the base scenarios that the system survives in plain replay, {run.suite.get('budget')} rollouts each. "
         f"{METHODS}"
@@ -75,140 +76,149 @@ def main_table(run: Run) -> Table:
 
 def careful_table(run: Run) -> Table | None:
     """Return how avoidable and how hard the collisions are; None if none was graded."""
-    rows = []
-    for row_head, lines in _searches(run).items():
-        cells = [
-            Cell.of(
-                estimate([_case(line, _metric(line, name)) for line in lines], "mean" if "speed" in name else "bounded")
-            )
-            for name in GRADES
-        ]
-        rows.append(Row(row_head, tuple(cells)))
-    if all(math.isnan(_metric(line, "attributable")) for line in run.lines):
+    if all(math.isnan(metric_of(line, "attributable")) for line in run.lines):
         return None
-    note = (
-        "Of the saved collisions of each base in which one was found. Careful drivers "
-        "(docs/explanation/careful-drivers.md) take the wheel when the danger begins; "
-        "a collision that one of them avoids is attributable to the system. Who has stopped is "
-        f"often hit all the same: see the columns with the ego moving. {METHODS}"
+    return Table.pivot(
+        "careful",
+        "Could it have been avoided?",
+        run.lines,
+        rows=SEARCH,
+        columns=GRADES,
+        metric=lambda lines, name: _mean(
+            lines, partial(metric_of, name=name), "mean" if "speed" in name else "bounded"
+        ),
+        note="Of the saved collisions of each base in which one was found. Careful drivers (docs/careful.md) take the wheel when the danger begins; a collision that one of them avoids is attributable to the system. Who has "
+        f"stopped is often hit all the same: see the columns with the ego moving. {METHODS}",
     )
-    heads = ("Generator", "System")
-    return Table("careful", "Could it have been avoided?", heads, tuple(GRADES.values()), tuple(rows), note)
 
 
 def transfer_table(run: Run) -> Table | None:
     """Return the CR of other systems in the saved scenarios, against the bases; None if none was transferred."""
-    rows = []
-    for row_head, lines in _searches(run).items():
-        transferred = [line for line in lines if line.get("transfer")]
-        for system in dict.fromkeys(name for line in transferred for name in line["transfer"]):
-            with_adversary, base = (
-                {str(line["key"]): _case(line, float(line["transfer"][system][condition])) for line in transferred}
-                for condition in ("found", "base")
-            )
-            difference = Cell.of(paired_difference(with_adversary, base))
-            rates = [Cell.of(estimate(list(condition.values()), "bounded")) for condition in (with_adversary, base)]
-            rows.append(Row((*row_head, system), (*rates, difference)))
-    if not rows:
-        return None
-    note = (
-        "The saved scenarios of each base in which a collision was found against the system, driven by another one; "
-        f"the difference is paired by base. {METHODS}"
+
+    def metric(drives: Sequence[tuple[Line, str]], column: str) -> Cell:
+        with_adversary, base = (
+            {str(line["key"]): _case(line, float(line["transfer"][system][condition])) for line, system in drives}
+            for condition in ("found", "base")
+        )
+        if column == "difference":
+            return Cell.of(paired_difference(with_adversary, base))
+        return Cell.of(estimate((with_adversary if column == "found" else base).values(), "bounded"))
+
+    table = Table.pivot(
+        "transfer",
+        "Transfer",
+        [(line, system) for line in _by_search(run) for system in line.get("transfer") or ()],
+        rows={
+            "Generator": lambda drive: drive[0]["generator"],
+            "System": lambda drive: drive[0]["system"],
+            "Driven by": lambda drive: drive[1],
+        },
+        columns={"found": "CR in what was found", "base": "CR in the bases", "difference": "difference"},
+        metric=metric,
+        note="The saved scenarios of each base in which a collision was found against the system, driven by another "
+        f"one; the difference is paired by base. {METHODS}",
     )
-    columns = "CR in what was found", "CR in the bases", "difference"
-    return Table("transfer", "Transfer", ("Generator", "System", "Driven by"), columns, tuple(rows), note)
+    return table if table.rows else None
 
 
 def budget_table(run: Run) -> Table:
     """Return the CR within parts of the budget."""
     budget = int(run.suite.get("budget", 1))
     rollout_limits = sorted({max(1, round(budget * share)) for share in (0.125, 0.25, 0.5, 1.0)})
-    rows = []
-    for row_head, lines in _searches(run).items():
-        cells = []
-        for rollout_limit in rollout_limits:
-            cases = [_case(line, _within(line, rollout_limit)) for line in lines]
-            cells.append(Cell.of(estimate(cases, "share")))
-        rows.append(Row(row_head, tuple(cells)))
-    columns = tuple(f"CR within {count}" for count in rollout_limits)
-    return Table("budget", "CR by rollouts spent", ("Generator", "System"), columns, tuple(rows), METHODS)
+    return Table.pivot(
+        "budget",
+        "CR by rollouts spent",
+        run.lines,
+        rows=SEARCH,
+        columns={count: f"CR within {count}" for count in rollout_limits},
+        metric=lambda lines, count: _mean(lines, partial(_within, most=count), "share"),
+        note=METHODS,
+    )
 
 
 def against_table(run: Run) -> Table | None:
     """Return the CR of each generator minus that of random search, over the same bases."""
-    searches = _searches(run)
-    rows = []
-    for (generator, system), lines in searches.items():
-        random_lines = searches.get((RANDOM, system))
-        if random_lines is None or generator == RANDOM:
-            continue
+    random_lines = {system: lines for (generator, system), lines in _searches(run).items() if generator == RANDOM}
+
+    def metric(lines: Sequence[Line], _: str) -> Cell:
         generator_cases, random_cases = (
             {
                 f"{line['cluster']}#{line['spec']['repetition']}": _case(line, _within(line))
                 for line in search_lines
                 if line["status"] != "ok" or not math.isnan(_within(line))
             }
-            for search_lines in (lines, random_lines)
+            for search_lines in (lines, random_lines[str(lines[0]["system"])])
         )
-        rows.append(
-            Row((generator, system), (Cell.of(paired_difference(generator_cases, random_cases, kind="share")),))
-        )
-    if not rows:
-        return None
-    note = f"CR of the generator minus that of random search in the same base scenarios with the same seeds. {METHODS}"
-    heads = ("Generator", "System")
-    return Table("against_random", "Against random search", heads, ("difference of CR",), tuple(rows), note)
+        return Cell.of(paired_difference(generator_cases, random_cases, kind="share"))
+
+    table = Table.pivot(
+        "against_random",
+        "Against random search",
+        [line for line in run.lines if str(line["generator"]) != RANDOM and str(line["system"]) in random_lines],
+        rows=SEARCH,
+        columns={"CR": "difference of CR"},
+        metric=metric,
+        note="CR of the generator minus that of random search in the same base scenarios with the same seeds. "
+        f"{METHODS}",
+    )
+    return table if table.rows else None
 
 
 def group_table(run: Run) -> Table:
     """Return the CR by group of base scenarios."""
-    groups = list(dict.fromkeys(str(line["group"]) for line in run.lines))
-    rows = []
-    for row_head, lines in _searches(run).items():
-        cells = [
-            Cell.of(estimate([_case(line, _within(line)) for line in lines if line["group"] == group], "share"))
-            for group in groups
-        ]
-        rows.append(Row(row_head, tuple(cells)))
-    return Table("groups", "CR by group", ("Generator", "System"), tuple(groups), tuple(rows), METHODS)
+    return Table.pivot(
+        "groups",
+        "CR by group",
+        run.lines,
+        rows=SEARCH,
+        columns={line["group"]: str(line["group"]) for line in run.lines},
+        metric=lambda lines, group: _mean([line for line in lines if line["group"] == group], _within, "share"),
+        note=METHODS,
+    )
 
 
 def traffic_table(run: Run) -> Table | None:
     """Return systems in natural traffic and among Adv.PPO's adversaries by town, the paper's rows below."""
-    rows = []
-    for (generator, system), lines in _searches(run).items():
-        natural = [line for line in lines if line["spec"].get("scenario", {}).get("type") == "NaturalJunction"]
-        if generator != ADVERSARIES:
-            continue
-        for town in dict.fromkeys(str(line["spec"]["scenario"]["town"]) for line in natural):
-            town_lines = [line for line in natural if line["spec"]["scenario"]["town"] == town]
-            natural_cases = {str(line["key"]): _case(line, 1.0 - _metric(line, "survived")) for line in town_lines}
-            adversarial_cases = {
-                str(line["key"]): _case(line, max(1.0 - _metric(line, "survived"), _found(line))) for line in town_lines
-            }
-            increase = paired_difference(adversarial_cases, natural_cases, kind="share")
-            for traffic, cases, difference in (
-                ("natural", natural_cases, None),
-                ("Adv.PPO", adversarial_cases, increase),
-            ):
-                cells = (
-                    Cell.of(estimate(cases.values(), "share")),
-                    Cell.of(difference) if difference else Cell(math.nan),
-                )
-                rows.append(Row((system, traffic, town), cells))
-    if not rows:
+    natural_lines = [
+        line
+        for line in _by_search(run)
+        if line["generator"] == ADVERSARIES and line["spec"].get("scenario", {}).get("type") == "NaturalJunction"
+    ]
+    if not natural_lines:
         return None
-    for (system, traffic), by_town in NATURAL.items():
-        for town, (rate, _, _) in by_town.items():
-            traffic_name = "natural" if traffic == "Autopilot" else traffic
-            rows.append(Row((system, traffic_name, town), (Cell(rate), Cell(math.nan)), published=True))
-    note = (
-        "Any collision with an adversary counts, wherever the adversary is. Where a system collides in natural traffic "
-        f"no adversary was tried; it counts as colliding among them, too. Shaded rows: {SOURCE}. {METHODS}"
+
+    def metric(drives: Sequence[tuple[Line, str]], column: str) -> Cell:
+        collided = {str(line["key"]): 1.0 - metric_of(line, "survived") for line, _ in drives}
+        natural = {str(line["key"]): _case(line, collided[str(line["key"])]) for line, _ in drives}
+        adversarial = {
+            str(line["key"]): _case(line, max(collided[str(line["key"])], _found(line))) for line, _ in drives
+        }
+        among_adversaries = drives[0][1] == "Adv.PPO"
+        if column == "CR":
+            return Cell.of(estimate((adversarial if among_adversaries else natural).values(), "share"))
+        return Cell.of(paired_difference(adversarial, natural, kind="share")) if among_adversaries else Cell.value(None)
+
+    return Table.pivot(
+        "traffic",
+        "Natural and adversarial traffic",
+        [(line, traffic) for line in natural_lines for traffic in ("natural", "Adv.PPO")],
+        rows={
+            "System": lambda drive: drive[0]["system"],
+            "Traffic": lambda drive: drive[1],
+            "Town": lambda drive: drive[0]["spec"]["scenario"]["town"],
+        },
+        columns={"CR": "CR", "increase": "more than in natural traffic"},
+        metric=metric,
+        below=[
+            Row.of_published((system, "natural" if traffic == "Autopilot" else traffic, town), (rate, None))
+            for (system, traffic), by_town in NATURAL.items()
+            for town, (rate, _, _) in by_town.items()
+        ],
+        note="Any collision with an adversary counts, wherever the adversary is. Where a system collides in natural "
+        "traffic no adversary was tried; it counts as colliding among them, too. Shaded rows: "
+        f"{SOURCE}. {METHODS}",
+        source=SOURCE,
     )
-    heads = ("System", "Traffic", "Town")
-    columns = ("CR", "more than in natural traffic")
-    return Table("traffic", "Natural and adversarial traffic", heads, columns, tuple(rows), note, SOURCE)
 
 
 def _found(line: Line) -> float:
@@ -248,6 +258,11 @@ def _searches(run: Run) -> dict[tuple[str, str], list[Line]]:
     return searches
 
 
+def _by_search(run: Run) -> list[Line]:
+    """Return the lines, those of a search one after another."""
+    return [line for lines in _searches(run).values() for line in lines]
+
+
 def _within(line: Line, most: float = math.inf) -> float:
     """Whether a search has found a collision within so many rollouts; NaN: nothing to search, or it failed."""
     metrics = line.get("metrics") or {}
@@ -256,10 +271,9 @@ def _within(line: Line, most: float = math.inf) -> float:
     return float(bool(metrics["CR"]) and metrics["rollouts"] <= most)
 
 
-def _metric(line: Line, name: str) -> float:
-    """Return a metric of a line; NaN if it was not measured."""
-    value = (line.get("metrics") or {}).get(name)
-    return math.nan if value is None else float(value)
+def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> Cell:
+    """Return the mean of a value of searches, over their base scenarios."""
+    return Cell.of(estimate([_case(line, value(line)) for line in lines], kind))
 
 
 def _case(line: Line, value: float) -> CaseValue:

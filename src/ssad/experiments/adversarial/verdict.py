@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ssad.report.load import Run
-from ssad.report.verdict import lines_by, metric_of
+from ssad.report.records import metric_of
+from ssad.report.verdict import lines_by
 
 
 def verdict(run: Run) -> list[str]:

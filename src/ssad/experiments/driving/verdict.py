@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from ssad.report.load import Run
-from ssad.report.verdict import lines_by, mean_of, metric_of
+from ssad.report.records import metric_of
+from ssad.report.verdict import lines_by, mean_of
 
 
 def verdict(run: Run) -> list[str]:

@@ -6,8 +6,9 @@ import math
 
 from ssad.experiments.gap import page as gap
 from ssad.report.load import Run
+from ssad.report.records import metric_of
 from ssad.report.tables import Cell
-from ssad.report.verdict import mean_of, metric_of
+from ssad.report.verdict import mean_of
 
 
 def verdict(run: Run) -> list[str]:

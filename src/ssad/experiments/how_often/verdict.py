@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from ssad.report.load import Run
-from ssad.report.verdict import Line, lines_by, metric_of
+from ssad.report.records import Line, metric_of
+from ssad.report.verdict import lines_by
 
 METHODS = {"monte-carlo": "plain Monte Carlo", "importance": "importance sampling"}
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from ssad.report.load import Run
-from ssad.report.verdict import lines_by, metric_of, worst_condition
+from ssad.report.records import metric_of
+from ssad.report.verdict import lines_by, worst_condition
 
 
 def verdict(run: Run) -> list[str]:

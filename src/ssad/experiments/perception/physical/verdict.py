@@ -6,7 +6,8 @@ import math
 
 from ssad.experiments.perception.physical import page as physical
 from ssad.report.load import Run
-from ssad.report.verdict import Line, lines_by, metric_of
+from ssad.report.records import Line, metric_of
+from ssad.report.verdict import lines_by
 
 
 def verdict(run: Run) -> list[str]:

@@ -1,0 +1,55 @@
+"""Numbers of records: their fields as factors of a table, and estimates of their metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ssad.metrics import CaseValue, estimate
+from ssad.metrics.uncertainty import Kind
+from ssad.report.tables import Cell
+
+Line = Mapping[str, Any]
+"""A line of results.jsonl."""
+
+
+def field(name: str) -> Callable[[Line], str]:
+    """Return the factor of a table that a field of the lines is, or of their specification; empty where it is absent.
+
+    Args:
+        name: Name of the field.
+    """
+
+    def value_of(line: Line) -> str:
+        value = line.get(name, (line.get("spec") or {}).get(name))
+        return "" if value is None else str(value)
+
+    return value_of
+
+
+def metric_of(line: Line, name: str) -> float:
+    """Return a metric of a line; NaN where it was not measured or the cell failed."""
+    value = (line.get("metrics") or {}).get(name) if line["status"] == "ok" else None
+    return math.nan if value is None else float(value)
+
+
+def case_of(line: Line, value: float) -> CaseValue:
+    """Return a value (NaN: not measured) as that of the line's case in its cluster; both are its key by default."""
+    return CaseValue(
+        value,
+        str(line.get("cluster") or line["key"]),
+        str(line.get("case") or line["key"]),
+        failed=line["status"] != "ok",
+    )
+
+
+def metric_cell(lines: Sequence[Line], name: str, kind: Kind) -> Cell:
+    """Return the mean of a metric over lines with its interval, which the clusters give.
+
+    Args:
+        lines: Lines of a row.
+        name: Name of the metric.
+        kind: Kind of its values; see `ssad.metrics.uncertainty.estimate`.
+    """
+    return Cell.of(estimate([case_of(line, metric_of(line, name)) for line in lines], kind))
