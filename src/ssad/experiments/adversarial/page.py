@@ -87,8 +87,10 @@ def careful_table(run: Run) -> Table | None:
         metric=lambda lines, name: _mean(
             lines, partial(metric_of, name=name), "mean" if "speed" in name else "bounded"
         ),
-        note="Of the saved collisions of each base in which one was found. Careful drivers (docs/careful.md) take the wheel when the danger begins; a collision that one of them avoids is attributable to the system. Who has "
-        f"stopped is often hit all the same: see the columns with the ego moving. {METHODS}",
+        note="Of the saved collisions of each base in which one was found. Careful drivers "
+        "(docs/explanation/careful-drivers.md) take the wheel when the danger begins; a collision that one of them "
+        "avoids is attributable to the system. Who has stopped is often hit all the same: see the columns with the "
+        f"ego moving. {METHODS}",
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
+from itertools import product
 
 from ssad.experiments.driving.episodes import DrivingRun
 from ssad.metrics import FAMILIES, METRICS, Estimate
@@ -20,31 +22,29 @@ def precrash_table(run: DrivingRun) -> Table | None:
     systems = [name for name in run.systems if (name, AVERAGE) in run.numbers]
     if not systems:
         return None
-    rows = []
-    for symbol in SHOWN:
-        for system in systems:
-            estimates_by_group = [run.numbers.get((system, group)) for group in (*SCENARIOS, AVERAGE)]
-            rows.append(
-                Row(
-                    (symbol, system),
-                    tuple(Cell.of(value[symbol]) if value else Cell(math.nan) for value in estimates_by_group),
-                )
-            )
-        for system, values in PRECRASH[symbol].items():
-            rows.append(Row((symbol, system), tuple(Cell(value) for value in values), published=True))
-    note = (
-        f"Shaded rows: {SOURCE}. Avg. is the mean of the scenarios' values. {METHODS} A failed episode counts in the "
-        f"denominator. {_counts(run, systems)}"
-    )
-    return Table(
+
+    def published(row: tuple[str, str]) -> list[Row]:
+        symbol, system = row
+        rows_of_paper = PRECRASH[symbol].items() if system == systems[-1] else ()
+        return [Row.of_published((symbol, name), values) for name, values in rows_of_paper]
+
+    return Table.listing(
         "precrash",
         "Pre-crash scenarios",
-        ("Metric", "System"),
-        (*SCENARIOS.values(), "Avg."),
-        tuple(rows),
-        note,
-        SOURCE,
+        list(product(SHOWN, systems)),
+        rows={"Metric": lambda row: row[0], "System": lambda row: row[1]},
+        columns={**SCENARIOS, AVERAGE: "Avg."},
+        metric=lambda row, group: _cell(run, (row[1], group), row[0]),
+        published=published,
+        note=f"Shaded rows: {SOURCE}. Avg. is the mean of the scenarios' values. {METHODS} A failed episode counts in "
+        f"the denominator. {_counts(run, systems)}",
+        source=SOURCE,
     )
+
+
+def _cell(run: DrivingRun, key: tuple[str, str], symbol: str) -> Cell:
+    """Return a metric of a system in a group; n/a where the system has no episodes in it."""
+    return Cell.of(run.numbers[key][symbol]) if key in run.numbers else Cell.value(None)
 
 
 def _counts(run: DrivingRun, systems: list[str]) -> str:
@@ -67,67 +67,71 @@ def natural_table(run: DrivingRun) -> Table | None:
     towns = {record.group: record.town for record in run.records if record.outcome.family == "natural"}
     if not towns:
         return None
-    rows = []
-    for system in run.systems:
-        for group in (*towns, FAMILIES["natural"]):
-            values = run.numbers.get((system, group))
-            if values:
-                traffic = f"Autopilot, {Cell.of(values['CR']).count.split(',')[0]}"
-                head = (system, traffic, towns.get(group, "mean of the towns"))
-                rows.append(Row(head, tuple(Cell.of(values[symbol]) for symbol in SHOWN)))
-    for (system, traffic), by_town in NATURAL.items():
-        for town, numbers in by_town.items():
-            rows.append(
-                Row((system, traffic, town), (*(Cell(number) for number in numbers), Cell(math.nan)), published=True)
-            )
-    note = (
-        f"Shaded rows: {SOURCE}. Their DR fits SafeBench's normalised scale (DR / 5 m); ours here is in metres, and "
-        f"includes up to half a metre of spacing between route points. See also the normalised table. {METHODS}"
+    return Table.listing(
+        "natural",
+        "Natural junction routes",
+        [key for key in product(run.systems, (*towns, FAMILIES["natural"])) if key in run.numbers],
+        rows={
+            "System": lambda key: key[0],
+            "Traffic": lambda key: f"Autopilot, {_cell(run, key, 'CR').count.split(',')[0]}",
+            "Town": lambda key: towns.get(key[1], "mean of the towns"),
+        },
+        columns={symbol: symbol for symbol in SHOWN},
+        metric=partial(_cell, run),
+        below=[
+            Row.of_published((system, traffic, town), (*numbers, None))
+            for (system, traffic), by_town in NATURAL.items()
+            for town, numbers in by_town.items()
+        ],
+        note=f"Shaded rows: {SOURCE}. Their DR fits SafeBench's normalised scale (DR / 5 m); ours here is in metres, "
+        "and includes up to half a metre of spacing between route points. See also the normalised table. "
+        f"{METHODS}",
+        source=SOURCE,
     )
-    heads = ("System", "Traffic", "Town")
-    return Table("natural", "Natural junction routes", heads, SHOWN, tuple(rows), note, SOURCE)
 
 
 def full_table(run: DrivingRun) -> Table:
     """Return every metric for every system and group."""
-    symbols = tuple(symbol for symbol in METRICS if symbol != "LC" or run.measures(symbol))
-    rows = [
-        Row((system, run.headings[group]), tuple(Cell.of(values[symbol]) for symbol in symbols))
-        for (system, group), values in run.numbers.items()
-    ]
     note = f"Avg. is the mean of the eight pre-crash scenarios' values. {METHODS}"
     if not run.measures("SS"):
         note += " SS is not measured, since no town of this run has stop signs; the driving score is without them."
-    return Table("metrics", "All metrics", ("System", "Group"), symbols, tuple(rows), note)
+    return Table.listing(
+        "metrics",
+        "All metrics",
+        run.numbers,
+        rows={"System": lambda key: key[0], "Group": lambda key: run.headings[key[1]]},
+        columns={symbol: symbol for symbol in METRICS if symbol != "LC" or run.measures(symbol)},
+        metric=partial(_cell, run),
+        note=note,
+    )
 
 
 def normalised_table(run: DrivingRun) -> Table:
     """Return the terms of SafeBench's overall score, each 0 (best) to 1 (worst), and the two scores made of them."""
-    columns = (
-        "CR",
-        f"OR / {DIVISORS['OR']:g} m",
-        f"DR / {DIVISORS['DR']:g} m",
-        "1 - RC",
-        f"TS / {DIVISORS['TS']:g} s",
-        "SafeBench score (lower is better)",
-        "FREA score (higher is better)",
+
+    def metric(key: tuple[str, str], column: str) -> Cell:
+        estimate = run.numbers[key]["OS" if column == "FREA" else column]
+        if column in ("OR", "DR", "TS"):
+            return Cell.of(_scaled(column, estimate))
+        return Cell.of(estimate.scaled(-1.0, 1.0) if column in ("RC", "FREA") else estimate)
+
+    return Table.listing(
+        "normalised",
+        "Normalised metrics and overall scores",
+        run.numbers,
+        rows={"System": lambda key: key[0], "Group": lambda key: run.headings[key[1]]},
+        columns={
+            "CR": "CR",
+            "OR": f"OR / {DIVISORS['OR']:g} m",
+            "DR": f"DR / {DIVISORS['DR']:g} m",
+            "RC": "1 - RC",
+            "TS": f"TS / {DIVISORS['TS']:g} s",
+            "OS": "SafeBench score (lower is better)",
+            "FREA": "FREA score (higher is better)",
+        },
+        metric=metric,
+        note=f"SafeBench's score weighs CR 0.4, OR 0.1, DR 0.1, 1 - RC 0.3, TS 0.1; FREA's is one minus it. {METHODS}",
     )
-    rows = []
-    for (system, group), values in run.numbers.items():
-        score = values["OS"]
-        estimates = (
-            values["CR"],
-            _scaled("OR", values["OR"]),
-            _scaled("DR", values["DR"]),
-            values["RC"].scaled(-1.0, 1.0),
-            _scaled("TS", values["TS"]),
-            score,
-            score.scaled(-1.0, 1.0),
-        )
-        rows.append(Row((system, run.headings[group]), tuple(Cell.of(estimate) for estimate in estimates)))
-    note = f"SafeBench's score weighs CR 0.4, OR 0.1, DR 0.1, 1 - RC 0.3, TS 0.1; FREA's is one minus it. {METHODS}"
-    title = "Normalised metrics and overall scores"
-    return Table("normalised", title, ("System", "Group"), columns, tuple(rows), note)
 
 
 def _scaled(name: str, estimate: Estimate) -> Estimate:
@@ -142,17 +146,16 @@ def _scaled(name: str, estimate: Estimate) -> Estimate:
 
 def summary_table(run: DrivingRun) -> Table:
     """Return scenario x system with the main metrics, the averages last, for the terminal."""
-    rows = [
-        Row((heading, system), tuple(Cell.of(values[symbol]) for symbol in SHOWN))
-        for group, heading in run.headings.items()
-        for system in run.systems
-        if (values := run.numbers.get((system, group)))
-    ]
-    note = (
-        "CR: collisions per episode; [a, b]: its 95 % interval, a–b: range\n"
-        "OR: m driven off the road, DR: m from the route, RC: share of the route"
+    return Table.listing(
+        "summary",
+        run.run.title,
+        [(system, group) for group in run.headings for system in run.systems if (system, group) in run.numbers],
+        rows={"Scenario": lambda key: run.headings[key[1]], "System": lambda key: key[0]},
+        columns={symbol: symbol for symbol in SHOWN},
+        metric=partial(_cell, run),
+        note="CR: collisions per episode; [a, b]: its 95 % interval, a–b: range\n"
+        "OR: m driven off the road, DR: m from the route, RC: share of the route",
     )
-    return Table("summary", run.run.title, ("Scenario", "System"), SHOWN, tuple(rows), note)
 
 
 def driving_tables(run: DrivingRun) -> list[Table]:

@@ -9,21 +9,21 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal
 
 from ssad.core import safeio
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.metrics.rank import family_correlation
 from ssad.report.load import Run
 from ssad.report.pages import render
-from ssad.report.tables import METHODS, Cell, Row, Table
+from ssad.report.records import Line, case_of, field, metric_of
+from ssad.report.tables import METHODS, Cell, Table
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
 SETTINGS = re.compile(r"\?.*$|(?<=^attack-)(.*)-[0-9]+$")  # pgd?steps=2 (once attack-pgd-2) is a kind of pgd
 
-Line = Mapping[str, Any]
 Condition = tuple[str, str, int]
 MAIN = {
     "AP": "AP",
@@ -49,6 +49,11 @@ SIGNS = {
     "stop_signs": "signs run",
 }
 BOUNDED = ("AP", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
+CONDITION = {
+    "System": field("system"),
+    "Perturbation": field("perturbation"),
+    "Severity": lambda line: str(line["severity"] or ""),
+}
 ROOM = (110.0, 13.0)  # pixels of a name in the figure
 CAUSES = ("hidden", "missed", "misplaced", "late", "known")
 SIZE, MARGIN = 360, 46
@@ -104,118 +109,128 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
 
 def main_table(run: Run) -> Table:
     """Return component and system metrics, a row a condition."""
-    rows = []
-    for (system, perturbation, severity), lines in conditions(run).items():
-        row_head = (system, perturbation, str(severity) if severity else "")
-        rows.append(Row(row_head, tuple(_cell(lines, name) for name in MAIN)))
-    note = (
-        "AP: all kinds of objects as one, the mean of those within 0.5, 1, 2 and 4 m, a drive at a time, on the "
+    return Table.pivot(
+        "gap",
+        "Component and system",
+        run.lines,
+        rows=CONDITION,
+        columns=MAIN,
+        metric=_cell,
+        note="AP: all kinds of objects as one, the mean of those within 0.5, 1, 2 and 4 m, a drive at a time, on the "
         "pictures that the driver got in it. The object that matters is the one that the ego touches, else the one "
         "that it comes nearest to; its recall counts looks in which it is in view and found within 2 m; believed "
         "counts steps. CR: "
         "share of the drives with a collision. RC: share of the route completed. Hard braking: times above 4 m/s² a "
-        f"drive. {METHODS}"
-    )
-    return Table(
-        "gap", "Component and system", ("System", "Perturbation", "Severity"), tuple(MAIN.values()), tuple(rows), note
+        f"drive. {METHODS}",
     )
 
 
 def drop_table(run: Run) -> Table:
     """Return the changes of metrics under a perturbation against the same drives without it."""
-    rows = [
-        Row(
-            (system, perturbation, str(severity)),
-            tuple(change(run, (system, perturbation, severity), metric) for metric in DROPS),
-        )
-        for system, perturbation, severity in conditions(run)
-        if severity
-    ]
-    note = (
-        "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation. Without brackets: the "
-        "range over the drives, where too few of them differ for an interval."
+    clean = clean_lines(run)
+    return Table.pivot(
+        "changes",
+        "What a perturbation changes",
+        [line for line in run.lines if int(line["severity"])],
+        rows=CONDITION,
+        columns=DROPS,
+        metric=lambda lines, name: _change(lines, clean, name),
+        note="Perturbed less clean, in the same drives: below 0 it is lower under the perturbation. Without brackets: "
+        "the range over the drives, where too few of them differ for an interval.",
     )
-    heads = ("System", "Perturbation", "Severity")
-    return Table("changes", "What a perturbation changes", heads, tuple(DROPS.values()), tuple(rows), note)
 
 
 def rank_table(run: Run) -> Table:
     """Return the rank correlation of damage to the component with damage to the system."""
-    rows = []
-    perturbed = [condition for condition in conditions(run) if condition[2]]
-    for system in dict.fromkeys(condition[0] for condition in perturbed):
-        system_conditions = [condition for condition in perturbed if condition[0] == system]
-        families = [SETTINGS.sub(r"\1", condition[1]) for condition in system_conditions]
-        for component_metric in ("AP", "target_recall"):
-            component_losses = [-change(run, entry, component_metric).mean for entry in system_conditions]
-            cells = []
-            for system_metric, sign in (("collision", 1.0), ("route_completion", -1.0)):
-                system_losses = [sign * change(run, entry, system_metric).mean for entry in system_conditions]
-                cells.append(Cell.of(family_correlation(component_losses, system_losses, families)))
-            rows.append(
-                Row(
-                    (system, DROPS[component_metric], f"{len(system_conditions)} in {len(set(families))}"), tuple(cells)
-                )
-            )
-    note = (
-        "Spearman's rank correlation over perturbations of what the component loses and what the system loses; 95 % "
-        "interval by a bootstrap over the families of perturbations (all severities of one are one family, and "
-        "so are all step counts of an attack), from five families on. n/a: one of the two does not vary."
+    perturbed: dict[str, list[Condition]] = {}
+    for condition in conditions(run):
+        if condition[2]:
+            perturbed.setdefault(condition[0], []).append(condition)
+
+    def families(system: str) -> list[str]:
+        return [SETTINGS.sub(r"\1", perturbation) for _, perturbation, _ in perturbed[system]]
+
+    def correlation(row: tuple[str, str], system_metric: str) -> Cell:
+        system, component_metric = row
+        sign = 1.0 if system_metric == "collision" else -1.0
+        component_losses = [-change(run, condition, component_metric).mean for condition in perturbed[system]]
+        system_losses = [sign * change(run, condition, system_metric).mean for condition in perturbed[system]]
+        return Cell.of(family_correlation(component_losses, system_losses, families(system)))
+
+    return Table.listing(
+        "rank",
+        "Does the component's damage tell the system's?",
+        list(product(perturbed, ("AP", "target_recall"))),
+        rows={
+            "System": lambda row: row[0],
+            "Lost by the component": lambda row: DROPS[row[1]],
+            "Perturbations in families": lambda row: f"{len(perturbed[row[0]])} in {len(set(families(row[0])))}",
+        },
+        columns={"collision": "CR", "route_completion": "RC"},
+        metric=correlation,
+        note="Spearman's rank correlation over perturbations of what the component loses and what the system loses; "
+        "95 % interval by a bootstrap over the families of perturbations (all severities of one are one family, and "
+        "so are all step counts of an attack), from five families on. n/a: one of the two does not vary.",
     )
-    heads = ("System", "Lost by the component", "Perturbations in families")
-    return Table("rank", "Does the component's damage tell the system's?", heads, ("CR", "RC"), tuple(rows), note)
 
 
 def cause_table(run: Run) -> Table:
     """Return how the driver perceived the object that it hit, before each collision."""
-    rows = []
-    for (system, perturbation, severity), lines in conditions(run).items():
+
+    def metric(lines: Sequence[Line], column: str) -> Cell:
         causes = [line["cause"] for line in lines if line.get("cause")]
-        if not causes:
-            continue
-        counts = Counter(record["cause"] for record in causes)
-        unknown = sorted(float(record["unknown_s"]) for record in causes)
-        median = unknown[len(unknown) // 2]
         repaired_drives = [line["repaired"] for line in lines if line.get("repaired")]
-        avoided = (
-            Cell(sum(not record["same"] for record in repaired_drives), digits=0) if repaired_drives else Cell(math.nan)
-        )
-        numbers = [len(causes), *(counts[name] for name in CAUSES)]
-        cells = (*(Cell(number, digits=0) for number in numbers), Cell(median), avoided)
-        rows.append(Row((system, perturbation, str(severity) if severity else ""), cells))
-    note = (
-        "Collisions by what the object that was hit was in most of the steps from 3 s to 0.5 s before: out of view or "
-        "hidden; in view and not found; found more than 2 m from where it was; found, but not believed yet; believed "
-        "where it was (then planning or prediction failed). Unknown: for how long before the contact it was not "
-        "believed where it was, at most 3 s, the median. Gone when repaired: of these collisions, those that "
+        if column == "collisions":
+            return Cell(len(causes), digits=0)
+        if column == "unknown_s":
+            return Cell(sorted(float(record["unknown_s"]) for record in causes)[len(causes) // 2])
+        if column == "repaired":
+            gone = sum(not record["same"] for record in repaired_drives)
+            return Cell.value(gone if repaired_drives else None, digits=0 if repaired_drives else 2)
+        return Cell(sum(record["cause"] == column for record in causes), digits=0)
+
+    return Table.pivot(
+        "causes",
+        "Before a collision",
+        run.lines,
+        rows=CONDITION,
+        columns={
+            "collisions": "collisions",
+            **{cause: cause for cause in CAUSES},
+            "unknown_s": "unknown, s",
+            "repaired": "gone when repaired",
+        },
+        metric=metric,
+        having=lambda lines: any(line.get("cause") for line in lines),
+        note="Collisions by what the object that was hit was in most of the steps from 3 s to 0.5 s before: out of "
+        "view or hidden; in view and not found; found more than 2 m from where it was; found, but not believed yet; "
+        "believed where it was (then planning or prediction failed). Unknown: for how long before the contact it was "
+        "not believed where it was, at most 3 s, the median. Gone when repaired: of these collisions, those that "
         "do not happen when the same drive is driven again with the object that was hit found where it is whenever it "
-        "is in view, all else as it was: then this error alone decides."
+        "is in view, all else as it was: then this error alone decides.",
     )
-    heads = ("System", "Perturbation", "Severity")
-    columns = ("collisions", *CAUSES, "unknown, s", "gone when repaired")
-    return Table("causes", "Before a collision", heads, columns, tuple(rows), note)
 
 
 def sign_table(run: Run) -> Table:
     """Return how far stop signs were read, and how many were run."""
-    rows = [
-        Row(
-            (system, perturbation, str(severity) if severity else ""),
-            (
-                *(_cell(lines, name) for name in SIGNS),
-                change(run, (system, perturbation, severity), "stop_signs") if severity else Cell(math.nan),
-            ),
-        )
-        for (system, perturbation, severity), lines in conditions(run).items()
-        if any((line.get("metrics") or {}).get("sign_recall") is not None for line in lines)
-    ]
-    note = (
-        "Of the looks with a stop sign of the way ahead, those in which it was read; attacks on signs are made at 5 to "
-        "20 m. Signs run: a drive. More than clean: the rise against the same drives without the perturbation."
+    clean = clean_lines(run)
+
+    def metric(lines: Sequence[Line], column: str) -> Cell:
+        if column != "more":
+            return _cell(lines, column)
+        return _change(lines, clean, "stop_signs") if int(lines[0]["severity"]) else Cell.value(None)
+
+    return Table.pivot(
+        "signs",
+        "Stop signs that are read",
+        run.lines,
+        rows=CONDITION,
+        columns={**SIGNS, "more": "more than clean"},
+        metric=metric,
+        having=lambda lines: any((line.get("metrics") or {}).get("sign_recall") is not None for line in lines),
+        note="Of the looks with a stop sign of the way ahead, those in which it was read; attacks on signs are made at "
+        "5 to 20 m. Signs run: a drive. More than clean: the rise against the same drives without the perturbation.",
     )
-    heads = ("System", "Perturbation", "Severity")
-    columns = (*SIGNS.values(), "more than clean")
-    return Table("signs", "Stop signs that are read", heads, columns, tuple(rows), note)
 
 
 def scatter(run: Run) -> str:
@@ -330,15 +345,12 @@ def sheets(run: Run) -> list[dict[str, str]]:
 
 def values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
     """Return a metric by drive: scenario and repetition."""
-    cases = {}
-    for line in lines:
-        value = (line.get("metrics") or {}).get(name) if line["status"] == "ok" else None
-        cluster = str(line.get("cluster") or line["key"])
-        case = f"{line.get('case') or line['key']}"
-        number = math.nan if value is None else float(value)
-        key = f"{cluster}#{line['spec'].get('repetition', 0)}"
-        cases[key] = CaseValue(number, cluster, case, failed=line["status"] != "ok")
-    return cases
+    return {
+        f"{line.get('cluster') or line['key']}#{line['spec'].get('repetition', 0)}": case_of(
+            line, metric_of(line, name)
+        )
+        for line in lines
+    }
 
 
 def _cell(lines: Sequence[Line], name: str) -> Cell:
@@ -353,12 +365,21 @@ def change(run: Run, condition: Condition, name: str) -> Cell:
 
     Drives that the condition does not have, such as those without a car that could wear a texture, do not count.
     """
-    lines_by_condition = conditions(run)
-    perturbed, clean = (
-        values(lines_by_condition[condition], name),
-        values(lines_by_condition.get((condition[0], "none", 0), []), name),
-    )
-    kind: Literal["share", "mean"] = "share" if name == "collision" else "mean"
+    return _change(conditions(run)[condition], clean_lines(run), name)
+
+
+def clean_lines(run: Run) -> dict[str, list[Line]]:
+    """Return the lines without a perturbation by system."""
+    return {condition[0]: lines for condition, lines in conditions(run).items() if condition[1:] == ("none", 0)}
+
+
+def _change(lines: Sequence[Line], clean_by_system: Mapping[str, Sequence[Line]], name: str) -> Cell:
+    """Return the change of a metric in the lines of a condition against the same drives without it."""
+    perturbed, clean = (values(part, name) for part in (lines, clean_by_system.get(lines[0]["system"], [])))
     return Cell.of(
-        paired_difference(perturbed, {drive: clean[drive] for drive in perturbed if drive in clean}, kind=kind)
+        paired_difference(
+            perturbed,
+            {drive: clean[drive] for drive in perturbed if drive in clean},
+            kind="share" if name == "collision" else "mean",
+        )
     )

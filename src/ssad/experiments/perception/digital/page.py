@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +23,10 @@ from ssad.experiments.perception.digital.run import (
     title_of,
 )
 from ssad.experiments.perception.digital.tables import (
+    ATTACK,
     FURTHEST,
+    SCENES,
+    DetectorSetting,
     black_box_table,
     defence_table,
     distance_table,
@@ -29,6 +34,7 @@ from ssad.experiments.perception.digital.tables import (
     hardened_table,
     target_table,
     transfer_table,
+    with_detector,
 )
 from ssad.experiments.perception.shifts.page import CLASSES, interval_note, replicates_of
 from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit
@@ -45,10 +51,21 @@ TEMPLATE = Path(__file__).with_name("page.html")
 SOURCE = "published by the paper: nuScenes val, L-infinity attacks, epsilon 5 and ten steps"
 PAPER = {("fgsm", "full"): "FGSM", ("pgd", "full"): "PGD", ("cw", "margin"): "C&W", ("", ""): ""}
 EPSILON = 5.0
+EFFORT = {
+    "gradients": "gradients an image",
+    "queries": "queries an image",
+    "loss_before": "loss before",
+    "loss_after": "loss after",
+    "used": "budget used (%)",
+    "change_px": "largest change (px)",
+    "idle": "idle images",
+    "gradient_error": "error of the gradient (%)",
+    "batch": "images at once",
+}
 
 
-def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], list[tuple[float, ...]]] | None:
-    """Return the paper's row beside one of ours: name and budget, and each detector's metrics; None: it has none."""
+def published_scores(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], list[float]] | None:
+    """Return the paper's row beside one of ours: attack and budget, and its scores by column; None: it has none."""
     attack, loss, norm, radius, _, options = setting[:6]
     published_attack = PAPER.get((attack, loss))
     options = " ".join(word for word in options.split() if not word.startswith("precision="))
@@ -66,100 +83,99 @@ def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], l
     if not any(names):
         return None
     budget = size_of(Setting("told", "", "linf", EPSILON, DIGITAL_STEPS[published_attack])) if published_attack else ""
-    row_head = (published_attack or title_of(setting), budget)
-    pairs = zip(run.detectors, names, strict=True)
-    return row_head, [
-        PUBLISHED[published_attack].get(name, (math.nan, math.nan))[: len(run.metrics(detector))]
-        for detector, name in pairs
+    scores = {
+        detector: dict(zip(("mAP", "NDS"), PUBLISHED[published_attack].get(name, (math.nan, math.nan)), strict=True))
+        for detector, name in zip(run.detectors, names, strict=True)
+    }
+    return (published_attack or title_of(setting), budget), [
+        scores[detector][metric] for detector, metric in score_columns(run)
     ]
+
+
+def score_columns(run: DigitalRun) -> dict[tuple[str, str], str]:
+    """Return the columns of detector x score."""
+    return {
+        (detector, metric): f"{detector} {metric}" for detector in run.detectors for metric in run.metrics(detector)
+    }
 
 
 def main_table(run: DigitalRun) -> Table:
     """Return attack x detector: mAP and NDS, the paper's rows between ours."""
-    rows = []
-    for setting in run.rows:
-        row_head = (title_of(setting), size_of(setting))
-        cells = [
-            metric_cell(run.record(detector, setting), metric)
-            for detector in run.detectors
-            for metric in run.metrics(detector)
-        ]
-        rows.append(Row(row_head, tuple(cells)))
-        published = published_row(run, setting)
-        if published:
-            rows.append(
-                Row(published[0], tuple(Cell(value) for scores in published[1] for value in scores), published=True)
-            )
-    columns = tuple(f"{detector} {metric}" for detector in run.detectors for metric in run.metrics(detector))
+
+    def published(setting: Setting) -> list[Row]:
+        found = published_scores(run, setting)
+        return [Row.of_published(*found)] if found else []
+
     note = f"Percent; each camera image is attacked by itself, its stored 8-bit picture is scored; {interval_note(run)}"
     note += run.about_flat
-    if any(row.published for row in rows):
+    if any(published_scores(run, setting) for setting in run.rows):
         note += (
             f" Shaded rows: {SOURCE}; ours are other pictures and other detectors, so the share of the clean score "
             "that is lost can be compared, the level cannot."
         )
-    return Table("digital", "Detection under digital attacks", ("Attack", "Budget"), columns, tuple(rows), note, SOURCE)
+    return Table.listing(
+        "digital",
+        "Detection under digital attacks",
+        run.rows,
+        rows=ATTACK,
+        columns=score_columns(run),
+        metric=lambda setting, column: metric_cell(run.record(column[0], setting), column[1]),
+        published=published,
+        note=note,
+        source=SOURCE,
+    )
 
 
 def lost_table(run: DigitalRun) -> Table:
     """Return attack x detector: the share of the clean score that is lost, the paper's shares between ours."""
-    rows = []
-    clean = published_row(run, Setting())
-    for setting in (entry for entry in run.rows if entry[0]):
-        row_head = (title_of(setting), size_of(setting))
-        cells = [
-            lost_cell(run, detector, setting, metric) for detector in run.detectors for metric in run.metrics(detector)
-        ]
-        rows.append(Row(row_head, tuple(cells)))
-        published = published_row(run, setting)
-        if published and clean:
-            shares = [
-                100 * (1 - attacked_score / clean_score)
-                for after, before in zip(published[1], clean[1], strict=True)
-                for attacked_score, clean_score in zip(after, before, strict=True)
-            ]
-            rows.append(Row(published[0], tuple(Cell(share) for share in shares), published=True))
-    columns = tuple(f"{detector} {metric}" for detector in run.detectors for metric in run.metrics(detector))
-    note = "Percent of each detector's own clean score; more is a stronger attack."
-    return Table("lost", "What an attack takes away", ("Attack", "Budget"), columns, tuple(rows), note, SOURCE)
+    clean = published_scores(run, Setting())
+
+    def published(setting: Setting) -> list[Row]:
+        attacked = published_scores(run, setting)
+        if attacked is None or clean is None:
+            return []
+        pairs = zip(attacked[1], clean[1], strict=True)
+        return [Row.of_published(attacked[0], [100 * (1 - score / clean_score) for score, clean_score in pairs])]
+
+    return Table.listing(
+        "lost",
+        "What an attack takes away",
+        [setting for setting in run.rows if setting.attack],
+        rows=ATTACK,
+        columns=score_columns(run),
+        metric=lambda setting, column: lost_cell(run, column[0], setting, column[1]),
+        published=published,
+        note="Percent of each detector's own clean score; more is a stronger attack.",
+        source=SOURCE,
+    )
 
 
 def effort_table(run: DigitalRun) -> Table:
     """Return the cost of each attack, and its effect on the loss that it ascends."""
-    names = ("gradients", "queries", "loss_before", "loss_after", "used", "change_px", "idle", "gradient_error")
-    columns = (
-        "gradients an image",
-        "queries an image",
-        "loss before",
-        "loss after",
-        "budget used (%)",
-        "largest change (px)",
-        "idle images",
-        "error of the gradient (%)",
-        "images at once",
-    )
-    rows = []
-    for (detector, setting), record in run.records.items():
-        if not setting.attack or setting.source or record["status"] != "ok" or (setting.defence and not setting.aware):
-            continue
-        values = [record.get(name) for name in (*names, "batch")]
-        scaled = [
-            Cell(
-                math.nan if value is None else float(value) * (100 if n in ("used", "gradient_error") else 1),
-                digits=0 if n in ("idle", "batch") else 2,
-            )
-            for n, value in zip((*names, "batch"), values, strict=True)
-        ]
-        system = ", ".join(part for part in [detector, defence_of(setting)] if part)
-        row_head = (system, title_of(setting), size_of(setting), scenes_of(setting), record["access"])
-        rows.append(Row(row_head, tuple(scaled)))
-    note = (
-        "Means over the images. Idle images have no object for a loss that needs one and are left as they are. The "
-        "error of the gradient is against finite differences, on the image with most objects of each scene."
-        f"{short_of(run)}"
-    )
-    return Table(
-        "effort", "What it took", ("Detector", "Attack", "Budget", "Scenes", "Access"), columns, tuple(rows), note
+
+    def metric(row: DetectorSetting, name: str) -> Cell:
+        value = run.records[row].get(name)
+        scale = 100 if name in ("used", "gradient_error") else 1
+        return Cell.value(None if value is None else float(value) * scale, digits=0 if name in ("idle", "batch") else 2)
+
+    def direct(row: DetectorSetting) -> bool:
+        setting = row[1]
+        return bool(setting.attack) and not setting.source and (setting.aware or not setting.defence)
+
+    return Table.listing(
+        "effort",
+        "What it took",
+        [row for row, record in run.records.items() if direct(row) and record["status"] == "ok"],
+        rows={
+            **with_detector(ATTACK | SCENES),
+            "Detector": lambda row: ", ".join(filter(None, [row[0], defence_of(row[1])])),
+            "Access": lambda row: run.records[row]["access"],
+        },
+        columns=EFFORT,
+        metric=metric,
+        note="Means over the images. Idle images have no object for a loss that needs one and are left as they are. "
+        "The error of the gradient is against finite differences, on the image with most objects of each scene."
+        f"{short_of(run)}",
     )
 
 
@@ -174,31 +190,34 @@ def short_of(run: DigitalRun) -> str:
 
 def every_table(run: DigitalRun) -> Table:
     """Return every cell."""
-    rows = []
-    for (detector, setting), record in run.records.items():
-        valid_record = record if record["status"] == "ok" else None
-        cells = [metric_cell(valid_record, metric) for metric in ("mAP", "NDS", "AP_car")]
-        lost = lost_cell(run, detector, setting, "mAP") if setting[0] else Cell(math.nan)
-        row_head = (detector, title_of(setting), size_of(setting), circumstances(setting), scenes_of(setting))
-        rows.append(Row(row_head, (*cells, lost)))
-    columns = ("mAP", "NDS", "AP of cars", "mAP lost")
-    heads = ("Detector", "Attack", "Budget", "Circumstances", "Scenes")
-    return Table("cells", "Every attack", heads, columns, tuple(rows), "Percent.")
+
+    def metric(row: DetectorSetting, name: str) -> Cell:
+        if name == "lost":
+            return lost_cell(run, *row, "mAP") if row[1].attack else Cell.value(None)
+        return metric_cell(run.record(*row), name)
+
+    return Table.listing(
+        "cells",
+        "Every attack",
+        run.records,
+        rows=with_detector(ATTACK | {"Circumstances": circumstances} | SCENES),
+        columns={"mAP": "mAP", "NDS": "NDS", "AP_car": "AP of cars", "lost": "mAP lost"},
+        metric=metric,
+        note="Percent.",
+    )
 
 
 def class_table(run: DigitalRun) -> Table:
     """Return the AP of each class under the attacks of the table."""
-    rows = [
-        Row(
-            (detector, title_of(setting), size_of(setting)),
-            tuple(metric_cell(run.record(detector, setting), f"AP_{class_name}") for class_name in CLASSES),
-        )
-        for detector in run.detectors
-        for setting in run.rows
-    ]
-    note = "AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation."
-    columns = tuple(class_name.replace("_", " ") for class_name in CLASSES)
-    return Table("classes", "By class", ("Detector", "Attack", "Budget"), columns, tuple(rows), note)
+    return Table.listing(
+        "classes",
+        "By class",
+        list(product(run.detectors, run.rows)),
+        rows=with_detector(ATTACK),
+        columns={f"AP_{class_name}": class_name.replace("_", " ") for class_name in CLASSES},
+        metric=lambda row, name: metric_cell(run.record(*row), name),
+        note="AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation.",
+    )
 
 
 def attempts_of(run: DigitalRun) -> list[Attempt]:
@@ -255,18 +274,16 @@ def published_attempts() -> list[Attempt]:
 
 def audit_table(verdict: Verdict) -> Table:
     """Return how often each rule was applied, and how often it was broken."""
-    rows = [
-        Row(
-            (text,),
-            tuple(
-                Cell(count, digits=0)
-                for count in (verdict.compared[name], sum(fault.rule == name for fault in verdict.faults))
-            ),
-        )
-        for name, (text, _) in RULES.items()
-    ]
-    note = " ".join([verdict.text, *(f"{fault.detector}: {fault.text}." for fault in verdict.faults)])
-    return Table("audit", "Audit of the attacks", ("Rule",), ("comparisons", "faults"), tuple(rows), note)
+    faults = Counter(fault.rule for fault in verdict.faults)
+    return Table.listing(
+        "audit",
+        "Audit of the attacks",
+        RULES,
+        rows={"Rule": lambda rule: RULES[rule][0]},
+        columns={"comparisons": "comparisons", "faults": "faults"},
+        metric=lambda rule, column: Cell(faults[rule] if column == "faults" else verdict.compared[rule], digits=0),
+        note=" ".join([verdict.text, *(f"{fault.detector}: {fault.text}." for fault in verdict.faults)]),
+    )
 
 
 def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP") -> str:

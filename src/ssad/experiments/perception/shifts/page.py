@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -182,113 +184,124 @@ def published_names(run: DetectionRun) -> list[str]:
 
 def main_table(run: DetectionRun) -> Table:
     """Return shift x detector: mAP and NDS, the paper's rows between ours."""
-    rows = []
-    columns = [f"{detector} {metric}" for detector in run.detectors for metric in ("mAP", "NDS")]
     names = published_names(run)
-    for shift in ["", *run.shifts]:
-        row_head = (run.family(shift), title_of(shift))
-        cells = [summary_cell(run, detector, shift, metric) for detector in run.detectors for metric in ("mAP", "NDS")]
-        rows.append(Row(row_head, tuple(cells)))
-        if shift in PUBLISHED and any(names):
-            published = [PUBLISHED[shift].get(name, (math.nan, math.nan)) for name in names]
-            rows.append(Row(row_head, tuple(Cell(value) for scores in published for value in scores), published=True))
+
+    def published(shift: str) -> list[Row]:
+        if shift not in PUBLISHED or not any(names):
+            return []
+        scores = [PUBLISHED[shift].get(name, (None, None)) for name in names]
+        return [Row.of_published((run.family(shift), title_of(shift)), chain.from_iterable(scores))]
+
     if "random" not in run.suite["severities"]:
         strength = f"mean over severities {', '.join(run.numbers)}"
     elif run.suite["calibration"] == "paper":
         strength = "each sample at a severity drawn from 1 to 5"
     else:
         strength = "each scene at one severity from 1 to 5, all five as often, give or take one"
-    return Table(
+    return Table.listing(
         "shifts",
         "Detection under distribution shifts",
-        ("Family", "Shift"),
-        tuple(columns),
-        tuple(rows),
-        f"Percent; {strength}; {interval_note(run)} Shaded rows: {SOURCE}; ours "
+        ["", *run.shifts],
+        rows=factors(run),
+        columns=score_columns(run),
+        metric=lambda shift, column: summary_cell(run, column[0], shift, column[1]),
+        published=published,
+        note=f"Percent; {strength}; {interval_note(run)} Shaded rows: {SOURCE}; ours "
         "are other pictures and other detectors, so the fall under a shift can be compared, the level cannot.",
-        SOURCE,
+        source=SOURCE,
     )
+
+
+def factors(run: DetectionRun) -> dict[str, Callable[[str], str]]:
+    """Return the row factors of a shift: its family and title."""
+    return {"Family": run.family, "Shift": title_of}
+
+
+def score_columns(run: DetectionRun) -> dict[tuple[str, str], str]:
+    """Return the columns of detector x score."""
+    return {(detector, metric): f"{detector} {metric}" for detector in run.detectors for metric in ("mAP", "NDS")}
 
 
 def left_table(run: DetectionRun) -> Table:
     """Return shift x detector: the share of the clean score that is left, the paper's shares between ours."""
-    rows = []
-    columns = [f"{detector} {metric}" for detector in run.detectors for metric in ("mAP", "NDS")]
     names = published_names(run)
-    for shift in run.shifts:
-        row_head = (run.family(shift), title_of(shift))
-        rows.append(
-            Row(
-                row_head,
-                tuple(left_cell(run, detector, shift, m) for detector in run.detectors for m in ("mAP", "NDS")),
-            )
-        )
-        if shift in PUBLISHED and any(names):
-            cells = [
-                Cell(
-                    100 * PUBLISHED[shift][name][metric_index] / PUBLISHED[""][name][metric_index] if name else math.nan
-                )
-                for name in names
-                for metric_index in (0, 1)
-            ]
-            rows.append(Row(row_head, tuple(cells), published=True))
-    return Table(
+    has_published = any(names) and any(shift in PUBLISHED for shift in run.shifts)
+
+    def published(shift: str) -> list[Row]:
+        if shift not in PUBLISHED or not any(names):
+            return []
+        shares = [
+            100 * PUBLISHED[shift][name][number] / PUBLISHED[""][name][number] if name else None
+            for name in names
+            for number in (0, 1)
+        ]
+        return [Row.of_published((run.family(shift), title_of(shift)), shares)]
+
+    return Table.listing(
         "left",
         "What is left of the clean score",
-        ("Family", "Shift"),
-        tuple(columns),
-        tuple(rows),
-        "Percent of each detector's own clean score, which is what other pictures and detectors can be compared by."
-        + (f" Shaded rows: from the numbers {SOURCE}." if any(row.published for row in rows) else ""),
-        SOURCE,
+        run.shifts,
+        rows=factors(run),
+        columns=score_columns(run),
+        metric=lambda shift, column: left_cell(run, column[0], shift, column[1]),
+        published=published,
+        note="Percent of each detector's own clean score, which is what other pictures and detectors can be compared "
+        "by." + (f" Shaded rows: from the numbers {SOURCE}." if has_published else ""),
+        source=SOURCE,
     )
 
 
 def severity_table(run: DetectionRun) -> Table:
     """Return every number by severity."""
     severities = [*run.numbers, *(["random"] if "random" in run.suite["severities"] else [])]
-    rows = []
-    for metric in ("mAP", "NDS", "AP_car"):
-        for detector in run.detectors:
-            for shift in run.shifts:
-                cells = [cell_of(run, run.record(detector, shift, severity), metric) for severity in severities]
-                rows.append(Row((metric.replace("_", " "), detector, title_of(shift)), tuple(cells)))
-    return Table(
+    return Table.listing(
         "severities",
         "By severity",
-        ("Metric", "Detector", "Shift"),
-        tuple(f"severity {severity}" for severity in severities),
-        tuple(rows),
+        list(product(("mAP", "NDS", "AP_car"), run.detectors, run.shifts)),
+        rows={
+            "Metric": lambda row: row[0].replace("_", " "),
+            "Detector": lambda row: row[1],
+            "Shift": lambda row: title_of(row[2]),
+        },
+        columns={severity: f"severity {severity}" for severity in severities},
+        metric=lambda row, severity: cell_of(run, run.record(row[1], row[2], severity), row[0]),
     )
 
 
 def car_table(run: DetectionRun) -> Table:
     """Return the AP of cars."""
-    rows = [
-        Row(
-            (run.family(shift), title_of(shift)),
-            tuple(summary_cell(run, detector, shift, "AP_car") for detector in run.detectors),
-        )
-        for shift in ["", *run.shifts]
-    ]
-    return Table("car", "Cars alone: AP", ("Family", "Shift"), tuple(run.detectors), tuple(rows), "Percent.")
+    return Table.listing(
+        "car",
+        "Cars alone: AP",
+        ["", *run.shifts],
+        rows=factors(run),
+        columns={detector: detector for detector in run.detectors},
+        metric=lambda shift, detector: summary_cell(run, detector, shift, "AP_car"),
+        note="Percent.",
+    )
 
 
 def class_table(run: DetectionRun) -> Table:
     """Return the AP of each class and the errors of true positives on the clean data."""
-    columns = [
-        *(class_name.replace("_", " ") for class_name in CLASSES),
-        *(f"{error_name} ({unit})" for error_name, unit in ERRORS.items()),
-    ]
-    rows = []
-    for detector in run.detectors:
+
+    def metric(detector: str, column: str) -> Cell:
         record = run.record(detector, "", "0")
-        cells = [cell_of(run, record, f"AP_{class_name}") for class_name in CLASSES]
-        errors = [record["metrics"].get(error) if record else None for error in ERRORS]
-        cells += [Cell(math.nan if error is None else error) for error in errors]
-        rows.append(Row((detector,), tuple(cells)))
-    note = "AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation."
-    return Table("classes", "On the clean data", ("Detector",), tuple(columns), tuple(rows), note)
+        if column in ERRORS:
+            return Cell.value(record["metrics"].get(column) if record else None)
+        return cell_of(run, record, column)
+
+    return Table.listing(
+        "classes",
+        "On the clean data",
+        run.detectors,
+        rows={"Detector": str},
+        columns={
+            **{f"AP_{class_name}": class_name.replace("_", " ") for class_name in CLASSES},
+            **{error_name: f"{error_name} ({unit})" for error_name, unit in ERRORS.items()},
+        },
+        metric=metric,
+        note="AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation.",
+    )
 
 
 def robustness_table(run: DetectionRun) -> Table | None:
@@ -298,62 +311,46 @@ def robustness_table(run: DetectionRun) -> Table | None:
         The table, or None where a number is missing.
     """
     severities = run.numbers or ["random"]
-    scores: dict[tuple[str, str], dict[str, list[float]]] = {}
-    replicates: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
-    for detector in run.detectors:
-        for metric in ("NDS", "mAP"):
-            records = {
-                entry: [run.record(detector, entry, count) for count in severities] for entry in ["", *run.shifts]
-            }
-            # Means over shifts and severities are comparable only if none is missing.
-            if any(record is None for shift_records in records.values() for record in shift_records):
-                return None
-            complete_records = {
-                entry: [record for record in shift_records if record is not None]
-                for entry, shift_records in records.items()
-            }
-            scores[detector, metric] = {
-                entry: [record["metrics"][metric] for record in shift_records]
-                for entry, shift_records in complete_records.items()
-            }
-            replicates[detector, metric] = {
-                entry: [replicates_of(record, metric) for record in shift_records]
-                for entry, shift_records in complete_records.items()
-            }
-    rows = []
-    for detector in run.detectors:
-        cells = []
-        for metric in ("NDS", "mAP"):
-            detector_scores, baseline_scores = scores[detector, metric], scores[run.detectors[0], metric]
-            rate, error = _robustness(detector_scores, baseline_scores)
-            resampled = [
-                _robustness(
-                    _drawn(replicates[detector, metric], draw), _drawn(replicates[run.detectors[0], metric], draw)
-                )
-                for draw in range(len(replicates[detector, metric][""][0]))
-            ]
-            for value, value_draws in (
-                (error, [entry[1] for entry in resampled]),
-                (rate, [entry[0] for entry in resampled]),
-            ):
-                # the baseline's mCE is 1 by definition, so its replicates do not vary
-                used_draws = [] if value is error and detector_scores is baseline_scores else value_draws
-                count = next(iter(run.records.values())).get("n", 0)
-                cells.append(score_cell(run, value, used_draws, count, bounded=False))
-        rows.append(Row((detector,), tuple(cells)))
-    return Table(
+    records: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for detector, shift in product(run.detectors, ["", *run.shifts]):
+        shift_records = [run.record(detector, shift, severity) for severity in severities]
+        records[detector, shift] = [record for record in shift_records if record is not None]
+        # Means over shifts and severities are comparable only if none is missing.
+        if len(records[detector, shift]) < len(severities):
+            return None
+    baseline = run.detectors[0]
+
+    def scores(detector: str, number: Callable[[Mapping[str, Any]], float]) -> dict[str, list[float]]:
+        return {shift: [number(record) for record in records[detector, shift]] for shift in ["", *run.shifts]}
+
+    def metric(detector: str, column: tuple[str, str]) -> Cell:
+        name, score = column
+
+        def value(number: Callable[[Mapping[str, Any]], float]) -> float:
+            rate, error = _robustness(scores(detector, number), scores(baseline, number))
+            return error if name == "mCE" else rate
+
+        # the baseline's mCE is 1 by definition, so its replicates do not vary
+        draws = 0 if name == "mCE" and detector == baseline else len(replicates_of(records[detector, ""][0], score))
+        resampled = [value(partial(_draw, score=score, draw=draw)) for draw in range(draws)]
+        count = next(iter(run.records.values())).get("n", 0)
+        return score_cell(run, value(lambda record: record["metrics"][score]), resampled, count, bounded=False)
+
+    return Table.listing(
         "robustness",
         "Robustness in one number",
-        ("Detector",),
-        ("mCE (NDS)", "mRR (NDS)", "mCE (mAP)", "mRR (mAP)"),
-        tuple(rows),
-        f"Percent, over all shifts and severities {', '.join(severities)}. mCE: errors relative to those of "
-        f"{run.detectors[0]} (lower is better); mRR: share of the clean score that is left (higher is better).",
+        run.detectors,
+        rows={"Detector": str},
+        columns={(name, score): f"{name} ({score})" for score in ("NDS", "mAP") for name in ("mCE", "mRR")},
+        metric=metric,
+        note=f"Percent, over all shifts and severities {', '.join(severities)}. mCE: errors relative to those of "
+        f"{baseline} (lower is better); mRR: share of the clean score that is left (higher is better).",
     )
 
 
-def _drawn(values: Mapping[str, Sequence[Sequence[float]]], k: int) -> dict[str, list[float]]:
-    return {shift: [row[k] for row in rows] for shift, rows in values.items()}
+def _draw(record: Mapping[str, Any], score: str, draw: int) -> float:
+    """Return a replicate of a score."""
+    return replicates_of(record, score)[draw]
 
 
 def _robustness(own: Mapping[str, Sequence[float]], base: Mapping[str, Sequence[float]]) -> tuple[float, float]:
