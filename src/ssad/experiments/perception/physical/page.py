@@ -16,6 +16,7 @@ from ssad.report.artefacts import pictures
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import PHYSICAL as PUBLISHED
+from ssad.report.records import Line, field
 from ssad.report.tables import Cell, Row, Table
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -42,8 +43,13 @@ OTHERS = {
     "ASR_all_25": "ASR, whole class",
     "confidence": "mean score",
 }
+VICTIM: dict[str, Callable[[tuple[str, str, tuple[str, str]]], str]] = {
+    "Town": lambda row: row[0],
+    "Detector": lambda row: row[1],
+    "Attack": lambda row: title_of(row[2]),
+}
+"""Row factors of a town, a detector and an attack."""
 
-Line = Mapping[str, Any]
 Shown = tuple[str, str, str]
 """Attack, carrier, and the detector that it was trained against ("" for what is not trained)."""
 
@@ -142,24 +148,25 @@ def main_table(run: PhysicalRun, number: int) -> Table:
     published_town = (
         BESIDE.get(test, dict(enumerate(PUBLISHED)).get(number)) if run.run.suite.get("reference") else None
     )
-    names = [next((column for prefix, column in DETECTORS.items() if d.startswith(prefix)), "") for d in run.detectors]
-    rows = []
+    names = {
+        detector: next((column for prefix, column in DETECTORS.items() if detector.startswith(prefix)), "")
+        for detector in run.detectors
+    }
     measured = {metric for line in run.run.lines for metric in line.get("metrics") or ()}
     scores = {metric: title for metric, title in SCORES.items() if metric in measured or metric != "ASR_any_25"}
-    for attack in run.attacks:
-        cells = [
-            score(run.lines(test, "drive", detector, attack), metric) for detector in run.detectors for metric in scores
-        ]
-        rows.append(Row((title_of(attack),), tuple(cells)))
-        if published_town and attack in PAPER and any(names):
-            published = PUBLISHED[published_town][PAPER[attack]]
-            cells = []
-            for name in names:
-                precision, rate = published.get(name, (math.nan, None))
-                published_scores = {"AP50": precision, "ASR_25": math.nan if rate is None else rate}
-                cells += [Cell(published_scores.get(metric, math.nan)) for metric in scores]
-            rows.append(Row((f"{PAPER[attack]}, {published_town}",), tuple(cells), published=True))
-    columns = tuple(f"{detector} {title}" for detector in run.detectors for title in scores.values())
+    columns = {(d, metric): f"{d} {title}" for d in run.detectors for metric, title in scores.items()}
+
+    def published(attack: tuple[str, str]) -> list[Row]:
+        if not published_town or attack not in PAPER or not any(names.values()):
+            return []
+        cells = PUBLISHED[published_town][PAPER[attack]]
+        published_scores = {
+            (detector, metric): number
+            for detector, name in names.items()
+            for metric, number in zip(("AP50", "ASR_25"), cells.get(name, (None, None)), strict=True)
+        }
+        return [Row.of_published((f"{PAPER[attack]}, {published_town}",), map(published_scores.get, columns))]
+
     note = (
         f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
         "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
@@ -172,8 +179,17 @@ def main_table(run: PhysicalRun, number: int) -> Table:
             f" Shaded rows: {SOURCE}, {published_town}. "
             "Other towns, pictures and detectors: what can be compared is the order."
         )
-    title = f"Trained in {train}, tested in {test}"
-    return Table(f"physical-{test.lower()}", title, ("Attack",), columns, tuple(rows), note, SOURCE)
+    return Table.listing(
+        f"physical-{test.lower()}",
+        f"Trained in {train}, tested in {test}",
+        run.attacks,
+        rows={"Attack": title_of},
+        columns=columns,
+        metric=lambda attack, column: score(run.lines(test, "drive", column[0], attack), column[1]),
+        published=published,
+        note=note,
+        source=SOURCE,
+    )
 
 
 def _place(suite: Mapping[str, Any]) -> str:
@@ -189,34 +205,37 @@ def _place(suite: Mapping[str, Any]) -> str:
 
 def margin_table(run: PhysicalRun) -> Table:
     """Return each trained texture against the draw of a control of its carrier that comes nearest to it."""
-    rows = []
-    for (_, test), detector in ((pair, victim) for pair in run.pairs for victim in run.detectors):
-        for attack in run.attacks:
-            name, carrier = attack
-            attack_lines = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
-            controls = [
-                control for control in run.attacks if control[1] == carrier and learns_nothing(control[0], name)
-            ]
-            differences = [
-                (paired_gap(draw, line), control)
-                for control, line in product(controls, attack_lines)
-                for draw in run.lines(test, "drive", detector, control)
-            ]
-            if differences:
-                difference, nearest = min(differences, key=lambda candidate: lower(candidate[0]))
-                cells = (
-                    score(attack_lines, "AP50"),
-                    score(run.lines(test, "drive", detector, nearest), "AP50"),
-                    difference,
-                )
-                rows.append(Row((test, detector, title_of(attack), title_of(nearest)), cells))
-    note = (
-        "AP50 in percent. The difference is what a control leaves less what the attack leaves in the same pictures; "
-        "its interval is of paired replicates of the bootstrap over drives. Of all controls and all their draws it is "
-        "that with the least lower end; above 0 the attack is stronger than all that learns nothing."
+    nearest: dict[tuple[str, str, tuple[str, str]], tuple[Cell, tuple[str, str]]] = {}
+    for (_, test), detector, attack in product(run.pairs, run.detectors, run.attacks):
+        name, carrier = attack
+        attack_lines = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
+        controls = [control for control in run.attacks if control[1] == carrier and learns_nothing(control[0], name)]
+        differences = [
+            (paired_gap(draw, line), control)
+            for control, line in product(controls, attack_lines)
+            for draw in run.lines(test, "drive", detector, control)
+        ]
+        if differences:
+            nearest[test, detector, attack] = min(differences, key=lambda candidate: lower(candidate[0]))
+
+    def metric(row: tuple[str, str, tuple[str, str]], column: str) -> Cell:
+        test, detector, attack = row
+        difference, control = nearest[row]
+        if column == "difference":
+            return difference
+        return score(run.lines(test, "drive", detector, attack if column == "attack" else control), "AP50")
+
+    return Table.listing(
+        "margins",
+        "Attacks against controls",
+        nearest,
+        rows={**VICTIM, "Nearest control": lambda row: title_of(nearest[row][1])},
+        columns={"attack": "attack", "control": "control", "difference": "difference"},
+        metric=metric,
+        note="AP50 in percent. The difference is what a control leaves less what the attack leaves in the same "
+        "pictures; its interval is of paired replicates of the bootstrap over drives. Of all controls and all their "
+        "draws it is that with the least lower end; above 0 the attack is stronger than all that learns nothing.",
     )
-    heads = ("Town", "Detector", "Attack", "Nearest control")
-    return Table("margins", "Attacks against controls", heads, ("attack", "control", "difference"), tuple(rows), note)
 
 
 def is_control(name: str) -> bool:
@@ -241,36 +260,53 @@ def lower(cell: Cell) -> float:
 def transfer_table(run: PhysicalRun) -> Table:
     """Return textures trained against one detector, shown to all; beside them the clean target and controls."""
     sources = list(dict.fromkeys(["", *run.detectors, *(attack_key[2] for *_, attack_key in run.records)]))
-    rows = []
+
+    def lines_of(row: tuple[str, Shown], judge: str) -> list[Line]:
+        return run.records.get((row[0], "drive", judge, row[1]), [])
+
+    rows: list[tuple[str, Shown]] = []
     for _, test in run.pairs:
-        town_rows = []
-        for attack, source in product(run.attacks, sources):
-            records = [run.records.get((test, "drive", judge, (*attack, source))) for judge in run.judges]
-            if sum(bool(lines) for lines in records) >= 2:
-                cells = [score([line for line in lines or () if line["status"] == "ok"], "AP50") for lines in records]
-                town_rows.append(Row((test, title_of(attack), source), tuple(cells)))
-        rows += town_rows if any(row.head[2] for row in town_rows) else []
-    note = "AP50 in percent of the target; n/a where the detector does not find the clean target often enough."
-    heads = ("Town", "Attack", "Trained against")
-    return Table("transfer", "Transfer between detectors", heads, tuple(run.judges), tuple(rows), note)
+        candidates = [(test, (*attack, source)) for attack, source in product(run.attacks, sources)]
+        town_rows = [row for row in candidates if sum(bool(lines_of(row, judge)) for judge in run.judges) >= 2]
+        rows += town_rows if any(source for _, (*_, source) in town_rows) else []
+    return Table.listing(
+        "transfer",
+        "Transfer between detectors",
+        rows,
+        rows={
+            "Town": lambda row: row[0],
+            "Attack": lambda row: title_of(row[1][:2]),
+            "Trained against": lambda row: row[1][2],
+        },
+        columns={judge: judge for judge in run.judges},
+        metric=lambda row, judge: score([line for line in lines_of(row, judge) if line["status"] == "ok"], "AP50"),
+        note="AP50 in percent of the target; n/a where the detector does not find the clean target often enough.",
+    )
 
 
 def others_table(run: PhysicalRun) -> Table:
     """Return the other scores: at a higher confidence, and of the whole class."""
-    rows = []
-    for _, test in run.pairs:
-        for detector in run.judges:
-            for attack in run.attacks:
-                lines = run.lines(test, "drive", detector, attack)
-                if lines:
-                    cells = (*(score(lines, metric) for metric in OTHERS), _difference(lines))
-                    rows.append(Row((test, detector, title_of(attack)), cells))
-    heads, columns = ("Town", "Detector", "Attack"), (*OTHERS.values(), "colour difference")
-    note = (
-        "Percent; the colour difference (CIE 1976) is the mean between a texture and the paint that it covers: 0 for "
-        "the paint itself, 100 for white on black."
+
+    def metric(row: tuple[str, str, tuple[str, str]], name: str) -> Cell:
+        test, detector, attack = row
+        lines = run.lines(test, "drive", detector, attack)
+        return _difference(lines) if name == "delta_e" else score(lines, name)
+
+    towns = [test for _, test in run.pairs]
+    return Table.listing(
+        "others",
+        "Other scores",
+        [
+            (test, detector, attack)
+            for test, detector, attack in product(towns, run.judges, run.attacks)
+            if run.lines(test, "drive", detector, attack)
+        ],
+        rows=VICTIM,
+        columns={**OTHERS, "delta_e": "colour difference"},
+        metric=metric,
+        note="Percent; the colour difference (CIE 1976) is the mean between a texture and the paint that it covers: 0 "
+        "for the paint itself, 100 for white on black.",
     )
-    return Table("others", "Other scores", heads, columns, tuple(rows), note)
 
 
 def _difference(lines: Sequence[Line]) -> Cell:
@@ -281,72 +317,76 @@ def _difference(lines: Sequence[Line]) -> Cell:
 
 def grid_table(run: PhysicalRun) -> Table:
     """Return the scores over all views of the grid, and the cell in which an attack does least."""
-    rows = []
-    for (test, view, detector, attack_key), lines in run.records.items():
-        finished = [line for line in lines if line["status"] == "ok"]
-        if view != "grid" or not finished:
-            continue
-        worst_cells = [line["worst"] for line in finished if line["worst"]]
-        worst_cell = max(worst_cells, key=lambda candidate: candidate[2]) if worst_cells else None
-        position = f"{worst_cell[0]:g} m, {worst_cell[1]:g}°" if worst_cell else ""
-        row_head = (
-            test,
-            detector,
-            title_of(attack_key[:2]),
-            attack_key[2] if attack_key[2] != detector else "",
-            position,
-        )
-        rows.append(
-            Row(
-                row_head,
-                (
-                    score(finished, "AP50"),
-                    score(finished, "ASR_25"),
-                    Cell(100 * worst_cell[2] if worst_cell else math.nan),
-                ),
-            )
-        )
-    note = (
-        "Percent. The worst cell of distance and azimuth (0° is the front, 90° the left) is the one in which the "
-        "attack does least; of the clean pictures the one in which the detector does."
+    lines_by_row = {
+        key: finished
+        for key, lines in run.records.items()
+        if key[1] == "grid" and (finished := [line for line in lines if line["status"] == "ok"])
+    }
+
+    def worst_cell(row: tuple[str, str, str, Shown]) -> tuple[float, float, float] | None:
+        worst_cells = [line["worst"] for line in lines_by_row[row] if line["worst"]]
+        return max(worst_cells, key=lambda candidate: candidate[2], default=None)
+
+    def metric(row: tuple[str, str, str, Shown], name: str) -> Cell:
+        if name != "worst":
+            return score(lines_by_row[row], name)
+        worst = worst_cell(row)
+        return Cell.value(100 * worst[2] if worst else None)
+
+    return Table.listing(
+        "grid",
+        "Views from all around",
+        lines_by_row,
+        rows={
+            "Town": lambda row: row[0],
+            "Detector": lambda row: row[2],
+            "Attack": lambda row: title_of(row[3][:2]),
+            "Trained against": lambda row: row[3][2] if row[3][2] != row[2] else "",
+            "Worst cell": lambda row: f"{worst[0]:g} m, {worst[1]:g}°" if (worst := worst_cell(row)) else "",
+        },
+        columns={"AP50": "AP50", "ASR_25": "ASR", "worst": "AP50 in the worst cell"},
+        metric=metric,
+        note="Percent. The worst cell of distance and azimuth (0° is the front, 90° the left) is the one in which the "
+        "attack does least; of the clean pictures the one in which the detector does.",
     )
-    heads = ("Town", "Detector", "Attack", "Trained against", "Worst cell")
-    return Table("grid", "Views from all around", heads, ("AP50", "ASR", "AP50 in the worst cell"), tuple(rows), note)
 
 
 def comparison_table(run: PhysicalRun) -> Table:
     """In each town and view the strongest attack with a carrier beside each other one, with the paired difference."""
-    rows = []
+    pairs: list[tuple[Line, Line]] = []
     carriers = list(dict.fromkeys(carrier for _, carrier in run.attacks))
     for (_, test), view, detector, carrier in product(run.pairs, ("drive", "grid"), run.detectors, carriers):
-        attack_lines = {}
+        attack_lines = []
         for attack in run.attacks:
             lines = [] if is_control(attack[0]) else run.lines(test, view, detector, attack)
             if attack[1] == carrier and lines and lines[0]["source"] and lines[0].get("replicates"):
-                attack_lines[attack] = lines[0]
-        strongest = min(attack_lines, key=lambda attack: attack_lines[attack]["metrics"]["AP50"], default=("", ""))
-        for attack, line in attack_lines.items():
-            if attack != strongest:
-                cells = (
-                    score([attack_lines[strongest]], "AP50"),
-                    score([line], "AP50"),
-                    paired_gap(line, attack_lines[strongest]),
-                )
-                row_head = (
-                    test,
-                    "all around" if view == "grid" else "behind",
-                    detector,
-                    title_of(strongest),
-                    title_of(attack),
-                )
-                rows.append(Row(row_head, cells))
-    note = (
-        "AP50 in percent. The difference is what the other leaves less what the strongest leaves in the same pictures. "
-        "Its interval is of paired replicates of the bootstrap over drives, so it can exclude zero where the two "
-        "intervals overlap: some drives are harder for both."
+                attack_lines.append(lines[0])
+        strongest = min(attack_lines, key=lambda line: line["metrics"]["AP50"], default={})
+        pairs += [(strongest, line) for line in attack_lines if line is not strongest]
+
+    def metric(pair: tuple[Line, Line], column: str) -> Cell:
+        strongest, other = pair
+        if column == "difference":
+            return paired_gap(other, strongest)
+        return score([strongest if column == "strongest" else other], "AP50")
+
+    return Table.listing(
+        "comparison",
+        "Attacks against each other",
+        pairs,
+        rows={
+            "Town": lambda pair: pair[1]["test"],
+            "View": lambda pair: "all around" if pair[1].get("view") == "grid" else "behind",
+            "Detector": lambda pair: pair[1]["detector"],
+            "Strongest": lambda pair: title_of((pair[0]["attack"], pair[0]["carrier"])),
+            "Other": lambda pair: title_of((pair[1]["attack"], pair[1]["carrier"])),
+        },
+        columns={"strongest": "strongest", "other": "other", "difference": "difference"},
+        metric=metric,
+        note="AP50 in percent. The difference is what the other leaves less what the strongest leaves in the same "
+        "pictures. Its interval is of paired replicates of the bootstrap over drives, so it can exclude zero where the "
+        "two intervals overlap: some drives are harder for both.",
     )
-    heads, columns = ("Town", "View", "Detector", "Strongest", "Other"), ("strongest", "other", "difference")
-    return Table("comparison", "Attacks against each other", heads, columns, tuple(rows), note)
 
 
 def paired_gap(more: Line, less: Line) -> Cell:
@@ -364,15 +404,24 @@ def paired_gap(more: Line, less: Line) -> Cell:
 
 def effort_table(run: PhysicalRun) -> Table:
     """Return how the textures were trained."""
-    rows = {}
-    for line in run.run.lines:
-        if line["status"] == "ok" and "epochs" in line and line["attack"].split()[0] not in CONTROLS:
-            row_head = (line["train"], line["source"], title_of((line["attack"], line["carrier"])))
-            names = ("epochs", "loss_before", "loss_after")
-            rows[row_head] = Row(row_head, tuple(Cell(float(line[name])) for name in names))
-    note = "The loss is ascended; means over the first and the last epoch, each picture with its own print and noise."
-    columns = ("epochs", "loss in the first epoch", "in the last")
-    return Table("effort", "Training", ("Town", "Detector", "Attack"), columns, tuple(rows.values()), note)
+    return Table.pivot(
+        "effort",
+        "Training",
+        [
+            line
+            for line in run.run.lines
+            if line["status"] == "ok" and "epochs" in line and line["attack"].split()[0] not in CONTROLS
+        ],
+        rows={
+            "Town": field("train"),
+            "Detector": field("source"),
+            "Attack": lambda line: title_of((line["attack"], line["carrier"])),
+        },
+        columns={"epochs": "epochs", "loss_before": "loss in the first epoch", "loss_after": "in the last"},
+        metric=lambda lines, name: Cell(float(lines[-1][name])),
+        note="The loss is ascended; means over the first and the last epoch, each picture with its own print and "
+        "noise.",
+    )
 
 
 def maps(run: PhysicalRun) -> list[tuple[str, str]]:
