@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from benchmarks.joined_runs import joined, summary_of
 from benchmarks.provenance import origin, warning
 from ssad.core.checkpoints import state_hash
 from ssad.experiments.perception.digital.page import section
-from ssad.experiments.perception.digital.run import Setting, setting_of
 from ssad.experiments.perception.scene_boxes import detector_of
 from ssad.experiments.suites import load_suite
 from ssad.report.tables import to_markdown
@@ -41,18 +40,13 @@ TABLES = (
 
 def store(folders: Sequence[Path]) -> None:
     """Keep what the page needs of runs."""
-    run = joined(folders, _place)
+    run = joined(folders)
     tables = {table.name: table for table in section(run)[1]}
     for name in TABLES:
         (RESULTS / f"{name}.md").unlink(missing_ok=True)
         if name in tables:
             (RESULTS / f"{name}.md").write_text(to_markdown(tables[name]))
-    (RESULTS / "run.json").write_text(json.dumps(summary_of(run, _place), indent=1) + "\n")
-
-
-def _place(row: Mapping[str, Any]) -> tuple[str, Setting]:
-    """What tells a cell from others, whatever device it ran on."""
-    return row["detector"], setting_of(row)
+    (RESULTS / "run.json").write_text(json.dumps(summary_of(run), indent=1) + "\n")
 
 
 def outdated() -> list[str]:

@@ -11,7 +11,7 @@ import argparse
 import json
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,20 +48,13 @@ OTHERS = ("margins", "comparison", "transfer", "grid", "others", "effort")
 
 def store(folders: Sequence[Path], name: str | None = None) -> None:
     """Keep what the page needs of runs of one suite."""
-    run = joined(folders, _place)
+    run = joined(folders)
     folder = RESULTS / (name or run.suite["name"])
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    (folder / "run.json").write_text(json.dumps(summary_of(run, _place), indent=1) + "\n")
+    (folder / "run.json").write_text(json.dumps(summary_of(run), indent=1) + "\n")
     for table in section(run)[1]:
         (folder / f"{table.name}.md").write_text(to_markdown(table))
-
-
-def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What tells a cell from others, whatever run it is of."""
-    number = row["spec"].get("light", row["spec"])["number"] if "spec" in row else row["number"]
-    names = ("train", "test", "view", "detector", "attack", "carrier", "source")
-    return (*(row[name] for name in names), number)
 
 
 def outdated(about: dict[str, Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 from helpers.run_folder import write_run
 
 from benchmarks.joined_runs import joined, summary_of
+from ssad.core.errors import ConfigError
 
 
 def cell(name: str, device: str) -> dict[str, Any]:
@@ -24,10 +24,6 @@ def line(name: str, device: str, status: str = "ok", **more: Any) -> dict[str, A
         "versions": {"device": device, "torch": f"2.{len(device)}"},
         **more,
     }
-
-
-def place(row: Mapping[str, Any]) -> str:
-    return str(row["detector"])
 
 
 def a_run(folder: Path, device: str, lines: list[dict[str, Any]], **about: Any) -> Path:
@@ -48,13 +44,13 @@ def test_what_failed_in_one_run_is_taken_from_the_other(tmp_path: Path) -> None:
     here = a_run(tmp_path / "a", "cuda", [line("b", "cuda", "failed", reason="memory"), line("a", "cuda")])
     rest = [line("a", "cpu"), line("b", "cpu"), line("c", "cpu", "failed", reason="time")]
     there = a_run(tmp_path / "b", "cpu", rest, weights={"one": "a", "two": "b"})
-    run = joined([here, there], place)
+    run = joined([here, there])
     assert [(one["detector"], one["versions"]["device"]) for one in run.lines] == [
         ("a", "cuda"),
         ("b", "cpu"),
         ("c", "cpu"),
     ]
-    told = summary_of(run, place)
+    told = summary_of(run)
     assert "cells" not in told
     assert told["command"] == ["ssad run digital --device cuda", "ssad run digital --device cpu"]
     assert told["torch"] == ["2.3", "2.4"]
@@ -71,11 +67,11 @@ def test_what_failed_in_one_run_is_taken_from_the_other(tmp_path: Path) -> None:
     ("other", "message"),
     [
         ({"suite": {"name": "shifts"}}, "of the suite shifts, not of digital"),
-        ({"weights": {"one": "b"}}, "weights of one"),
+        ({"weights": {"one": "b"}}, "one has another version"),
     ],
 )
 def test_runs_that_do_not_belong_together_are_refused(tmp_path: Path, other: dict[str, Any], message: str) -> None:
     one = a_run(tmp_path / "a", "cuda", [line("a", "cuda")])
     two = a_run(tmp_path / "b", "cuda", [line("b", "cuda")], **other)
-    with pytest.raises(SystemExit, match=message):
-        joined([one, two], place)
+    with pytest.raises(ConfigError, match=message):
+        joined([one, two])

@@ -96,7 +96,7 @@ def run(
         console.print(f"... and {len(failures) - 5} more: see {folder / 'results.jsonl'}", markup=False)
     if failures:
         console.print("to run the failed cells again, repeat the command with --retry")
-    report(folder)
+    report([folder])
     raise typer.Exit(1 if failures else 0)
 
 
@@ -111,20 +111,42 @@ def _wanted(texts: list[str]) -> dict[str, list[str]]:
     return selections
 
 
-def report(folder: Dir) -> None:
-    """Write DIR/report.html and DIR/tables from the results in DIR. Exit code 1: files are missing or were changed."""
-    from ssad.engine.store import read_run
-    from ssad.experiments.runs import write_report
-    from ssad.report import check_artefacts
+def report(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Results folders of `ssad run`.")],
+    markdown: Annotated[
+        bool,
+        typer.Option("--markdown", help="Print all tables as one Markdown page instead; several DIR are joined."),
+    ] = False,
+) -> None:
+    """Write DIR/report.html and DIR/tables from the results in DIR. Exit code 1: files are missing or were changed.
 
-    read_run(folder)
-    print(f"report: {write_report(folder)}")
-    problems = check_artefacts(folder)
+    With --markdown no file is written: the page goes to standard output, with the commands, versions, weights and
+    numbers of cases behind it. Runs of one suite are joined; a cell that failed in one of them may come from another.
+    """
+    from ssad.engine.store import read_run
+
+    for folder in folders:
+        read_run(folder)
+    if markdown:
+        from ssad.experiments.runs import report_markdown
+
+        print(report_markdown(folders), end="")
+        return
+    problems = [problem for folder in folders for problem in _report(folder)]
     for problem in problems[:5]:
         print(problem)
     if problems:
         print(f"{len(problems)} files are not as the run left them; what is made of them is not to be trusted")
         raise typer.Exit(1)
+
+
+def _report(folder: Path) -> list[str]:
+    """Write the report of a run, and return the problems of its files."""
+    from ssad.experiments.runs import write_report
+    from ssad.report import check_artefacts
+
+    print(f"report: {write_report(folder)}")
+    return check_artefacts(folder)
 
 
 def compare(

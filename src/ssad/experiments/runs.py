@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import rich.table
@@ -14,10 +15,13 @@ from ssad.engine.replay import replay_cell
 from ssad.engine.run import run_json
 from ssad.engine.store import read_run
 from ssad.experiments.suites import kind_of
+from ssad.report.join import join_runs
 from ssad.report.load import Run, load_run
+from ssad.report.markdown import run_markdown
 from ssad.report.pages import TABLE_HASH, table_hash
 from ssad.report.tables import write_tables
 from ssad.report.terminal import terminal_table
+from ssad.report.verdict import complete_verdict
 
 
 def read_plan(folder: str | Path) -> Plan:
@@ -95,6 +99,22 @@ def write_report(folder: Path | str, kind: Kind | None = None) -> Path:
     path = run.folder / "report.html"
     safeio.write_atomic(path, page)
     return path
+
+
+def report_markdown(folders: Sequence[Path | str]) -> str:
+    """Return all tables of a run, or of several runs of one suite that are joined, as a Markdown page.
+
+    Args:
+        folders: Results folders.
+
+    Raises:
+        StoreError: A folder holds no run, or has no results.
+        ConfigError: The runs cannot be joined.
+    """
+    run = join_runs([load_run(folder) for folder in folders])
+    kind = kind_of_run(run)
+    _, tables = kind.page(run)
+    return run_markdown(run, tables, complete_verdict(run, kind.verdict(run)))
 
 
 def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
