@@ -10,10 +10,10 @@ from typing import Any
 from ssad.core import safeio
 from ssad.experiments.driving.driving_tables import driving_tables, summary_table
 from ssad.experiments.driving.episodes import FAMILY_TITLES, DrivingRun, load_episodes
-from ssad.experiments.driving.figures import interval_plot
 from ssad.experiments.driving.player import MODELS, outcome_class, replay_data
 from ssad.metrics import METRICS
 from ssad.report.artefacts import pictures
+from ssad.report.figures import Interval, interval_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.tables import Cell, Table
@@ -56,7 +56,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
         natural=tables_by_name.get("natural"),
         full=tables_by_name["metrics"],
         normalised=tables_by_name["normalised"],
-        plot=interval_plot(run),
+        plot=interval_plot(_collision_rates(run), label="collision rate with 95 % intervals"),
         matrix=_matrix(run),
         failures=[record for record in run.records if record.status != "ok"],
         witness=_witness(run),
@@ -105,6 +105,26 @@ def _tile(run: DrivingRun, system: str) -> dict[str, Any]:
         "parts": parts,
         "failed": sum(record.system == system and record.status != "ok" for record in run.records),
     }
+
+
+def _collision_rates(run: DrivingRun) -> list[tuple[str, list[Interval]]]:
+    """Return the collision rate of every system in every group and average."""
+
+    def interval(number: int, system: str, group: str) -> Interval:
+        cell = Cell.of(run.numbers[system, group]["CR"])
+        return Interval(number, cell, f"{system}: {cell.text}, {cell.tip}")
+
+    return [
+        (
+            heading,
+            [
+                interval(number, system, group)
+                for number, system in enumerate(run.systems)
+                if (system, group) in run.numbers
+            ],
+        )
+        for group, heading in run.headings.items()
+    ]
 
 
 def _matrix(run: DrivingRun) -> list[dict[str, Any]]:

@@ -8,13 +8,13 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from html import escape
 from itertools import product
 from pathlib import Path
 
 from ssad.core import safeio
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.metrics.rank import family_correlation
+from ssad.report.figures import Change, change_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.records import Line, case_of, field, metric_of
@@ -54,9 +54,7 @@ CONDITION = {
     "Perturbation": field("perturbation"),
     "Severity": lambda line: str(line["severity"] or ""),
 }
-ROOM = (110.0, 13.0)  # pixels of a name in the figure
 CAUSES = ("hidden", "missed", "misplaced", "late", "known")
-SIZE, MARGIN = 360, 46
 COLOURS = {
     "fault": "var(--s1)",
     "shift": "var(--s0)",
@@ -235,90 +233,21 @@ def sign_table(run: Run) -> Table:
 
 def scatter(run: Run) -> str:
     """Fall of AP against rise of CR, a point a perturbation, with intervals; as SVG text, "" without perturbations."""
-    points = [
-        (condition, change(run, condition, "AP"), change(run, condition, "collision"))
-        for condition in conditions(run)
-        if condition[2]
-    ]
-    points = [
-        (condition, ap_change, cr_change)
-        for condition, ap_change, cr_change in points
-        if not math.isnan(ap_change.mean) and not math.isnan(cr_change.mean)
-    ]
-    if not points:
-        return ""
     families = {line["perturbation"]: str(line.get("family", "")) for line in run.lines}
-    left, right = _ends([-value for _, one, _ in points for value in (one.mean, one.low, one.high)])
-    bottom, top = _ends([value for *_, one in points for value in (one.mean, one.low, one.high)])
-
-    def x(value: float) -> float:
-        return MARGIN + SIZE * (min(max(value, left), right) - left) / (right - left)
-
-    def y(value: float) -> float:
-        return 10 + SIZE * (top - min(max(value, bottom), top)) / (top - bottom)
-
-    elements = []
-    for tick in _ticks(left, right):
-        emphasis = ' style="stroke-width:2"' if tick == 0.0 else ""
-        elements.append(
-            f'<line x1="{x(tick):.1f}" x2="{x(tick):.1f}" y1="10" y2="{SIZE + 10}" class="grid"{emphasis}/>'
-        )
-        elements.append(f'<text x="{x(tick):.1f}" y="{SIZE + 26}" text-anchor="middle">{tick:g}</text>')
-    for tick in _ticks(bottom, top):
-        emphasis = ' style="stroke-width:2"' if tick == 0.0 else ""
-        line = (
-            f'<line x1="{MARGIN}" x2="{MARGIN + SIZE}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" class="grid"{emphasis}/>'
-        )
-        elements.append(f'{line}<text x="{MARGIN - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>')
-    label_positions: list[tuple[float, float]] = []
-    # points far from equal damage to both parts are labelled first; others are left without a label where it is crowded
-    for (system, name, severity), fall, rise in sorted(points, key=lambda one: -abs(one[2].mean + one[1].mean)):
-        colour, point_x, point_y = COLOURS.get(families.get(name, ""), "var(--s3)"), x(-fall.mean), y(rise.mean)
-        for one, line_end in (
-            ((x(-fall.high), point_y), (x(-fall.low), point_y)),
-            ((point_x, y(rise.low)), (point_x, y(rise.high))),
-        ):
-            if not any(math.isnan(coordinate) for coordinate in (*one, *line_end)):
-                style = 'stroke-dasharray="2 3"' if "range" in (fall.method, rise.method) else ""
-                elements.append(
-                    f'<line x1="{one[0]:.1f}" y1="{one[1]:.1f}" x2="{line_end[0]:.1f}" '
-                    f'y2="{line_end[1]:.1f}" stroke="{colour}" '
-                    f'opacity=".5" {style}/>'
-                )
-        tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
-        elements.append(
-            f'<circle cx="{point_x:.1f}" cy="{point_y:.1f}" r="4" fill="{colour}"><title>{escape(tip)}</title></circle>'
-        )
-        if all(
-            abs(point_x - label_x) > ROOM[0] or abs(point_y - label_y) > ROOM[1] for label_x, label_y in label_positions
-        ):
-            label_positions.append((point_x, point_y))
-            elements.append(f'<text x="{point_x + 7:.1f}" y="{point_y - 6:.1f}">{escape(f"{name} {severity}")}</text>')
-    for legend_row, kind in enumerate(dict.fromkeys(families.get(condition[1], "") for condition, _, _ in points)):
-        legend_y, colour = 22 + 16 * legend_row, COLOURS.get(kind, "var(--s3)")
-        elements.append(f'<circle cx="{MARGIN + SIZE + 64}" cy="{legend_y}" r="5" fill="{colour}"/>')
-        elements.append(f'<text x="{MARGIN + SIZE + 74}" y="{legend_y + 4}">{escape(kind)}</text>')
-    elements.append(f'<text x="{MARGIN + SIZE / 2}" y="{SIZE + 44}" text-anchor="middle">AP lost</text>')
-    elements.append(
-        f'<text x="12" y="{SIZE / 2}" transform="rotate(-90 12 {SIZE / 2})" text-anchor="middle">CR gained</text>'
+    points = []
+    for system, name, severity in (condition for condition in conditions(run) if condition[2]):
+        fall, rise = (change(run, (system, name, severity), metric) for metric in ("AP", "collision"))
+        if not math.isnan(fall.mean) and not math.isnan(rise.mean):
+            tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
+            lost = replace(fall, mean=-fall.mean, low=-fall.high, high=-fall.low)
+            points.append(Change(lost, rise, f"{name} {severity}", families.get(name, ""), tip))
+    return change_plot(
+        points,
+        COLOURS,
+        label="AP lost against collision rate gained, a point a perturbation",
+        x_title="AP lost",
+        y_title="CR gained",
     )
-    label = "AP lost against collision rate gained, a point a perturbation"
-    size = f"{SIZE + MARGIN + 140} {SIZE + 52}"
-    return f'<svg viewBox="0 0 {size}" role="img" aria-label="{label}">{"".join(elements)}</svg>'
-
-
-def _ends(values: Sequence[float]) -> tuple[float, float]:
-    """Return the ends of an axis in tenths, with 0 and some room; intervals may be missing."""
-    finite_values = [value for value in values if not math.isnan(value)]
-    # Changes of shares lie in [-1, 1].
-    low, high = max(min(*finite_values, 0.0) - 0.05, -1.0), min(max(*finite_values, 0.1) + 0.05, 1.0)
-    return math.floor(10.0 * low) / 10.0, math.ceil(10.0 * high) / 10.0
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Return the numbers along an axis, one of which is 0."""
-    step = 0.1 if high - low < 0.75 else 0.25
-    return [round(index * step, 2) for index in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def sheets(run: Run) -> list[dict[str, str]]:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.experiments.perception.physical.heatmap import HeatMap, heat_maps
 from ssad.experiments.perception.physical.page import (
     PhysicalRun,
     comparison_table,
@@ -22,6 +21,7 @@ from ssad.experiments.perception.physical.page import (
     transfer_table,
 )
 from ssad.experiments.runs import write_report
+from ssad.report.figures import HeatMap, heat_maps
 from ssad.report.load import load_run
 from ssad.report.paper import PHYSICAL
 

@@ -39,7 +39,7 @@ from ssad.experiments.perception.digital.tables import (
 from ssad.experiments.perception.shifts.page import CLASSES, interval_note, replicates_of
 from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit
 from ssad.report.artefacts import pictures
-from ssad.report.curves import Panel, Point, panels
+from ssad.report.figures import Panel, Point, panels
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import DETECTORS, DIGITAL_STEPS

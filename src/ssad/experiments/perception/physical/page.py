@@ -10,9 +10,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from ssad.experiments.perception.physical.heatmap import HeatMap, heat_maps
 from ssad.metrics import replicate_difference
 from ssad.report.artefacts import pictures
+from ssad.report.figures import HeatMap, heat_maps
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import PHYSICAL as PUBLISHED

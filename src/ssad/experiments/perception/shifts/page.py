@@ -16,7 +16,7 @@ from ssad.metrics import replicate_estimate
 from ssad.metrics.intervals import MIN_CLUSTERS
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
 from ssad.report.artefacts import pictures
-from ssad.report.curves import Panel, Point, panels
+from ssad.report.figures import Panel, Point, panels
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import DETECTORS
