@@ -17,7 +17,7 @@ def series_colour(number: int) -> str:
     return f"var(--s{number % SERIES})"
 
 
-def element(name: str, content: str = "", **attributes: object) -> str:
+def element(name: str, content: str = "", /, **attributes: object) -> str:
     """Return an SVG element.
 
     Args:

@@ -1,0 +1,55 @@
+"""Figures are well-formed SVG with escaped names; crowded points keep their dots and lose their names."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+
+from ssad.report.figures import Change, Interval, Panel, Point, change_plot, element, interval_plot, panels
+from ssad.report.tables import Cell
+
+RANGE = Cell(0.5, 0.25, 0.75, method="range")
+
+
+def parsed(text: str) -> ET.Element:
+    return ET.fromstring(text)
+
+
+def test_an_element_has_its_attributes_in_order_and_leaves_out_none() -> None:
+    made = element("line", x1=1.25, y1=2, stroke_width="3", class_="grid", style=None)
+    assert made == '<line x1="1.2" y1="2" stroke-width="3" class="grid"/>'
+    assert element("text", "a") == "<text>a</text>"
+
+
+def test_panels_share_one_scale_and_leave_out_what_is_not_measured() -> None:
+    points = [Point(0.0, Cell(40.0, 35.0, 45.0), "a"), Point(0.5, Cell(math.nan), "b"), Point(1.0, Cell(12.0), "c")]
+    figure = parsed(panels([Panel("x < y", [(0.0, "0")], [points])] * 2, label="a & b", columns=1))
+    assert figure.attrib["aria-label"] == "a & b"
+    assert [text.text for text in figure.iter("text") if text.attrib.get("class") == "name"] == ["x < y"] * 2
+    assert {text.text for text in figure.iter("text")} >= {"0", "25", "50"}
+    assert len(list(figure.iter("circle"))) == 4
+
+
+def test_intervals_are_bars_and_ranges_are_dashes() -> None:
+    groups = [("g", [Interval(0, Cell(0.5, 0.25, 0.75, method="beta"), "bar"), Interval(1, RANGE, "dash")]), ("h", [])]
+    figure = parsed(interval_plot(groups, label="l"))
+    bars = [line for line in figure.iter("line") if line.attrib.get("class") != "grid"]
+    assert [bar.attrib.get("stroke-dasharray") for bar in bars] == [None, "3 3"]
+    assert [bar.attrib["stroke"] for bar in bars] == ["var(--s0)", "var(--s1)"]
+    assert (bars[0].attrib["x1"], bars[0].attrib["x2"]) == ("59.00%", "83.00%")
+    assert "h" not in [text.text for text in figure.iter("text")]
+
+
+def test_crowded_points_have_no_names_but_tips() -> None:
+    changes = [
+        Change(Cell(0.1), RANGE, "near", "shift", "near: tip"),
+        Change(Cell(0.1), Cell(0.9), "far", "shift", "far: tip"),
+        Change(Cell(0.1), Cell(0.51), "hidden", "<other>", "hidden: tip"),
+    ]
+    figure = parsed(change_plot(changes, {"shift": "blue"}, label="l", x_title="x", y_title="y"))
+    texts = [text.text for text in figure.iter("text")]
+    assert "far" in texts
+    assert ("near" in texts) + ("hidden" in texts) == 1
+    assert "<other>" in texts, "the legend has every group"
+    assert {title.text for title in figure.iter("title")} == {"near: tip", "far: tip", "hidden: tip"}
+    assert change_plot([], {}, label="l", x_title="x", y_title="y") == ""
