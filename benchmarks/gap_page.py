@@ -37,7 +37,7 @@ from ssad.experiments.gap.page import (
     sign_table,
     values,
 )
-from ssad.experiments.gap.perceiving_loop import PerceivingSystem
+from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.report.load import Run, load_run
 from ssad.report.tables import Cell, Row, Table, to_markdown

@@ -12,7 +12,7 @@ import pytest
 from helpers.run_folder import write_run
 
 from ssad.experiments.gap.page import scatter, sign_table
-from ssad.experiments.gap.perceiving_loop import PerceivingSystem
+from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.report.load import load_run
 
 ROOT = Path(__file__).parents[2]

@@ -30,7 +30,8 @@ from ssad.experiments.gap.component_metrics import (
     sign_metrics,
 )
 from ssad.experiments.gap.drive_sheet import Seen, drive_film, drive_sheet
-from ssad.experiments.gap.perceiving_loop import PerceivingSystem, drive_perceiving, drive_repaired
+from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired
+from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.experiments.gap.verdict import verdict
 from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
 from ssad.report.load import Run
