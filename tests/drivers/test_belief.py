@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ssad.core.driving import Belief, Believer, Planner
+from ssad.core.driving import Belief, BeliefSimulator, Believer
 from ssad.core.errors import ConfigError
 from ssad.core.traces import trace_hash
 from ssad.core.types import ENDS, AgentKind, Controller, EpisodeAgent, Pose, SignalState
@@ -464,7 +464,7 @@ def test_a_believer_drives_egos_alone_and_is_named_when_it_errs() -> None:
         controller = Controller.EXTERNAL
 
     scene = episode(alone(), standing(60.0))
-    assert isinstance(World([scene], GRAPHS), Planner)
+    assert isinstance(World([scene], GRAPHS), BeliefSimulator)
     with pytest.raises(ConfigError, match=r"system wrong: belief: speed has shape \(3,\)"):
         rollout(World([scene], GRAPHS), Wrong())
     with pytest.raises(ConfigError, match="outside has a belief, so its controller must be AUTOPILOT"):

@@ -316,7 +316,7 @@ class Driver(Protocol):
 class Believer(Protocol):
     """A driver of egos whose controller is AUTOPILOT: its belief is the input of the Autopilot's planner.
 
-    It works in simulators that are a `Planner`.
+    It works in every `BeliefSimulator`.
     """
 
     def believe(self, view: Observation) -> Belief:
@@ -332,8 +332,8 @@ class Believer(Protocol):
 
 
 @runtime_checkable
-class Planner(Protocol):
-    """A simulator whose Autopilot plans over a belief."""
+class BeliefSimulator(Protocol):
+    """Simulator whose Autopilot plans over a belief."""
 
     def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
         """Set the belief of egos; it holds until the next call, or until the scene starts again.

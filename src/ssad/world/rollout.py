@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.driving import (
+    BeliefSimulator,
     Believer,
     Choice,
     CommandedSimulator,
@@ -16,7 +17,6 @@ from ssad.core.driving import (
     LoopChanges,
     NoteKeeper,
     Observation,
-    Planner,
     Policies,
     ReadingChange,
     Scenes,
@@ -223,7 +223,7 @@ class Loop:
     def _believe(self, driver: Driver, state: WorldState, egos: I32) -> None:
         """Pass the driver's belief to the planner; ended scenes keep their previous one."""
         assert isinstance(driver, Believer)
-        assert isinstance(self.simulator, Planner)
+        assert isinstance(self.simulator, BeliefSimulator)
         ended = self.simulator.ended() != End.RUNNING
         readings = self._readings(driver, state, egos)
         belief = driver.believe(self._observe(state, egos, ended, readings))
@@ -331,7 +331,7 @@ def _check_believer(simulator: Simulator, who: int | Selector, driver: Driver) -
         )
     if not isinstance(who, int) or who != 0:
         raise ConfigError(f"driver {driver.name} plans over a belief: it can drive egos alone, agent 0")
-    if not isinstance(simulator, Planner):
+    if not isinstance(simulator, BeliefSimulator):
         raise ConfigError(f"driver {driver.name} plans over a belief, which this simulator takes from nobody")
 
 

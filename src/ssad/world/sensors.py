@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.core.driving import Belief, Planner, Sensor
+from ssad.core.driving import Belief, BeliefSimulator, Sensor
 from ssad.core.errors import ConfigError
 from ssad.core.types import F32, I32
 from ssad.world.kernels.look import CHANNELS, OBSERVATION, look, look_as_adversary, look_from_above
@@ -75,8 +75,8 @@ def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND
 
 
 def truth(simulator: Any, agents: I32) -> Belief:
-    """Return the truth as a belief, as background traffic perceives it, for egos [N, 2]; see `Planner.truth`."""
-    if not isinstance(simulator, Planner):
+    """Return the truth as a belief, as background traffic perceives it, for egos [N, 2]; see `BeliefSimulator.truth`."""
+    if not isinstance(simulator, BeliefSimulator):
         raise ConfigError("this simulator's Autopilot plans over no belief: it cannot tell the truth as one")
     if agents[:, 1].any():
         raise ConfigError("the sensor 'truth' is for egos, who plan over a belief; other agents have none")
