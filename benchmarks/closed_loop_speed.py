@@ -98,7 +98,7 @@ def measured(name: str, *, device: str, seconds: float, warm: int, width: int, s
     watch = Stopwatch(torch.cuda.synchronize if cuda else lambda: None)
     watch.around("views", onboard, "view")
     watch.around("rendering", onboard, "render")
-    watch.around("pictures to the detector", eyes, "look")
+    watch.around("pictures to the detector", eyes, "perceive")
     watch.around("decoding", eyes.detector, "predict")
     watch.around("detector", eyes.detector, "_maps" if hasattr(eyes.detector, "_maps") else "dense")
     watch.around("lifting", driver, "_sightings")

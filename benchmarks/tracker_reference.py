@@ -23,7 +23,7 @@ import numpy as np
 
 from ssad.core.types import F64, AgentKind
 from ssad.drivers.perceiving.objects import I64, Objects
-from ssad.drivers.perceiving.tracker import Tracker, Tracking
+from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
 from ssad.metrics.tracking import TrackedFrame, TrackScores, track_scores
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -136,7 +136,7 @@ def settings(density: float) -> Tracking:
 
 def ours(frames: Frames, density: float = GROUND) -> Iterator[tuple[F64, I64]]:
     """Boxes and numbers of the tracks that were hit in each picture, by SSAD's tracker."""
-    tracker = Tracker(settings(density))
+    tracker = KalmanTracker(settings(density))
     for k, (_, _, box, score) in enumerate(frames):
         middle, side = 0.5 * (box[:, :2] + box[:, 2:]), box[:, 2:] - box[:, :2]
         n = len(box)

@@ -9,7 +9,7 @@ import pytest
 from helpers.optional import import_or_skip
 
 from ssad.drivers.perceiving.objects import no_objects
-from ssad.drivers.perceiving.tracker import Tracker
+from ssad.drivers.perceiving.tracker import KalmanTracker
 from ssad.metrics.tracking import TrackedFrame, similarity_of, track_scores
 
 
@@ -62,7 +62,7 @@ def random_frames(seed: int) -> list[TrackedFrame]:
 
 def tracker_frames() -> list[TrackedFrame]:
     """Our tracker on cars that cross, with misses and false finds."""
-    draws, tracker, frames = np.random.default_rng(5), Tracker(None, 1), []
+    draws, tracker, frames = np.random.default_rng(5), KalmanTracker(None, 1), []
     start, speed = draws.uniform(-20, 20, (8, 2)), draws.uniform(-6, 6, (8, 2))
     for step in range(60):
         time = 0.2 * step
@@ -83,7 +83,7 @@ def tracker_frames() -> list[TrackedFrame]:
         )
         tracker.update(np.array([0]), np.array([time]), objects)
         tracks = tracker.confirmed(np.array([0]), np.array([time]))
-        frames.append(TrackedFrame(np.arange(8), tracks.ident, similarity_of(place, tracks.mean[:, :2], 4.0)))
+        frames.append(TrackedFrame(np.arange(8), tracks.ident, similarity_of(place, tracks.place, 4.0)))
     return frames
 
 

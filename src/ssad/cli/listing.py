@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final
 
 
@@ -28,6 +29,12 @@ def _system_list() -> dict[str, str]:
 
     rows = names("system", SYSTEMS) | {"ppo:FILE": "PPO with other weights, FILE.safetensors; also sac and td3"}
     return rows | {"module:object": "a driving system of your own (README.md)"}
+
+
+def _part_list(kind: str) -> dict[str, str]:
+    from ssad.drivers.perceiving.parts import part_names
+
+    return part_names(kind) | {"module:object": f"a {kind} of your own (docs/how-to/perceiving-parts.md)"}
 
 
 def _kind_list() -> dict[str, str]:
@@ -129,6 +136,9 @@ LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
     "scenarios": _scenario_list,
     "generators": _generator_list,
     "systems": _system_list,
+    "perceivers": partial(_part_list, "perceiver"),
+    "trackers": partial(_part_list, "tracker"),
+    "planners": partial(_part_list, "planner"),
     "detectors": _detector_list,
     "recipes": _recipe_list,
     "perturbations": _perturbation_list,

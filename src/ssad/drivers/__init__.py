@@ -26,6 +26,7 @@ SYSTEMS: dict[str, str] = {
     "careful-reg157": "ssad.drivers.careful.driver:CarefulReg157",
     "careful-rss": "ssad.drivers.careful.driver:CarefulRSS",
     "line-of-sight": "ssad.drivers.belief:LineOfSight",
+    "perceiving": "ssad.drivers.perceiving.systems:Composed",
     "perceiving-perfect": "ssad.drivers.perceiving.systems:Perfect",
     "perceiving-fcos3d": "ssad.drivers.perceiving.systems:Fcos3d",
     "perceiving-pgd-det": "ssad.drivers.perceiving.systems:PgdDet",

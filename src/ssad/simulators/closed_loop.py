@@ -16,6 +16,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import quiet_warp
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
+from ssad.core.registry import Reference
 from ssad.core.source import source_version
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 
@@ -96,6 +97,9 @@ def system_version(name: str) -> str:
         from ssad.detectors import SHIPPED
 
         return f"{source_hash} {safeio.read_json(SHIPPED / f'{weights_name}.json')['hash'][:12]}"
+    version_of_parts = getattr(system_type, "version_of_parts", None)
+    if callable(version_of_parts):  # of a perceiving system whose parts are named by its arguments
+        return f"{source_hash} {version_of_parts(**Reference.of(name).options)}".strip()
     return f"{source_hash} {weights_version(name)[:12]}".strip()
 
 

@@ -75,7 +75,7 @@ def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND
 
 
 def truth(simulator: Any, agents: I32) -> Belief:
-    """Return the truth as a belief, as background traffic perceives it, for egos [N, 2]; see `BeliefSimulator.truth`."""
+    """Return the truth as a belief for egos [N, 2], as background traffic perceives it; `BeliefSimulator.truth`."""
     if not isinstance(simulator, BeliefSimulator):
         raise ConfigError("this simulator's Autopilot plans over no belief: it cannot tell the truth as one")
     if agents[:, 1].any():

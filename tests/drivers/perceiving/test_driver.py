@@ -219,7 +219,7 @@ def test_settings_out_of_range_are_one_line() -> None:
         PerfectEyes(missed=1.0)
     eyes = CameraEyes(OneCar(), {"front": CAMERA})
     with pytest.raises(ConfigError, match="expected"):
-        eyes.look(steady_view(0.0, front=np.ones((1, 3, 5, 5), np.uint8)), np.array([0]))
+        eyes.perceive(steady_view(0.0, front=np.ones((1, 3, 5, 5), np.uint8)), np.array([0]))
 
 
 def test_results_depend_on_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -235,8 +235,8 @@ def test_results_depend_on_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path
 @pytest.mark.parametrize("system", [Fcos3d, PgdDet, Yolov5n])
 def test_what_the_tracker_may_use_is_what_the_detector_is_asked_for(system: type[OneCamera]) -> None:
     for made, low in ((system(), tracking_of(system.weights).low), (system(tracking=Tracking(high=0.5, low=0.2)), 0.2)):
-        assert isinstance(made.eyes, CameraEyes)
-        assert made.eyes.threshold == made.tracking.low == low
+        assert isinstance(made.perceiver, CameraEyes)
+        assert made.perceiver.threshold == made.tracking.low == low
     scores = [tracking_of(system.weights).high for system in (PgdDet, Fcos3d, Yolov5n)]
     assert scores == sorted(set(scores))
 

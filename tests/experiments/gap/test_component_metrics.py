@@ -10,7 +10,8 @@ from helpers.metric_traces import make_trace, straight
 
 from ssad.core.types import AgentKind, Contact, EpisodeTrace
 from ssad.drivers.perceiving.objects import Objects, no_objects
-from ssad.drivers.perceiving.tracker import Tracker, Tracking, Tracks
+from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
+from ssad.drivers.perceiving.tracks import Tracks
 from ssad.experiments.gap.component_metrics import (
     Perceived,
     cause_of_collision,
@@ -44,9 +45,9 @@ def objects(*places: tuple[float, float], score: float = 0.9) -> Objects:
 
 
 def tracks(*places: tuple[float, float]) -> Tracks:
-    tracker = Tracker(Tracking(confirm=1))
+    tracker = KalmanTracker(Tracking(confirm=1))
     tracker.update(np.array([0]), np.zeros(1), objects(*places))
-    return tracker.tracks
+    return tracker.confirmed(np.array([0]), np.zeros(1))
 
 
 def perceived(trace: EpisodeTrace, found: Any, known: Any) -> Perceived:

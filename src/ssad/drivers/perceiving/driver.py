@@ -1,31 +1,47 @@
-"""The driving system that knows of traffic only what its cameras show.
+"""The driving system that knows of traffic only what its sensors show.
 
-    cameras -> detector -> world -> tracker -> belief -> the Autopilot's planner and controller
+    sensors -> perceiver -> world -> tracker -> belief -> planner and controller
 
 Route, lane map and its own pose are given, signals are those of the map, and so are stop signs unless it reads them
-itself; other road users are told by detected objects and nothing else. All else is the Autopilot, so that what it
-drives worse is what it sees worse.
+itself; other road users are told by detected objects and nothing else. All else is by default the Autopilot, so that
+what it drives worse is what it sees worse. Perceiver, tracker and planner are protocols
+(`ssad.drivers.perceiving.parts`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssad.core.detections import Detections
 from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.rotations import upright_poses
-from ssad.core.types import F32, F64, I32, U8, Controller, Episode
-from ssad.drivers.perceiving.eyes import Eyes
+from ssad.core.types import F32, F64, I32, U8, Bool, Controller, Episode
+from ssad.drivers.perceiving.ego_boxes import EgoBoxes, boxes_in_world, check_boxes, sign_places
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
 from ssad.drivers.perceiving.objects import I64, Objects, no_objects
+from ssad.drivers.perceiving.parts import (
+    Perceiver,
+    Planner,
+    Tracker,
+    cameras_of,
+    restored,
+    snapshot_of,
+    without_truth,
+)
+from ssad.drivers.perceiving.planner import AutopilotPlanner
 from ssad.drivers.perceiving.repair import Repair
-from ssad.drivers.perceiving.signs import SignMemory, SignReading, read_signs
-from ssad.drivers.perceiving.tracker import Tracker, Tracking, Tracks, believed
+from ssad.drivers.perceiving.signs import SignMemory, SignReading, read_signs, sign_labels
+from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
+from ssad.drivers.perceiving.tracks import Tracks, believed, check_tracks
+
+if TYPE_CHECKING:
+    from ssad.rendering.lidar import Lidar
 
 LATE = 1e-4  # s, less than a step: times are 32-bit numbers
 
@@ -37,11 +53,11 @@ class Sighting:
     Attributes:
         scene: Which scene.
         time: s when the pictures were taken.
-        found: What was found in them, in the world; None: no camera had a picture.
-        pictures: What the cameras showed, uint8 [3, H, W] by name, where eyes look at pictures; tensors where pictures
-            stay on a GPU.
+        found: What was found in them, in the world; None: no sensor had a reading.
+        pictures: What the cameras showed, uint8 [3, H, W] by name, where the perceiver reads images; tensors where
+            images stay on a GPU.
         signs: Where the stop signs stand that were read, if the driver reads them: x, y in the world [M, 2], m.
-        eye: From where: x, y [2].
+        pose: Pose of the ego then: x, y, yaw [3].
     """
 
     scene: int
@@ -49,7 +65,7 @@ class Sighting:
     found: Objects | None
     pictures: Mapping[str, U8] = field(default_factory=dict)
     signs: F64 | None = None
-    eye: F64 | None = None
+    pose: F64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +84,17 @@ class Known:
 
 
 class Perceiving:
-    """Autopilot on the belief of its eyes.
+    """Driver that perceives: by default the Autopilot on the belief of a perceiver.
+
+    With the planner of the Autopilot it has the method `believe` of `ssad.core.driving.Believer`; with another one its
+    controller is EXTERNAL, and `act` returns the controls of that planner.
 
     Args:
-        eyes: Source of detections.
+        perceiver: Source of detections.
+        tracker: Tracker of the detected objects; None: the built-in one.
+        planner: Planner over the belief; None: that of the Autopilot.
         lifting: Settings of the projection of detections to the world.
-        tracking: Settings of the tracker.
+        tracking: Settings of the built-in tracker.
         rate: Looks per second; the world has 10 steps per second.
         latency: s from an image to its detections. Tracks are predicted to the present, so latency delays new objects
             but does not misplace known ones.
@@ -82,16 +103,18 @@ class Perceiving:
         signs: Settings of reading stop signs; None: those of the map are known.
 
     Raises:
-        ConfigError: A value is out of its range.
+        ConfigError: A value is out of its range, or there are settings for a tracker that is not built in.
     """
 
     name = "perceiving"
-    controller = Controller.AUTOPILOT
+    believe: Callable[[Observation], Belief]
 
     def __init__(
         self,
-        eyes: Eyes,
+        perceiver: Perceiver,
         *,
+        tracker: Tracker | None = None,
+        planner: Planner | None = None,
         lifting: Lifting | None = None,
         tracking: Tracking | None = None,
         rate: float = 5.0,
@@ -102,59 +125,88 @@ class Perceiving:
     ) -> None:
         if not 0.0 < rate <= 1000.0 or not 0.0 <= latency <= 10.0:
             raise ConfigError(f"perceiving needs a rate above 0 and a latency of 0 to 10 s, not {rate} and {latency}")
-        self.eyes, self.lifting, self.tracking = eyes, lifting or Lifting(), tracking or Tracking()
+        if tracker is not None and tracking is not None:
+            raise ConfigError("perceiving takes a tracker, or settings of the built-in one (tracking), not both")
+        self.perceiver, self.lifting, self.tracking = perceiver, lifting or Lifting(), tracking or Tracking()
+        self.tracker: Tracker = tracker or KalmanTracker(self.tracking, 0)
+        self.planner: Planner = planner or AutopilotPlanner()
+        self.controller: Controller = getattr(self.planner, "controller", Controller.EXTERNAL)
         self.rate, self.latency, self.watch = rate, latency, watch
         self.repair = repair
-        self.sensors: tuple[str, ...] = tuple(dict.fromkeys((*eyes.sensors, *(("truth",) if repair else ()))))
+        self.sensors: tuple[str, ...] = tuple(dict.fromkeys((*perceiver.sensors, *(("truth",) if repair else ()))))
+        self._perceiver_name = str(getattr(perceiver, "name", type(perceiver).__name__))
+        self._views = cameras_of(perceiver)  # those of a perfect detector are no sensors
         self._signs = None if signs is None else SignMemory(signs)
-        self._tracker = Tracker(self.tracking, 0)
         self._looks = np.zeros(0, np.int64)
         self._waiting: list[Sighting] = []
+        if self.controller == Controller.AUTOPILOT:
+            # Only a driver with this method is a Believer, whose belief the world plans over.
+            self.believe = self._believed
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
         """Cameras among its sensors, which the engine renders."""
-        return {name: camera for name, camera in self.eyes.cameras.items() if name in self.sensors}
+        return {name: camera for name, camera in self._views.items() if name in self.sensors}
+
+    @property
+    def lidars(self) -> Mapping[str, Lidar]:
+        """Models of the LiDARs of its perceiver."""
+        return dict(getattr(self.perceiver, "lidars", {}))
+
+    @property
+    def radars(self) -> Mapping[str, Lidar]:
+        """Models of the rays of the radars of its perceiver."""
+        return dict(getattr(self.perceiver, "radars", {}))
 
     @property
     def detector(self) -> Any:
-        """Detector of its eyes, for attacks; None if they have none."""
-        return getattr(self.eyes, "detector", None)
+        """Detector of its perceiver, for attacks; None without one."""
+        return getattr(self.perceiver, "detector", None)
 
     def to(self, device: str) -> None:
-        """Move the computation to another device, if the eyes support it."""
-        move_eyes = getattr(self.eyes, "to", None)
-        if move_eyes is not None:
-            move_eyes(device)
+        """Move the computation to another device, as far as the parts support it."""
+        for part in (self.perceiver, self.tracker, self.planner):
+            move_part = getattr(part, "to", None)
+            if move_part is not None:
+                move_part(device)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Forget the past."""
-        self._tracker = Tracker(self.tracking, len(episodes))
+        self.tracker.reset(episodes)
         self._looks = np.full(len(episodes), -1)
         self._waiting = []
         if self._signs is not None:
             self._signs.reset(len(episodes))
-        self.eyes.reset(episodes)
+        self.perceiver.reset(episodes)
+        self.planner.reset(episodes)
 
     def snapshot(self) -> Any:
         """Return the complete state; `restore` continues from it bit by bit, together with a simulator snapshot."""
         signs = None if self._signs is None else self._signs.snapshot()
-        return self._tracker.snapshot(), self._looks.copy(), list(self._waiting), self.eyes.snapshot(), signs
+        parts = [snapshot_of(part) for part in (self.perceiver, self.tracker, self.planner)]
+        return parts, self._looks.copy(), list(self._waiting), signs
 
     def restore(self, snapshot: Any) -> None:
         """Continue from an earlier snapshot of the same batch."""
-        tracks, look_counts, pending, eye_state, sign_state = snapshot
-        self._tracker.restore(tracks)
+        (perceiver, tracker, planner), look_counts, pending, sign_state = snapshot
+        self.perceiver = restored(self.perceiver, perceiver)
+        self.tracker = restored(self.tracker, tracker)
+        self.planner = restored(self.planner, planner)
         self._looks, self._waiting = look_counts.copy(), list(pending)
-        self.eyes.restore(eye_state)
         if self._signs is not None:
             self._signs.restore(sign_state)
 
     def act(self, view: Observation) -> F32:
-        """Raise RuntimeError: the planner runs inside the world."""
-        raise RuntimeError("the Autopilot runs inside the world")
+        """Return the controls [N, 3] of its planner over what it believes.
 
-    def believe(self, view: Observation) -> Belief:
+        Raises:
+            RuntimeError: The planner is that of the Autopilot, which runs inside the world.
+        """
+        if self.controller == Controller.AUTOPILOT:
+            raise RuntimeError("the Autopilot runs inside the world")
+        return self.planner.plan(without_truth(view, readings=False), self._believed(view))
+
+    def _believed(self, view: Observation) -> Belief:
         """Return the tracked objects around the egos."""
         now = view.time.astype(np.float64)
         look_counts = np.floor((now + LATE) * self.rate).astype(np.int64)
@@ -163,7 +215,8 @@ class Perceiving:
             self._looks[view.scene[due_rows]] = look_counts[due_rows]
             self._waiting += self._sightings(view, due_rows, now)
         self._take_in(dict(zip(view.scene.tolist(), now.tolist(), strict=True)))
-        tracks = self._tracker.confirmed(view.scene, now)
+        tracks = self.tracker.confirmed(view.scene, now)
+        check_tracks(tracks, view.scene, type(self.tracker).__name__)
         if self.watch is not None:
             self.watch(Known(view.scene, now, tracks))
         belief = believed(tracks, view.scene)
@@ -173,10 +226,44 @@ class Perceiving:
 
     def _sightings(self, view: Observation, rows: I64, now: F64) -> list[Sighting]:
         """Return the sightings of some rows at the present time."""
-        detections_by_camera, scenes = self.eyes.look(view, rows), view.scene[rows].astype(np.int64)
+        percepts = self.perceiver.perceive(without_truth(view, readings=True), rows)
+        scenes = view.scene[rows].astype(np.int64)
         ego_poses = upright_poses(view.pose[rows].astype(np.float64))
-        parts, without_image, signs = [no_objects()], np.ones(len(rows), bool), [[np.zeros((0, 2))] for _ in rows]
-        for name, camera in self.eyes.cameras.items():
+        if isinstance(percepts, Mapping):
+            parts, without_reading, signs = self._from_images(percepts, ego_poses, scenes)
+        else:
+            parts, without_reading, signs = self._from_boxes(percepts, ego_poses, scenes)
+        # Neighbouring sensors overlap, so an object can be detected twice.
+        merged_objects = merged(Objects.joined(parts), self.lifting.merge)
+        sightings = []
+        for index, row in enumerate(rows.tolist()):
+            scene_slice = slice(*np.searchsorted(merged_objects.scene, [scenes[index], scenes[index] + 1]))
+            scene_objects = None if without_reading[index] else merged_objects.take(scene_slice)
+            if self.repair is not None:
+                scene_objects = self.repair(view, row, scene_objects or no_objects(), self._views, self.lifting)
+            images = {} if self.watch is None else self._pictures(view, row)
+            sign_positions = None if self._signs is None else np.concatenate(signs[index])
+            sightings.append(
+                Sighting(
+                    int(scenes[index]),
+                    float(now[row]),
+                    scene_objects,
+                    images,
+                    sign_positions,
+                    view.pose[row].astype(np.float64),
+                )
+            )
+            if self.watch is not None:
+                self.watch(sightings[-1])
+        return sightings
+
+    def _from_images(
+        self, detections_by_camera: Mapping[str, Sequence[Detections | None]], ego_poses: F64, scenes: I64
+    ) -> tuple[list[Objects], Bool, list[list[F64]]]:
+        """Return objects, rows [n] without an image, and positions of stop signs by row, of detections in images."""
+        parts, without_image, signs = [no_objects()], np.ones(len(scenes), bool), [[np.zeros((0, 2))] for _ in scenes]
+        self._check_percepts(detections_by_camera, len(scenes))
+        for name, camera in self._views.items():
             image_rows = np.array(
                 [index for index, detections in enumerate(detections_by_camera[name]) if detections is not None],
                 np.int64,
@@ -185,10 +272,9 @@ class Perceiving:
                 [detections for detections in detections_by_camera[name] if detections is not None],
                 ego_poses[image_rows] @ camera.to_ego,
             )
+            classes = self.perceiver.classes
             parts.append(
-                lift(
-                    valid_detections, camera, camera_poses, scenes[image_rows], self.eyes.classes, settings=self.lifting
-                )
+                lift(valid_detections, camera, camera_poses, scenes[image_rows], classes, settings=self.lifting)
             )
             without_image[image_rows] = False
             if self._signs is not None:
@@ -196,26 +282,48 @@ class Perceiving:
                     image_rows.tolist(), valid_detections, camera_poses, strict=True
                 ):
                     signs[index].append(
-                        read_signs(detections, camera, camera_pose, self.eyes.classes, score=self._signs.settings.score)
+                        read_signs(detections, camera, camera_pose, classes, score=self._signs.settings.score)
                     )
-        # Neighbouring cameras overlap, so an object can be detected twice.
-        merged_objects = merged(Objects.joined(parts), self.lifting.merge)
-        sightings = []
-        for index, row in enumerate(rows.tolist()):
-            scene_slice = slice(*np.searchsorted(merged_objects.scene, [scenes[index], scenes[index] + 1]))
-            scene_objects = None if without_image[index] else merged_objects.take(scene_slice)
-            if self.repair is not None:
-                scene_objects = self.repair(view, row, scene_objects or no_objects(), self.eyes.cameras, self.lifting)
-            images = {} if self.watch is None else self._pictures(view, row)
-            sign_positions = None if self._signs is None else np.concatenate(signs[index])
-            sightings.append(
-                Sighting(
-                    int(scenes[index]), float(now[row]), scene_objects, images, sign_positions, ego_poses[index, :2, 3]
+        return parts, without_image, signs
+
+    def _from_boxes(
+        self, boxes_by_row: Sequence[EgoBoxes | None], ego_poses: F64, scenes: I64
+    ) -> tuple[list[Objects], Bool, list[list[F64]]]:
+        """Return objects, rows [n] without a reading, and positions of stop signs by row, of boxes around the egos."""
+        name, classes = self._perceiver_name, self.perceiver.classes
+        if not isinstance(boxes_by_row, Sequence) or len(boxes_by_row) != len(scenes):
+            received = len(boxes_by_row) if isinstance(boxes_by_row, Sequence) else type(boxes_by_row).__name__
+            raise ConfigError(f"perceiver {name}: perceive returned {received}; expected a list of {len(scenes)} rows")
+        read_rows = [row for row, boxes in enumerate(boxes_by_row) if boxes is not None]
+        read_boxes = [boxes for boxes in boxes_by_row if boxes is not None]
+        for boxes in read_boxes:
+            if not isinstance(boxes, EgoBoxes):
+                raise ConfigError(
+                    f"perceiver {name}: perceive returned a row of type {type(boxes).__name__}; expected "
+                    "ssad.drivers.perceiving.ego_boxes.EgoBoxes or None"
                 )
+            check_boxes(boxes, classes, name)
+        objects = boxes_in_world(read_boxes, ego_poses[read_rows], scenes[read_rows], classes, settings=self.lifting)
+        without_reading = np.ones(len(scenes), bool)
+        without_reading[read_rows] = False
+        signs = [[np.zeros((0, 2))] for _ in scenes]
+        if self._signs is not None:
+            labels, score = sign_labels(classes), self._signs.settings.score
+            for row, boxes in zip(read_rows, read_boxes, strict=True):
+                signs[row].append(sign_places(boxes, ego_poses[row], labels, score=score))
+        return [objects], without_reading, signs
+
+    def _check_percepts(self, detections_by_camera: Mapping[str, Sequence[Detections | None]], count: int) -> None:
+        """Raise ConfigError unless there are detections of each camera and row."""
+        name = self._perceiver_name
+        if set(detections_by_camera) != set(self._views):
+            raise ConfigError(
+                f"perceiver {name}: perceive returned detections of {', '.join(detections_by_camera) or 'no camera'}; "
+                f"expected those of its cameras {', '.join(self._views) or '(none)'}"
             )
-            if self.watch is not None:
-                self.watch(sightings[-1])
-        return sightings
+        for camera, detections in detections_by_camera.items():
+            if len(detections) != count:
+                raise ConfigError(f"perceiver {name}: camera {camera} has {len(detections)} rows; expected {count}")
 
     def _pictures(self, view: Observation, row: int) -> dict[str, U8]:
         """Return the camera images of a row."""
@@ -240,10 +348,11 @@ class Perceiving:
             if batch:
                 scenes = np.array([arrival.scene for arrival in batch])
                 times = np.array([arrival.time for arrival in batch])
+                poses = np.array([arrival.pose for arrival in batch])
                 objects = Objects.joined(
                     [no_objects(), *(arrival.found for arrival in batch if arrival.found is not None)]
                 )
-                self._tracker.update(scenes, times, objects)
+                self.tracker.update(scenes, times, objects, poses)
                 for processed in batch:
-                    if self._signs is not None and processed.signs is not None and processed.eye is not None:
-                        self._signs.update(processed.scene, processed.time, processed.eye, processed.signs)
+                    if self._signs is not None and processed.signs is not None and processed.pose is not None:
+                        self._signs.update(processed.scene, processed.time, processed.pose[:2], processed.signs)

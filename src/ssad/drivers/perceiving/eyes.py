@@ -1,4 +1,4 @@
-"""Eyes of perceiving drivers: a detector on camera images, or a perfect detector that knows the truth.
+"""Built-in perceivers: a detector on camera images, and a perfect detector that knows the truth.
 
 Both report `Detections` in the frame of a camera, so the rest of the pipeline is the same; any difference in driving
 is caused by the detector.
@@ -6,9 +6,9 @@ is caused by the detector.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,14 +18,15 @@ from ssad.core.detections import Detections, Solids
 from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES, MMDET3D_CLASSES
+from ssad.core.nuscenes_names import CAMERAS, MMDET3D_ATTRIBUTES, MMDET3D_CLASSES
 from ssad.core.protocols import Detector
-from ssad.core.registry import resolve
 from ssad.core.rotations import Floats, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Episode
+from ssad.detectors import make_detector
 from ssad.drivers.belief import in_sight
 from ssad.drivers.perceiving.objects import I64, SIZES
+from ssad.drivers.perceiving.tracker import tracking_of
 from ssad.rendering.camera.rig import rig_camera
 
 FRONT = ("CAM_FRONT",)
@@ -43,53 +44,63 @@ MEMORY = 100  # approximate bytes of GPU memory that a detector needs per image 
 _SLOTS = 64  # more than the agents of any scene: with fixed draws per look none depends on the number of agents
 
 
-class Eyes(Protocol):
-    """Protocol of sources of detections.
-
-    Attributes:
-        sensors: Names of the sensors that it reads.
-        cameras: Its cameras, by the names of their sensors.
-    """
-
-    sensors: tuple[str, ...]
-    cameras: Mapping[str, Camera]
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the labels of its detections."""
-
-    def reset(self, episodes: Sequence[Episode]) -> None:
-        """Forget the past.
-
-        Args:
-            episodes: The B episodes that are driven next.
-        """
-
-    def snapshot(self) -> Any:
-        """Return the state that changes from look to look."""
-
-    def restore(self, snapshot: Any) -> None:
-        """Continue from an earlier snapshot.
-
-        Args:
-            snapshot: What `snapshot` returned.
-        """
-
-    def look(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
-        """Detect objects through all cameras.
-
-        Args:
-            view: Observation of the egos.
-            rows: [n] indices of the rows to process.
-
-        Returns:
-            For each camera the detections of each row, [n]; None where there was no image.
-        """
-
-
 def front(width: int = 640, channels: Sequence[str] = FRONT) -> dict[str, Camera]:
     """Return cameras of the nuScenes rig with images of a width in pixels, by channel."""
     return {channel: rig_camera(channel, width) for channel in channels}
+
+
+def camera_perceiver(
+    detector: str = "fcos3d-light",
+    *,
+    cameras: Sequence[str] = FRONT,
+    width: int = 640,
+    weights: str | None = None,
+    threshold: float | None = None,
+    input_width: int | None = None,
+) -> CameraEyes:
+    """Return the built-in perceiver of camera images.
+
+    Args:
+        detector: Name of the detector.
+        cameras: Channels of the nuScenes rig.
+        width: Width of their images, pixels.
+        weights: File of weights; None: the shipped ones.
+        threshold: Minimum score of detections; None: the one that suits the detector.
+        input_width: Width to which a 3D detector resizes images, pixels; None: its own.
+
+    Raises:
+        UnknownNameError: There is no such detector.
+        ConfigError: There is no such camera.
+    """
+    options = {"weights": weights} | ({} if input_width is None else {"input_width": input_width})
+    least = tracking_of(detector).low if threshold is None else threshold
+    eyes = CameraEyes(detector, _rig(cameras, width), threshold=least, **options)
+    _ = eyes.detector  # so that a wrong name fails here
+    return eyes
+
+
+def perfect_perceiver(
+    *,
+    cameras: Sequence[str] = FRONT,
+    width: int = 640,
+    reach: float = 60.0,
+    missed: float = 0.0,
+    burst: float = 3.0,
+    noise: float = 0.0,
+    phantoms: float = 0.0,
+) -> PerfectEyes:
+    """Return the built-in perceiver that knows the truth; arguments as of `camera_perceiver` and `PerfectEyes`."""
+    return PerfectEyes(_rig(cameras, width), reach=reach, missed=missed, burst=burst, noise=noise, phantoms=phantoms)
+
+
+def _rig(channels: Sequence[str], width: int) -> dict[str, Camera]:
+    unknown = [channel for channel in channels if channel not in CAMERAS]
+    if unknown or not channels or isinstance(channels, str) or not 64 <= width <= 1600:
+        raise ConfigError(
+            f"cameras must be a list of some of {', '.join(CAMERAS)}, and width 64 to 1600 pixels, not {channels} and "
+            f"{width}"
+        )
+    return front(width, channels)
 
 
 class CameraEyes:
@@ -123,14 +134,16 @@ class CameraEyes:
         """The detector, on its device."""
         if self._made is None:
             if isinstance(self._given, str):
-                # by name: drivers do not import detectors
-                factory: Callable[..., Detector] = resolve(
-                    "function", {"make_detector": "ssad.detectors:make_detector"}, "make_detector"
-                )
-                self._made = factory(self._given, device=self.device, **self._options)
+                made: Detector = make_detector(self._given, device=self.device, **self._options)
+                self._made = made
             else:
                 self._made = self._given
         return self._made
+
+    @property
+    def name(self) -> str:
+        """Name of the detector."""
+        return self._given if isinstance(self._given, str) else self._given.name
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -151,7 +164,7 @@ class CameraEyes:
     def restore(self, snapshot: Any) -> None:
         """Do nothing: the detector is stateless."""
 
-    def look(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
+    def perceive(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
         """Detect objects; on a GPU all cameras of one size form one batch, on a CPU each camera its own."""
         detections: dict[str, list[Detections | None]] = {}
         batches: dict[Any, list[tuple[str, I64, torch.Tensor]]] = {}
@@ -264,7 +277,7 @@ class PerfectEyes:
         self._draws = [generator("eyes", episode.key, episode.seed) for episode in episodes]
         self._missing = np.array([draws.random(_SLOTS) < self.missed for draws in self._draws]).reshape(-1, _SLOTS)
 
-    def look(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
+    def perceive(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
         """Return the visible objects as detections, with the configured errors."""
         truth: Belief = view.readings["truth"]
         truth = truth.rows(rows)

@@ -10,6 +10,7 @@ import numpy as np
 from ssad.core.driving import Belief, Observation
 from ssad.core.frames import Camera
 from ssad.core.rotations import upright_pose
+from ssad.core.types import Bool
 from ssad.drivers.belief import in_sight
 from ssad.drivers.perceiving.eyes import PerfectEyes, boxes_of, projected
 from ssad.drivers.perceiving.lift import Lifting, lift
@@ -59,6 +60,8 @@ class Repair:
             )
             scene = view.scene[[row]].astype(np.int64)
             parts.append(lift([projected_agent], camera, pose[None], scene, PerfectEyes.classes, settings=lifting))
+        if not cameras:  # a perceiver of LiDAR or radar: its own boxes are in no image
+            parts.append(_true_object(truth, agent_mask, view.scene[row], lifting))
         perfect = Objects.joined(parts).take(np.arange(min(1, sum(len(part) for part in parts))))
         if not len(perfect):
             return found
@@ -67,3 +70,12 @@ class Repair:
         distances[:, truth.kind[0] == 0] = np.inf
         replaced = (distances[:, agent] < AROUND) & (distances[:, agent] <= distances.min(1, initial=np.inf))
         return Objects.joined([found.take(~replaced), perfect])
+
+
+def _true_object(truth: Belief, mask: Bool, scene: int, lifting: Lifting) -> Objects:
+    """Return the selected object of a belief of one row as it is, with the covariance of detections at 0 m."""
+    centre, size, yaw, kind, velocity = boxes_of(truth, 0, mask)
+    count = len(kind)
+    spread = np.tile(np.diag([lifting.along[0] ** 2, lifting.across[0] ** 2]), (count, 1, 1))
+    scenes, kinds = np.full(count, scene, np.int64), np.array(kind, np.int64)
+    return Objects(scenes, centre[:, :2], spread, yaw, size[:, :2], velocity, kinds, np.ones(count))

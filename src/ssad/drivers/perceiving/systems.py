@@ -1,4 +1,4 @@
-"""Perceiving systems by name; their components can be chosen in Python, or in suites of kind `gap`."""
+"""Perceiving systems by name; their parts can be chosen in Python, in suites of kind `gap`, or by arguments."""
 
 from __future__ import annotations
 
@@ -6,7 +6,15 @@ from typing import Any, ClassVar
 
 from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
-from ssad.drivers.perceiving.tracker import Tracking, tracking_of
+from ssad.drivers.perceiving.parts import (
+    Perceiver,
+    Tracker,
+    make_perceiver,
+    make_planner,
+    make_tracker,
+    part_version,
+)
+from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking, tracking_of
 
 
 class OneCamera(Perceiving):
@@ -50,3 +58,57 @@ class Perfect(Perceiving):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(PerfectEyes(), **settings)
+
+
+class Composed(Perceiving):
+    """System of parts that are named by its arguments.
+
+    In any suite: `perceiving?perceiver=my_package.eyes:Eyes&tracker=my_package.tracks:Nearest@mine`. A part may have
+    a single argument of its own: `perceiver=my_package.eyes:Eyes?reach=40`. A suite of kind `gap` gives parts any
+    arguments, and so does a subclass of `Perceiving`.
+
+    Args:
+        perceiver: Name as for `ssad.drivers.perceiving.parts.make_perceiver`.
+        tracker: Name as for `make_tracker`. The built-in one has the scores that suit a built-in detector.
+        planner: Name as for `make_planner`.
+        rate: Looks per second.
+        latency: s from an image to its detections.
+
+    Raises:
+        UnknownNameError: There is no such part.
+        ConfigError: A part cannot be made, or a value is out of its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        perceiver: str = "camera",
+        tracker: str = "kalman",
+        planner: str = "autopilot",
+        rate: float = 5.0,
+        latency: float = 0.1,
+    ) -> None:
+        eyes = make_perceiver(perceiver)
+        super().__init__(
+            eyes, tracker=_tracker(tracker, eyes), planner=make_planner(planner), rate=rate, latency=latency
+        )
+
+    @staticmethod
+    def version_of_parts(
+        *, perceiver: str = "camera", tracker: str = "kalman", planner: str = "autopilot", **_: object
+    ) -> str:
+        """Return the versions of the parts, for the keys of results; arguments as of the class."""
+        eyes = make_perceiver(perceiver)
+        parts = (
+            ("perceiver", perceiver, eyes),
+            ("tracker", tracker, _tracker(tracker, eyes)),
+            ("planner", planner, make_planner(planner)),
+        )
+        return " ".join(filter(None, (part_version(kind, name, part, {}) for kind, name, part in parts)))
+
+
+def _tracker(name: str, perceiver: Perceiver) -> Tracker:
+    """Return a tracker by name; the built-in one without arguments gets the scores that suit the detector."""
+    if name == "kalman" and isinstance(perceiver, CameraEyes):
+        return KalmanTracker(tracking_of(perceiver.name))
+    return make_tracker(name)

@@ -13,6 +13,7 @@ scene depends on another.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -21,12 +22,12 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from ssad.core.columns import concatenate
-from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.registry import Reference
-from ssad.core.types import F64, I32, AgentKind
+from ssad.core.types import F64, I32, AgentKind, Episode
 from ssad.drivers.perceiving.kalman import distance, predict, update
 from ssad.drivers.perceiving.objects import I64, Objects
+from ssad.drivers.perceiving.tracks import Tracks
 
 MEMORY = 0.8  # weight of the earlier sizes, kinds and headings at each hit
 SCORES = {
@@ -95,8 +96,8 @@ def tracking_of(detector: str, *, high: float | None = None, low: float | None =
 
 
 @dataclass(frozen=True, slots=True)
-class Tracks:
-    """Table of N tracks of all scenes; never modified in place.
+class KalmanTracks:
+    """Table of the states of N tracks of all scenes; never modified in place.
 
     Attributes:
         scene: [N] index of the scene.
@@ -138,6 +139,11 @@ class Tracks:
         mean, covariance = predict(self.mean, self.covariance, time - self.time, density)
         return replace(self, time=time.copy(), mean=mean, covariance=covariance)
 
+    def reported(self) -> Tracks:
+        """Return the table that other parts of a driver read."""
+        place, velocity = self.mean[:, :2], self.mean[:, 2:]
+        return Tracks(self.scene, self.ident, place, velocity, self.yaw, self.size, self.kind, self.score)
+
     @property
     def kind(self) -> I64:
         """Kind with the most votes [N]."""
@@ -160,11 +166,11 @@ class Tracks:
         return np.where(observed, yaw + np.pi * backwards, course)
 
 
-def no_tracks() -> Tracks:
+def no_kalman_tracks() -> KalmanTracks:
     """Return a table without rows."""
     floats, integers = np.zeros(0), np.zeros(0, np.int64)
     pairs, votes = np.zeros((0, 2)), np.zeros((0, len(AgentKind)))
-    return Tracks(
+    return KalmanTracks(
         integers,
         integers,
         floats,
@@ -180,7 +186,7 @@ def no_tracks() -> Tracks:
     )
 
 
-class Tracker:
+class KalmanTracker:
     """Multi-object tracker of B scenes.
 
     Args:
@@ -190,24 +196,29 @@ class Tracker:
 
     def __init__(self, settings: Tracking | None = None, scenes: int = 1) -> None:
         self.settings = settings or Tracking()
-        self.tracks = no_tracks()
+        self.tracks = no_kalman_tracks()
         self._born = np.zeros(scenes, np.int64)
 
-    def snapshot(self) -> tuple[Tracks, I64]:
+    def reset(self, episodes: Sequence[Episode]) -> None:
+        """Forget all tracks; one scene for each of the episodes."""
+        self.tracks, self._born = no_kalman_tracks(), np.zeros(len(episodes), np.int64)
+
+    def snapshot(self) -> tuple[KalmanTracks, I64]:
         """Return the complete state; `restore` continues from it, bit by bit."""
         return self.tracks, self._born.copy()
 
-    def restore(self, snapshot: tuple[Tracks, I64]) -> None:
+    def restore(self, snapshot: tuple[KalmanTracks, I64]) -> None:
         """Continue from an earlier snapshot."""
         self.tracks, self._born = snapshot[0], snapshot[1].copy()
 
-    def update(self, scenes: I64, times: F64, found: Objects) -> None:
+    def update(self, scenes: I64, times: F64, found: Objects, poses: F64 | None = None) -> None:
         """Take in what was found in one look at each of some scenes.
 
         Args:
             scenes: [n] the scenes, each once; where nothing was found, all tracks missed a look.
             times: [n] s of the looks, none before the last one of its scene.
             found: The objects; those of other scenes do not count.
+            poses: Not used: objects are in the world frame.
         """
         settings, look_times = self.settings, np.full(len(self._born), np.nan)
         look_times[scenes] = times
@@ -224,7 +235,7 @@ class Tracker:
         tracks = tracks.take(tracks.missed <= max_missed)
         self.tracks = concatenate([tracks, self._begun(found.take(unmatched), look_times)])
 
-    def _matched(self, tracks: Tracks, found: Objects, scenes: I64) -> tuple[I64, I64]:
+    def _matched(self, tracks: KalmanTracks, found: Objects, scenes: I64) -> tuple[I64, I64]:
         """Rows of tracks and of objects that belong together, scene by scene."""
         settings = self.settings
         rows, track_begin, track_count = _by_scene(tracks.scene, scenes)
@@ -274,7 +285,7 @@ class Tracker:
                     free_tracks[track_matches[-1]], free_objects[object_matches[-1]] = False, False
         return np.concatenate(track_matches), np.concatenate(object_matches)
 
-    def _with_hits(self, tracks: Tracks, rows: I64, hits: Objects) -> Tracks:
+    def _with_hits(self, tracks: KalmanTracks, rows: I64, hits: Objects) -> KalmanTracks:
         """Update tracks with their hits."""
         columns = {column.name: getattr(tracks, column.name).copy() for column in fields(tracks)}
         filtered = update(tracks.mean[rows], tracks.covariance[rows], hits.place, hits.spread)
@@ -285,9 +296,9 @@ class Tracker:
         columns["size"][rows] = MEMORY * columns["size"][rows] + (1.0 - MEMORY) * hits.size
         columns["score"][rows], columns["missed"][rows] = hits.score, 0
         columns["hits"][rows] += 1
-        return Tracks(**columns)
+        return KalmanTracks(**columns)
 
-    def _begun(self, found: Objects, when: F64) -> Tracks:
+    def _begun(self, found: Objects, when: F64) -> KalmanTracks:
         """New tracks, numbered on in each scene."""
         count = len(found)
         numbers = np.zeros(count, np.int64)
@@ -302,7 +313,7 @@ class Tracker:
         covariance[:, 2, 2] = covariance[:, 3, 3] = self.settings.speed**2
         axis, heading, votes = _looks(found)
         first_hits, no_misses = np.ones(count, np.int64), np.zeros(count, np.int64)
-        return Tracks(
+        return KalmanTracks(
             found.scene,
             numbers,
             when[found.scene],
@@ -329,31 +340,39 @@ class Tracker:
         selected = self.tracks.take(
             (self.tracks.hits >= self.settings.confirm) & np.isfinite(scene_times[self.tracks.scene])
         )
-        return selected.at(scene_times[selected.scene], self.settings.density)
+        return selected.at(scene_times[selected.scene], self.settings.density).reported()
 
 
-def believed(tracks: Tracks, scenes: I32 | I64) -> Belief:
-    """Convert tracks to the belief of the planner: pose, speed, size and kind.
+def kalman_tracker(  # plain values, as they stand in a suite
+    *,
+    confirm: int = 2,
+    reserve: int = 6,
+    patience: int = 1,
+    high: float = 0.3,
+    low: float = 0.1,
+    gate: float = 9.21,
+    stranger: float = 3.0,
+    density: float = 3.0,
+    speed: float = 6.0,
+) -> KalmanTracker:
+    """Return the built-in tracker; its arguments are the fields of `Tracking`.
 
-    Args:
-        tracks: Tracks of exactly these scenes.
-        scenes: [N] scene of each row of the belief.
+    Raises:
+        ConfigError: A setting is out of its range.
     """
-    row = np.full(int(np.max(scenes, initial=-1)) + 1, -1)
-    row[scenes] = np.arange(len(scenes))
-    belief_row = row[tracks.scene]
-    order = np.argsort(belief_row, kind="stable")
-    tracks, belief_row = tracks.take(order), belief_row[order]
-    count = np.bincount(belief_row, minlength=len(scenes))
-    slot = np.arange(len(tracks)) - np.repeat(np.cumsum(count) - count, count)
-    shape = (len(scenes), max(int(count.max(initial=0)), 1))
-    pose, size = np.zeros((*shape, 3), np.float32), np.ones((*shape, 2), np.float32)
-    speed, kind = np.zeros(shape, np.float32), np.full(shape, int(AgentKind.NONE), np.int32)
-    yaw = tracks.yaw
-    pose[belief_row, slot, :2], pose[belief_row, slot, 2] = tracks.mean[:, :2], yaw
-    speed[belief_row, slot] = tracks.mean[:, 2] * np.cos(yaw) + tracks.mean[:, 3] * np.sin(yaw)
-    size[belief_row, slot], kind[belief_row, slot] = tracks.size, tracks.kind
-    return Belief(pose, speed, size, kind)
+    return KalmanTracker(
+        Tracking(
+            confirm=confirm,
+            reserve=reserve,
+            patience=patience,
+            high=high,
+            low=low,
+            gate=gate,
+            stranger=stranger,
+            density=density,
+            speed=speed,
+        )
+    )
 
 
 def _by_scene(scene: I64, scenes: I64) -> tuple[I64, I64, I64]:

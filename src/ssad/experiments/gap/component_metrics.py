@@ -16,7 +16,7 @@ from ssad.drivers.belief import in_sight
 from ssad.drivers.perceiving.driver import Known, Sighting
 from ssad.drivers.perceiving.objects import I64, Objects
 from ssad.drivers.perceiving.signs import SAME
-from ssad.drivers.perceiving.tracker import Tracks
+from ssad.drivers.perceiving.tracks import Tracks
 from ssad.metrics.detection import match
 from ssad.metrics.detection_boxes import BoxTable
 from ssad.metrics.tracking import ENOUGH, TrackedFrame, similarity_of, track_scores
@@ -119,7 +119,10 @@ def _upright(picture: Any) -> U8:
 
 
 def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Camera]) -> Bool:
-    """Which agents [N, A] the ego's cameras can see at N steps: not hidden, near enough, their middle in a picture."""
+    """Which agents [N, A] the ego's cameras can see at N steps: not hidden, near enough, their middle in a picture.
+
+    Without cameras (a perceiver of LiDAR or radar) all agents that are near and not hidden count.
+    """
     step_indices = np.asarray(steps, np.int64)
     kind = np.where(trace.active[step_indices], trace.kind, int(AgentKind.NONE)).astype(np.int32)
     kind[:, 0] = AgentKind.NONE
@@ -132,6 +135,8 @@ def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Cam
         kind,
     )
     unoccluded = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
+    if not cameras:
+        return np.asarray(unoccluded)
     egos = upright_poses(pose[:, 0].astype(np.float64))
     ones = np.ones(kind.shape)
     homogeneous = np.stack([pose[..., 0], pose[..., 1], 0.8 * ones, ones], -1)
@@ -253,7 +258,7 @@ def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | Non
     frames, steps = [], _steps(trace, seen.known)
     for (_, tracks), step, visible in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
         agent_positions = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
-        similarity = similarity_of(agent_positions, tracks.mean[:, :2], 2.0 * NEAR)
+        similarity = similarity_of(agent_positions, tracks.place, 2.0 * NEAR)
         is_hidden = trace.active[step] & ~visible
         is_hidden[0] = False
         visible_similarity = similarity[visible].max(0, initial=0.0)
@@ -397,11 +402,11 @@ def phantom_stop(trace: EpisodeTrace, seen: Perceived) -> float:
         if trace.speed[step, 0] > 0.5 or not len(tracks):
             continue
         yaw = float(trace.yaw[step, 0])
-        track_offsets = tracks.mean[:, :2] - (trace.x[step, 0], trace.y[step, 0])
+        track_offsets = tracks.place - (trace.x[step, 0], trace.y[step, 0])
         forward, lateral = track_offsets @ (np.cos(yaw), np.sin(yaw)), track_offsets @ (-np.sin(yaw), np.cos(yaw))
         other_agents = np.flatnonzero(trace.active[step])[1:]
         agent_positions = np.stack([trace.x[step, other_agents], trace.y[step, other_agents]], -1)
-        distances = np.linalg.norm(tracks.mean[:, None, :2] - agent_positions[None], axis=-1).min(1, initial=np.inf)
+        distances = np.linalg.norm(tracks.place[:, None] - agent_positions[None], axis=-1).min(1, initial=np.inf)
         standing_time += trace.dt * bool(
             ((forward > 0) & (forward < 20.0) & (np.abs(lateral) < 2.5) & (distances > ROUGH)).any()
         )
@@ -438,7 +443,7 @@ def _state(trace: EpisodeTrace, step: int, agent: int, seen: Perceived) -> str:
 
 
 def _gaps(tracks: Tracks, trace: EpisodeTrace, step: int, agent: int) -> F64:
-    return np.asarray(np.linalg.norm(tracks.mean[:, :2] - (trace.x[step, agent], trace.y[step, agent]), axis=1))
+    return np.asarray(np.linalg.norm(tracks.place - (trace.x[step, agent], trace.y[step, agent]), axis=1))
 
 
 def _mean(values: F64) -> float | None:

@@ -118,7 +118,7 @@ def _marked(picture: U8, trace: EpisodeTrace, step: int, time: float, seen: Perc
     detections, tracks = _at(seen.looks, time), _at(seen.known, time)
     for places, colour in (
         ([] if detections is None else detections.place, FOUND),
-        ([] if tracks is None else tracks.mean[:, :2], KNOWN),
+        ([] if tracks is None else tracks.place, KNOWN),
     ):
         for position in places:
             ego_point = to_local(np.array(ego), np.asarray(position))
@@ -161,10 +161,10 @@ def _above(trace: EpisodeTrace, step: int, time: float, seen: Perceived, graph: 
         for x, y in pixels(detections.place).tolist():
             cv2.drawMarker(canvas, (x, y), FOUND, cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
     if tracks is not None:
-        for mean, yaw, size in zip(tracks.mean, tracks.yaw, tracks.size, strict=True):
-            outline = pixels(_corners(np.array([mean[0], mean[1], yaw]), size))
+        for place, velocity, yaw, size in zip(tracks.place, tracks.velocity, tracks.yaw, tracks.size, strict=True):
+            outline = pixels(_corners(np.array([*place, yaw]), size))
             cv2.polylines(canvas, [outline], True, KNOWN, 2, cv2.LINE_AA)
-            cv2.polylines(canvas, [pixels([mean[:2], mean[:2] + mean[2:]])], False, KNOWN, 1, cv2.LINE_AA)
+            cv2.polylines(canvas, [pixels([place, place + velocity])], False, KNOWN, 1, cv2.LINE_AA)
     return canvas
 
 

@@ -123,9 +123,9 @@ def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
 
 def _perceived(seen: Seen) -> Iterator[Message]:
     """What the driver saw, found and believed."""
-    name, camera = next(iter(seen.perceived.cameras.items()))
-    camera_rotation, camera_position = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()
-    for seconds, image in seen.shots:
+    for seconds, image in seen.shots:  # none of a perceiver without cameras
+        name, camera = next(iter(seen.perceived.cameras.items()))
+        camera_rotation, camera_position = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()
         time = _ns(seconds)
         jpeg = encode_jpeg(np.ascontiguousarray(image), QUALITY, "420")
         yield time, "/tf", _transform(time, EGO, name, camera_position, camera_rotation)
@@ -138,7 +138,7 @@ def _perceived(seen: Seen) -> Iterator[Message]:
             metadata = {f"score {row}": f"{score:.3f}" for row, score in enumerate(detections.score.tolist())}
             yield _ns(seconds), "/detections", _update("detections", _ns(seconds), cubes=cubes, words=metadata)
     for seconds, tracks in seen.perceived.known:
-        cubes = _cubes("tracks", np.column_stack([tracks.mean[:, :2], tracks.yaw]), tracks.size, tracks.kind)
+        cubes = _cubes("tracks", np.column_stack([tracks.place, tracks.yaw]), tracks.size, tracks.kind)
         metadata = {f"track {row}": str(track_id) for row, track_id in enumerate(tracks.ident.tolist())}
         yield _ns(seconds), "/tracks", _update("tracks", _ns(seconds), cubes=cubes, words=metadata)
 

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
 from ssad.core.types import Episode, EpisodeTrace
-from ssad.drivers.perceiving.eyes import front
 from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.sensors import sensor_suite
 from ssad.experiments.gap.component_metrics import Watcher
 from ssad.experiments.gap.other_drives import images_of_other_drives
 from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.metrics import episode_metrics
-from ssad.rendering.sensor_suite import SensorSuite
 from ssad.scenarios.static.catalogue import parse_perturbation
 from ssad.scenarios.static.perturbation import Perturbation
 from ssad.simulators.closed_loop import Order, drive
@@ -43,14 +43,19 @@ def drive_perceiving(
     if spec["settings"] is None:
         return *drive(orders, device=device, key=_paired)[:2], None
     system = PerceivingSystem.model_validate(spec["settings"])
-    watcher = Watcher(front(system.width, system.cameras), len(orders), every)
+    watcher = Watcher(system.views, len(orders), every)
     driver = system.make(watcher, repair=repair, device=device)
-    suite = SensorSuite(
-        cameras=driver.cameras,
+    perturbation = perturbation_of(spec)
+    if perturbation is not None and perturbation.needs_victim and driver.detector is None:
+        raise ConfigError(
+            f"system {system.name}: {perturbation.name} needs a victim, but its perceiver has no attribute detector; "
+            "give it one (ssad.core.protocols.Detector), or leave attacks out"
+        )
+    suite = sensor_suite(
+        driver.perceiver,
         device=device,
         other_images=lambda camera, count: images_of_other_drives(camera, count, device),
     )
-    perturbation = perturbation_of(spec)
     if perturbation is not None:
         suite = perturbation.in_loop(suite, target=spec["target"], victim=driver.detector, seed=seed)
     driven = drive(orders, device=device, key=_paired, driver=driver, sensors=suite.build(), perturbation=suite.changes)

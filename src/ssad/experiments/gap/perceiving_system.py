@@ -2,22 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
 from ssad.core.checkpoints import state_hash
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import CAMERAS
+from ssad.core.safeio import dump_json, parse_json
 from ssad.core.schema import Schema
 from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.parts import (
+    Perceiver,
+    cameras_of,
+    make_perceiver,
+    make_planner,
+    make_tracker,
+    part_version,
+)
 from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.signs import SignReading, sign_labels
 from ssad.drivers.perceiving.tracker import Tracking, tracking_of
 
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
+KEYS_OF_PERCEIVER: Final = (
+    "detector",
+    "weights",
+    "cameras",
+    "width",
+    "input_width",
+    "missed",
+    "burst",
+    "noise",
+    "phantoms",
+)
+KEYS_OF_TRACKER: Final = ("confirm", "reserve")
+NAMED: Final = ("perceiver", "tracker", "planner")
+
+
+def _single_name(part: str | dict[str, Any]) -> str | dict[str, Any]:
+    if isinstance(part, dict) and len(part) != 1:
+        raise ValueError("expected a name, or one name with its arguments, as in {my_package.eyes:Eyes: {reach: 40}}")
+    return part
+
+
+Part = Annotated[str | dict[str, dict[str, Any] | None], AfterValidator(_single_name)]
+"""Name of a part (built-in, entry point or "module:object"), alone or as {NAME: {ARGUMENT: VALUE}}."""
 
 
 class PerceivingSystem(Schema):
@@ -38,6 +72,10 @@ class PerceivingSystem(Schema):
         reads_signs: true: stop signs are read by the detector; false: they are known from the map.
         sign_memory: time that a sign is remembered after its last reading, s; none: until it has been passed.
         missed, burst, noise, phantoms: errors of a perfect detector (`ssad.drivers.perceiving.eyes.PerfectEyes`).
+        perceiver: source of detections in place of the one that the keys detector, weights, cameras, width,
+            input_width, missed, burst, noise and phantoms describe (`ssad list perceivers`).
+        tracker: tracker in place of the one that confirm, reserve, high and low describe (`ssad list trackers`).
+        planner: planner in place of the Autopilot's (`ssad list planners`).
     """
 
     name: str = Field(min_length=1)
@@ -58,37 +96,83 @@ class PerceivingSystem(Schema):
     burst: float = Field(default=3.0, ge=1, allow_inf_nan=False)
     noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     phantoms: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    perceiver: Part | None = None
+    tracker: Part | None = None
+    planner: Part | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_unnamed_parts(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave parts out that are not named: the dump enters the keys of cells, which must not change by them."""
+        values: dict[str, Any] = dump(self)
+        return {key: value for key, value in values.items() if key not in NAMED or value is not None}
 
     @property
     def version(self) -> str:
-        """Hash of the weights of its detector; "" without one."""
-        return "" if self.perfect else state_hash(_detector(self.detector, self.weights, self.input_width))
+        """Hash of the weights of its detector, and the versions of the parts that are named; "" without any."""
+        built_in_detector = self.perceiver is None and not self.perfect
+        versions = [state_hash(self._make_perceiver().detector)] if built_in_detector else []
+        for kind in NAMED:
+            name, options = self._part(kind)
+            if name:
+                part = self._make_perceiver() if kind == "perceiver" else self._make_part(kind)
+                versions.append(part_version(kind, name, part, options))
+        return " ".join(filter(None, versions))
 
     @property
     def perfect(self) -> bool:
-        """True if the detector is given the truth."""
-        return self.detector == "truth"
+        """True if no perturbation of images reaches it: it is given the truth, or reads no camera."""
+        if self.perceiver is None:
+            return self.detector == "truth"
+        perceiver = self._make_perceiver()
+        return not set(cameras_of(perceiver)) & set(perceiver.sensors)
+
+    @property
+    def views(self) -> Mapping[str, Camera]:
+        """Cameras in whose images objects count as in view; none of a perceiver without cameras."""
+        return cameras_of(self._make_perceiver()) if self.perceiver else front(self.width, self.cameras)
 
     @property
     def tracking(self) -> Tracking:
-        """Settings of the tracker, with the scores that suit the detector unless the suite sets them."""
-        return tracking_of(self.detector, high=self.high, low=self.low, confirm=self.confirm, reserve=self.reserve)
+        """Settings of the built-in tracker, with the scores that suit the detector unless the suite sets them."""
+        name, options = self._part("perceiver")
+        detector = (options.get("detector", self.detector) if name == "camera" else "") if name else self.detector
+        tracker, settings = self._part("tracker")
+        given: dict[str, Any] = {"confirm": self.confirm, "reserve": self.reserve, "high": self.high, "low": self.low}
+        return tracking_of(detector, **(given | settings if tracker == "kalman" else given))
 
     def check(self) -> None:
-        """Validate the settings.
+        """Validate the settings, and make the parts that are named.
 
         Raises:
-            ConfigError: Scores cross, settings of stop signs do not fit, or the detector knows no stop signs.
+            ConfigError: Scores cross, settings of stop signs do not fit, or the detector knows no stop signs. A part
+                cannot be made, or a key describes a part that another key names.
         """
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ConfigError(f"system {self.name}: low {self.low:g} is above high {self.high:g}")
         if self.sign_memory is not None and not self.reads_signs:
             raise ConfigError(f"system {self.name}: sign_memory can only be used with reads_signs: true")
+        for kind, keys in (("perceiver", KEYS_OF_PERCEIVER), ("tracker", KEYS_OF_TRACKER)):
+            # By value: the dump of a suite writes out defaults.
+            defaults = {key: type(self).model_fields[key].default for key in keys}
+            changed = [key for key, default in defaults.items() if getattr(self, key) != default]
+            if getattr(self, kind) is not None and changed:
+                raise ConfigError(
+                    f"system {self.name}: {', '.join(changed)} would describe the built-in {kind}, but {kind} names "
+                    f"another; give it as an argument there, {kind}: {{NAME: {{{changed[0]}: ...}}}}"
+                )
+        if any(getattr(self, kind) is not None for kind in NAMED):
+            try:
+                self.make()
+            except UnknownNameError as error:
+                raise UnknownNameError(f"system {self.name}: {error}") from None
+            except ConfigError as error:
+                raise ConfigError(f"system {self.name}: {error}") from None
         if self.reads_signs:
             try:
-                sign_labels(self.make().eyes.classes)
+                sign_labels(self.make().perceiver.classes)
             except ConfigError as error:
-                raise ConfigError(f"system {self.name}, detector {self.detector}: {error}") from None
+                source = f"detector {self.detector}" if self.perceiver is None else f"perceiver {self.perceiver}"
+                raise ConfigError(f"system {self.name}, {source}: {error}") from None
 
     def make(
         self,
@@ -103,30 +187,67 @@ class PerceivingSystem(Schema):
             watch: Called with everything that the driver perceives.
             repair: Corrects one kind of error of its perception.
             device: Device of the detector.
+
+        Raises:
+            UnknownNameError: A named part does not exist.
+            ConfigError: A named part cannot be made.
         """
-        cameras, tracking = front(self.width, self.cameras), self.tracking
-        eyes: CameraEyes | PerfectEyes
-        if self.perfect:
-            eyes = PerfectEyes(cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms)
-        else:
-            detector = _detector(self.detector, self.weights, self.input_width, device)
-            eyes = CameraEyes(detector, cameras, threshold=tracking.low, device=device)
+        tracking, tracker_name = self.tracking, self._part("tracker")[0]
         memory_seconds = float("inf") if self.sign_memory is None else self.sign_memory
         sign_reading = (
             SignReading(confirm=self.confirm, memory=memory_seconds, score=tracking.high) if self.reads_signs else None
         )
-        return Perceiving(
-            eyes,
+        built_in = tracker_name in ("", "kalman")
+        driver = Perceiving(
+            self._make_perceiver(device),
+            tracker=None if built_in else self._make_part("tracker"),
+            planner=None if self.planner is None else self._make_part("planner"),
             rate=self.rate,
             latency=self.latency,
-            tracking=tracking,
+            tracking=tracking if built_in else None,
             watch=watch,
             repair=repair,
             signs=sign_reading,
         )
+        if any(getattr(self, kind) is not None for kind in NAMED):
+            driver.to(device)
+        return driver
+
+    def _part(self, kind: str) -> tuple[str, dict[str, Any]]:
+        """Return the name and the arguments of a part; "" if the suite names none."""
+        part = getattr(self, kind)
+        if part is None or isinstance(part, str):
+            return part or "", {}
+        ((name, options),) = part.items()
+        return name, dict(options or {})
+
+    def _make_part(self, kind: str) -> Any:
+        """Return the tracker or the planner that the suite names."""
+        name, options = self._part(kind)
+        return (make_tracker if kind == "tracker" else make_planner)(name, **options)
+
+    def _make_perceiver(self, device: str = "cpu") -> Any:
+        """Return the perceiver."""
+        tracking = self.tracking
+        name, options = self._part("perceiver")
+        if name:
+            if name == "camera":
+                options = {"threshold": tracking.low} | options
+            return _perceiver(name, dump_json(options), device)
+        cameras = front(self.width, self.cameras)
+        if self.perfect:
+            return PerfectEyes(cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms)
+        detector = _detector(self.detector, self.weights, self.input_width, device)
+        return CameraEyes(detector, cameras, threshold=tracking.low, device=device)
 
 
 def _detector(name: str, weights: str | None, width: int | None, device: str = "cpu") -> Any:
     from ssad.detectors import loaded_detector
 
     return loaded_detector(name, weights=weights, device=device, input_width=width)
+
+
+@lru_cache(maxsize=4)
+def _perceiver(name: str, options: str, device: str) -> Perceiver:
+    """Return a perceiver that a suite names, built once per process: it may load weights; `reset` clears its memory."""
+    return make_perceiver(name, **parse_json(options))

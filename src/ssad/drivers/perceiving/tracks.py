@@ -1,0 +1,102 @@
+"""Tracks of the objects around egos, as a tracker reports them, and the belief that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.driving import Belief
+from ssad.core.errors import ConfigError
+from ssad.core.types import F64, I32, AgentKind
+from ssad.drivers.perceiving.objects import I64
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Table of N tracked objects of several scenes, in the world frame.
+
+    Attributes:
+        scene: [N] index of the scene.
+        ident: [N] number of the track, unique in its scene for the whole episode.
+        place: [N, 2] x, y of the centre, m.
+        velocity: [N, 2] along x and y, m/s.
+        yaw: [N] heading, rad.
+        size: [N, 2] length and width, m; above 0.
+        kind: [N] `ssad.core.types.AgentKind`; not NONE.
+        score: [N] confidence of the last detection, 0 to 1.
+    """
+
+    scene: I64
+    ident: I64
+    place: F64
+    velocity: F64
+    yaw: F64
+    size: F64
+    kind: I64
+    score: F64
+
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    def take(self, index: npt.NDArray[Any] | slice) -> Self:
+        """Return the rows selected by indices, a mask or a slice."""
+        return type(self)(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
+
+
+def no_tracks() -> Tracks:
+    """Return a table without rows."""
+    floats, integers, pairs = np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 2))
+    return Tracks(integers, integers, pairs, pairs, floats, pairs, integers, floats)
+
+
+def check_tracks(tracks: Any, scenes: I32 | I64, tracker: str) -> None:
+    """Check the type, the shapes and the scenes of the tracks that a tracker returned.
+
+    Args:
+        tracks: Returned object.
+        scenes: [n] scenes that it was asked for.
+        tracker: Name of the tracker, for the message.
+
+    Raises:
+        ConfigError: It is no `Tracks`, or a column does not fit; the message names the column.
+    """
+    if not isinstance(tracks, Tracks):
+        raise ConfigError(
+            f"tracker {tracker}: confirmed returned {type(tracks).__name__}; return a "
+            "ssad.drivers.perceiving.tracks.Tracks"
+        )
+    count = len(np.atleast_1d(tracks.scene))
+    for column in fields(Tracks):
+        shape = np.shape(getattr(tracks, column.name))
+        expected = (count, 2) if column.name in ("place", "velocity", "size") else (count,)
+        if shape != expected:
+            raise ConfigError(f"tracker {tracker}: {column.name} has shape {shape}; expected {expected}")
+    if count and not np.isin(tracks.scene, scenes).all():
+        raise ConfigError(f"tracker {tracker}: confirmed returned a track of a scene that it was not asked for")
+
+
+def believed(tracks: Tracks, scenes: I32 | I64) -> Belief:
+    """Convert tracks to the belief of the planner: pose, speed, size and kind.
+
+    Args:
+        tracks: Tracks of exactly these scenes.
+        scenes: [N] scene of each row of the belief.
+    """
+    row = np.full(int(np.max(scenes, initial=-1)) + 1, -1)
+    row[scenes] = np.arange(len(scenes))
+    belief_row = row[tracks.scene]
+    order = np.argsort(belief_row, kind="stable")
+    tracks, belief_row = tracks.take(order), belief_row[order]
+    count = np.bincount(belief_row, minlength=len(scenes))
+    slot = np.arange(len(tracks)) - np.repeat(np.cumsum(count) - count, count)
+    shape = (len(scenes), max(int(count.max(initial=0)), 1))
+    pose, size = np.zeros((*shape, 3), np.float32), np.ones((*shape, 2), np.float32)
+    speed, kind = np.zeros(shape, np.float32), np.full(shape, int(AgentKind.NONE), np.int32)
+    yaw = tracks.yaw
+    pose[belief_row, slot, :2], pose[belief_row, slot, 2] = tracks.place, yaw
+    speed[belief_row, slot] = tracks.velocity[:, 0] * np.cos(yaw) + tracks.velocity[:, 1] * np.sin(yaw)
+    size[belief_row, slot], kind[belief_row, slot] = tracks.size, tracks.kind
+    return Belief(pose, speed, size, kind)
