@@ -42,7 +42,10 @@ def its_tests() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("group", ["systems", "detectors", "attacks", "generators", "scenarios", "kinds"])
+GROUPS = ["systems", "perceivers", "trackers", "detectors", "attacks", "generators", "scenarios", "kinds"]
+
+
+@pytest.mark.parametrize("group", GROUPS)
 def test_its_names_are_listed(group: str) -> None:
     done = ssad("list", group)
     assert done.returncode == 0, done.stderr
@@ -63,3 +66,23 @@ def test_its_page_names_only_what_is_there() -> None:
         assert f"`{file.name}`" in page
     for name in (name for names in PROJECT["entry-points"].values() for name in names if name.startswith("example-")):
         assert name in page or name == "example-coin"
+
+
+def test_its_perceiver_and_tracker_drive_in_a_gap_suite(tmp_path: Path) -> None:
+    """LiDAR alone: perturbations of cameras do not apply, and objects are in view without a camera."""
+    import ssad
+
+    (tmp_path / "short.yaml").write_text(
+        "name: short\ntype: StraightObstacle\ntown: ProvingGround\nlimits: {max_steps: 12}\n"
+        "route: [{x: 217.0, y: -5.25}, {x: 317.0, y: -5.25}]\n"
+    )
+    suite = tmp_path / "gap.yaml"
+    suite.write_text(
+        f"kind: gap\nname: lidar\nceilings: []\nscenarios: [{tmp_path / 'short.yaml'}]\nperturbations: [fog]\n"
+        "systems:\n- {name: lidar, perceiver: {example-clusters: {reach: 30}}, tracker: example-nearest, rate: 2.5}\n"
+    )
+    results = ssad.run(suite, out=tmp_path / "run", workers=0, quiet=True)
+    (row,) = results.rows
+    assert (row["status"], row["perturbation"]) == ("ok", "none")
+    assert row["metrics"]["phantoms"] is not None
+    assert results.report.is_file()

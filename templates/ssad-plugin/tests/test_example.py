@@ -67,3 +67,32 @@ def test_the_detector_keeps_its_promises_and_the_attack_its_budget() -> None:
     done = run_attack(make_attack("example-steps", steps=2), detector, images, truth, Budget(px(5)), objective="full")
     assert float((done.images - images).abs().max()) <= 5 / 255 + 1e-6
     assert float(done.after) > float(done.before)
+
+
+def test_the_perceiver_and_the_tracker_keep_their_protocols() -> None:
+    pytest.importorskip("torch")
+    from ssad import World, build_episode, load_scenarios, load_town
+    from ssad.drivers.perceiving.check import check_perceiver, check_tracker
+    from ssad.drivers.perceiving.parts import make_perceiver, make_tracker
+
+    scenarios = load_scenarios("LaneChanging")[:2]
+    town = load_town(scenarios[0].town)
+    episodes = [build_episode(scenario, town, seed=0) for scenario in scenarios]
+
+    def simulator(assign):
+        return World(episodes, {town.name: town}, assign=np.array(assign))
+
+    check_perceiver(lambda: make_perceiver("example-clusters", reach=80.0), simulator, episodes=2, steps=2)
+    check_tracker(lambda: make_tracker("example-nearest"), episodes=episodes)
+
+
+def test_the_perceiver_boxes_a_cluster_of_points() -> None:
+    from ssad.drivers.perceiving.parts import make_perceiver
+    from ssad.rendering.lidar import HDL32E
+
+    side = np.linspace(-0.9, 0.9, 10)
+    points = np.stack([np.full(10, 12.0), side, np.full(10, 1.0), np.ones(10)], 1) @ np.linalg.inv(HDL32E.to_ego).T
+    rows = np.column_stack([points[:, :3], np.ones(10), np.zeros(10)]).astype(np.float32)
+    boxes = make_perceiver("example-clusters").boxes(rows)
+    assert boxes.label.tolist() == [0]
+    np.testing.assert_allclose(boxes.centre[0], [12.0, 0.0, 1.0], atol=1e-4)
