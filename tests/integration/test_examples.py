@@ -51,6 +51,12 @@ def test_adversaries_by_selection() -> None:
     assert [trace.driven[-1] > 5.0 for trace in names["traces"]] == [True] * 3
 
 
+def test_parts_of_a_perceiving_driver() -> None:
+    names = run(FOLDER / "how-to" / "perceiving-parts.md")
+    assert [trace.end == "collision" for trace in names["traces"]] == [False, False]
+    assert names["traces"][0].brake.max() == 1.0  # for the car ahead
+
+
 def test_a_generator_of_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from ssad.drivers import make_system
     from ssad.scenarios.dynamic import load_scenarios
