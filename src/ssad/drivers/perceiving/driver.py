@@ -287,7 +287,7 @@ class Perceiving:
         return parts, without_image, signs
 
     def _from_boxes(
-        self, boxes_by_row: Sequence[EgoBoxes | None], ego_poses: F64, scenes: I64
+        self, boxes_by_row: Any, ego_poses: F64, scenes: I64
     ) -> tuple[list[Objects], Bool, list[list[F64]]]:
         """Return objects, rows [n] without a reading, and positions of stop signs by row, of boxes around the egos."""
         name, classes = self._perceiver_name, self.perceiver.classes

@@ -72,7 +72,7 @@ def camera_perceiver(
         UnknownNameError: There is no such detector.
         ConfigError: There is no such camera.
     """
-    options = {"weights": weights} | ({} if input_width is None else {"input_width": input_width})
+    options: dict[str, Any] = {"weights": weights} | ({} if input_width is None else {"input_width": input_width})
     least = tracking_of(detector).low if threshold is None else threshold
     eyes = CameraEyes(detector, _rig(cameras, width), threshold=least, **options)
     _ = eyes.detector  # so that a wrong name fails here
