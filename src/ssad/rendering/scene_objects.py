@@ -252,7 +252,8 @@ class Clear:
     def __init__(self, street: Street) -> None:
         vertices = street.vertices
         upright = vertices[(vertices[:, 2] > 0.35) & (vertices[:, 2] < 2.4)]
-        self.taken = {(int(x), int(y)) for x, y in np.unique(np.floor(upright[:, :2] * 2).astype(int), axis=0)}
+        squares: list[list[int]] = np.unique(np.floor(upright[:, :2] * 2).astype(int), axis=0).tolist()
+        self.taken = {(x, y) for x, y in squares}
 
     def footprint(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
         """Return True if a rectangle is free."""

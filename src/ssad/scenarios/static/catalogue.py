@@ -529,6 +529,8 @@ def _word(value: Any) -> str:
     """Return a setting as `Reference.of` reads it."""
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:g}"
     return safeio.dump_json(value) if isinstance(value, list | dict) else f"{value}"
 
 
