@@ -77,7 +77,7 @@ def name_page() -> str:
     lines = [
         "# Registered names",
         "",
-        "The names that commands and suites accept, as `ssad list WHAT` prints them. In place of each, a suite takes",
+        "The names that commands and suites accept, as `ssad list` prints them. In place of each, a suite takes",
         "an entry point of an installed package or `module:object`. `ssad list scenarios` and `ssad list towns` also",
         "show what has been imported on a machine. `python -m benchmarks.reference` makes this page.",
         "",

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_cli_shift import perfect
 
 from ssad.core import errors
+from tests.cli.test_shift import perfect
 
 ABSENT = "raise ModuleNotFoundError(f'No module named {__name__!r}', name=__name__)\n"
 # modules that nothing but perception, learning and gradients may need; whatever is not under them imports without torch

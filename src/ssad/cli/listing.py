@@ -70,9 +70,9 @@ def _perturbation_list() -> dict[str, str]:
 
     rows = dict(sorted(registered_names().items(), key=lambda pair: pair[::-1]))
     return rows | {
-        "NAME.json": "texture: the card of a texture, beside NAME.png (docs/physical.md)",
+        "NAME.json": "texture: the card of a texture, beside NAME.png (docs/reference/physical.md)",
         "FOLDER": "texture or light: what ssad export texture or ssad export light wrote",
-        "module:object": "a perturbation of your own (docs/gap.md)",
+        "module:object": "a perturbation of your own (docs/reference/gap.md)",
     }
 
 

@@ -538,7 +538,7 @@ class PerturbationTable(Schema):
     """Keys of every suite that takes perturbations.
 
     Attributes:
-        perturbations: Names, paths or module:object, with settings (docs/gap.md); the clean condition always runs.
+        perturbations: Names, paths or module:object, with settings (docs/reference/gap.md); "none" always runs.
         severities: Severities 1 to 5 of the perturbations that set none of their own.
     """
 

@@ -21,6 +21,7 @@ from ssad.experiments.perception.scored_data import Recorded, recording_of
 from ssad.experiments.perception.shifts import kind as shifts_kind
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite, shifted_scene
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts.perturbation import Shift
 
 
 def replace_name(monkeypatch: pytest.MonkeyPatch, name: str, value: Any) -> None:
@@ -180,17 +181,17 @@ def test_scenes_of_a_cell(tmp_path: Path) -> None:
     def of(cell: Any) -> list[list[Any]]:
         return list(kind.pieces(cell, job(tmp_path)).values())
 
-    assert of(clean) == [[None, 0, scene] for scene in SCENES]
-    assert of(fog) == [["fog", 3, scene] for scene in SCENES]
+    assert of(clean) == [[None, 0, "physical", scene] for scene in SCENES]
+    assert of(fog) == [["fog", 3, "physical", scene] for scene in SCENES]
     severities = dealt_severities(ShiftSpec("fog", seed=4), list(SCENES.values()))
     assert severities != dealt_severities(ShiftSpec("fog", seed=5), list(SCENES.values()))
-    assert of(dealt) == [["fog", severities[token], scene] for scene, token in SCENES.items()]
+    assert of(dealt) == [["fog", severities[token], "physical", scene] for scene, token in SCENES.items()]
     *_, drawn = plan_of(detectors=["one"], calibration="paper").cells
-    assert of(drawn) == [["fog", "random", scene] for scene in SCENES], "drawn by sample"
+    assert of(drawn) == [["fog", "random", "paper", scene] for scene in SCENES], "drawn by sample"
     there = boxes_path(tmp_path, "one", shifted_scene("fog", 3, "physical", "scene-2"))
     there.parent.mkdir(parents=True)
     there.touch()
-    assert of(fog) == [["fog", 3, scene] for scene in SCENES if scene != "scene-2"]
+    assert of(fog) == [["fog", 3, "physical", scene] for scene in SCENES if scene != "scene-2"]
 
 
 def test_boxes_are_found_and_scored_with_what_the_job_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,7 +272,6 @@ def test_where_none_is_given_a_data_set_is_recorded(
         "root": str(tmp_path / "data"),
         "version": "v1.0-found",
         "detectors": {"one": "one.pth", "two": "two.pth"},
-        "calibration": "physical",
         "seed": 4,
         "replicates": 100,
         "scenes": SCENES,
@@ -341,8 +341,8 @@ def test_the_picture_shows_the_middle_severity(
 ) -> None:
     sheets = []
 
-    def sheet(examination: Examination, split: str, shifts: Any, severity: int) -> str:
-        sheets.append((examination, split, shifts, severity))
+    def sheet(examination: Examination, split: str, perturbations: Any) -> str:
+        sheets.append((examination, split, perturbations))
         return "sheet"
 
     def save(path: Path, picture: str) -> None:
@@ -354,8 +354,8 @@ def test_the_picture_shows_the_middle_severity(
     plan = plan_of("cuda", severities=severities, seed=4)
     for _ in range(2):
         Detection().finish(plan, tmp_path)
-    expected = Examination(tmp_path, tmp_path / "data", "v1.0-found", (("one", "one.pth"),), 4, "cuda", 1, "physical")
-    assert sheets == [(expected, "val", ["fog"], shown)], "made once"
+    expected = Examination(tmp_path, tmp_path / "data", "v1.0-found", (("one", "one.pth"),), 4, "cuda", 1)
+    assert sheets == [(expected, "val", [Shift("fog", shown)])], "made once"
     captions: Mapping[str, str] = json.loads((tmp_path / "pictures" / "pictures.json").read_text())
     assert list(captions) == ["detections.jpg"]
     assert captions["detections.jpg"].startswith("What one finds")

@@ -181,7 +181,14 @@ def test_cells_are_scored_as_soon_as_their_boxes_are_there(
         patch.setattr(detection, "find_boxes", make)
         with pytest.raises(KeyboardInterrupt):
             run_detection(todo, tmp_path / "run", workers=0)
-    assert [u.shift for u in order[:6]] == [None, None, "gaussian", "gaussian", "fog", "fog"]
+    assert [getattr(u.perturbation, "name", None) for u in order[:6]] == [
+        None,
+        None,
+        "gaussian",
+        "gaussian",
+        "fog",
+        "fog",
+    ]
     assert len({u.scene for u in order[2:4]}) == 2, "the severities drawn for the two scenes"
     done = [(r["shift"], r["severity"]) for r in lines(tmp_path / "run")]
     assert {(None, 0), ("gaussian", "random"), ("fog", "random")} <= set(done)
@@ -481,7 +488,7 @@ def test_a_severity_that_cannot_be_is_named_by_its_place() -> None:
 def test_a_suite_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
     path.write_text("name: x\nkind: flying\n")
-    with pytest.raises(ConfigError, match=r"s\.yaml:2.*flying.*driving, detection"):
+    with pytest.raises(ConfigError, match=r"s\.yaml:2.*flying.*driving, perception, detection"):
         load_suite(str(path))
 
 

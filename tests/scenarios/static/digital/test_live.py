@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.core.driving import Perturbation
+from ssad.core.driving import ReadingChange
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
 from ssad.scenarios.static.digital.live import LiveAttack, attacked_detector, own_truth
@@ -38,7 +38,7 @@ def seen(detector: ToyDetector, pictures: np.ndarray[Any, Any]) -> int:
 def test_a_driver_loses_what_its_detector_found_and_nobody_told_the_truth() -> None:
     detector = ToyDetector()
     driver = SimpleNamespace(name="driver", detector=detector)
-    attack: Perturbation = LiveAttack(make_attack("pgd", steps=3), BUDGET)
+    attack: ReadingChange = LiveAttack(make_attack("pgd", steps=3), BUDGET)
     clean = frames()
     found = attack.apply(clean, driver, None, chances(3))
     assert found.dtype == np.uint8

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from ssad.core.types import F32, F64, I32, U8, Episode
 from ssad.rendering.onboard import OnboardCamera, Sight
 from ssad.scenarios.static.shifts import ShiftSpec, shift_images, sky_light
 from ssad.scenarios.static.shifts.anomaly import place_objects
-from ssad.scenarios.static.shifts.perturbation import OwnShift
 from ssad.world.models import MODELS
 
 
@@ -92,13 +91,12 @@ class OwnShiftedCamera(ShiftedCamera):
 
     Args:
         camera: The camera.
-        shift: The shift.
-        seed: Root of its random numbers.
+        shift: Shifts images [N, H, W, 3], given their descriptions.
     """
 
-    def __init__(self, camera: OnboardCamera, shift: OwnShift, seed: int) -> None:
+    def __init__(self, camera: OnboardCamera, shift: Callable[[U8, Sequence[Frame]], U8]) -> None:
         super().__init__(camera, ShiftSpec("uniform", 0))
-        self.shift, self.seed = shift, seed
+        self.shift = shift
 
     @property
     def _needs_boxes(self) -> bool:
@@ -107,12 +105,7 @@ class OwnShiftedCamera(ShiftedCamera):
 
     def _shifted(self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]) -> U8:
         """Return the images [N, H, W, 3] under the shift, each by itself: no result depends on the batch."""
-        return np.stack(
-            [
-                self.shift.shifted(image[None], [frame], self.seed)[0]
-                for image, frame in zip(images, frames, strict=True)
-            ]
-        )
+        return np.stack([self.shift(image[None], [frame])[0] for image, frame in zip(images, frames, strict=True)])
 
 
 def boxes_of(sight: Sight, speed: F32) -> tuple[TrackedBoxes, F64]:

@@ -178,4 +178,4 @@ class OwnShift(Perturbation):
 def _own_shifted_camera(onboard: Onboard, camera: Camera, *, shift: OwnShift, seed: int) -> Sensor:
     from ssad.scenarios.static.shifts.loop import OwnShiftedCamera
 
-    return OwnShiftedCamera(onboard.camera(camera), shift, seed)
+    return OwnShiftedCamera(onboard.camera(camera), partial(shift.shifted, seed=seed))
