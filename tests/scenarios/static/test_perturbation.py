@@ -19,7 +19,7 @@ from ssad.core.images import read_image
 from ssad.core.types import Controller, Limits
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import Watched
-from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.recorders.target_images import record_clips
 from ssad.recorders.target_recording import Clips
 from ssad.rendering import onboard
@@ -190,7 +190,7 @@ def test_it_acts_on_a_recorded_target(name: str, targets: dict[str, Path]) -> No
 
 def on_target(perturbation: Perturbation, folder: Path) -> float:
     """Mean change of the images by a perturbation, code values."""
-    images = TargetClips(folder, 1)
+    images = LightableClips(folder, 1)
     changed = list(perturbation.on_target(images))
     clean = list(images.clean())
     assert [drive for drive, _, _ in changed] == [drive for drive, _, _ in clean]

@@ -190,3 +190,20 @@ def _kept(folder: Path, hour: str, count: int, device: str) -> tuple[LitClip, ..
 def _stages(folder: Path, device: str) -> dict[Any, Any]:
     """Return the cache of the scenes of a recording, which are the same at all hours."""
     return {}
+
+
+@dataclass(frozen=True, slots=True)
+class LightableClips(TargetClips):
+    """Recorded images of a target that can wear textures, and be shown at another hour in any light.
+
+    It is the `TargetImages` of `ssad.scenarios.static.perturbation`.
+    """
+
+    def lit(self, hour: str, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, at an hour and with an edit around the target.
+
+        Raises:
+            FormatError: The folder holds no recording of this version.
+            UnknownNameError: There is no such hour.
+        """
+        return LitPictures.of(self, hour).under(edit)

@@ -20,9 +20,8 @@ from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.detectors import loaded_detector
 from ssad.engine.pool import open_pool, run_all
-from ssad.experiments.perception.physical.lit_images import LitPictures
+from ssad.experiments.perception.physical.lit_images import LightableClips, LitPictures
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
-from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
 from ssad.recorders.target_recording import Clips
 from ssad.rendering.camera.scene import Decal, Layer
@@ -68,11 +67,11 @@ class TargetAttacks:
         detector: Detector = loaded_detector(name, device=self.device)
         return detector
 
-    def clips(self, recording: str, count: int, detector: str) -> TargetClips:
+    def clips(self, recording: str, count: int, detector: str) -> LightableClips:
         """Return the first images of a recording, clean or ready for a texture."""
         victim = self.detector(detector)
         folder = self.folder / "data" / recording
-        return TargetClips(folder, count, tuple(victim.classes), self.device, whole=victim.task == "3d")
+        return LightableClips(folder, count, tuple(victim.classes), self.device, whole=victim.task == "3d")
 
     def texture(self, spec: TextureSpec) -> Tensor:
         """Return a texture [3, H, W], sRGB; it is trained now if necessary.
@@ -93,7 +92,7 @@ class TargetAttacks:
             spec, surface, views=views, detector=lambda: self.detector(spec.source), paint=base_paint
         )
 
-    def worn(self, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
+    def worn(self, clips: LightableClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image and truth of recorded images under a texture, which is trained now if necessary."""
         return worn(clips, albedo_of(self.texture(spec)), surface_of(self.target, spec.surface))
 
@@ -150,7 +149,7 @@ class TargetAttacks:
     def sheet(
         self,
         detector: str,
-        clips: TargetClips,
+        clips: LightableClips,
         *,
         textures: Mapping[str, TextureSpec],
         sides: Sequence[float | None],

@@ -19,7 +19,6 @@ from ssad.core.images import read_image
 from ssad.core.nuscenes_names import NO_ATTRIBUTE
 from ssad.experiments.perception.physical.textured_images import textured_clips
 from ssad.recorders.target_images import CLASSES, clip_rows
-from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical import Surface, View
 
 
@@ -86,17 +85,6 @@ class TargetClips:
                 f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
                 "the camera sees, or another camera"
             )
-
-    def lit(self, hour: str, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, at an hour and with an edit around the target.
-
-        Raises:
-            FormatError: The folder holds no recording of this version.
-            UnknownNameError: There is no such hour.
-        """
-        from ssad.experiments.perception.physical.lit_images import LitPictures
-
-        return LitPictures.of(self, hour).under(edit)
 
 
 def target_truth(
