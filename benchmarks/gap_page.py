@@ -33,6 +33,7 @@ from ssad.experiments.gap.page import (
     change,
     conditions,
     drop_table,
+    family_of_line,
     rank_table,
     sign_table,
     values,
@@ -243,7 +244,7 @@ def figure(run: Run, path: Path) -> None:
     from matplotlib.figure import Figure
 
     colour = dict(zip(COLOURS, ("#d1495b", "#2e6fb7", "#7b4bb3", "#3c8d40", "#c98a1b"), strict=True))
-    family = {line["perturbation"]: str(line["family"]) for line in run.lines}
+    family = {line["perturbation"]: family_of_line(line) for line in run.lines}
     told = [(c, lost_share(run, c), change(run, c, "collision")) for c in conditions(run) if c[2]]
     told = [one for one in told if not math.isnan(one[1]) and not math.isnan(one[2].mean)]
     drawing = Figure(figsize=(7.6, 5.2), layout="constrained")

@@ -128,9 +128,9 @@ def test_parts_that_are_wrong_are_one_line(tmp_path: Path, system: dict[str, Any
 
 
 def test_an_attack_without_a_victim_fails_its_drives_with_a_line(tmp_path: Path) -> None:
-    rows = run(suite_of(tmp_path, AHEAD, perturbations=["attack-fgsm"]), tmp_path / "out")
+    rows = run(suite_of(tmp_path, AHEAD, perturbations=["fgsm"]), tmp_path / "out")
     assert [row["status"] for row in rows] == ["ok", "failed"]
-    assert "attack-fgsm needs a victim" in rows[1]["reason"]
+    assert "fgsm needs a victim" in rows[1]["reason"]
 
 
 def test_signs_are_read_by_a_perceiver_of_another_author() -> None:

@@ -59,7 +59,6 @@ COLOURS = {
     "fault": "var(--s1)",
     "shift": "var(--s0)",
     "digital": "var(--s2)",
-    "attack": "var(--s2)",  # of runs before version 0.2
     "texture": "var(--s3)",
     "light": "var(--s4)",
 }
@@ -231,9 +230,15 @@ def sign_table(run: Run) -> Table:
     )
 
 
+def family_of_line(line: Line) -> str:
+    """Return the family of a line's perturbation; digital attacks were of the family "attack" in earlier runs."""
+    family = str(line.get("family", ""))
+    return "digital" if family == "attack" else family
+
+
 def scatter(run: Run) -> str:
     """Fall of AP against rise of CR, a point a perturbation, with intervals; as SVG text, "" without perturbations."""
-    families = {line["perturbation"]: str(line.get("family", "")) for line in run.lines}
+    families = {line["perturbation"]: family_of_line(line) for line in run.lines}
     points = []
     for system, name, severity in (condition for condition in conditions(run) if condition[2]):
         fall, rise = (change(run, (system, name, severity), metric) for metric in ("AP", "collision"))
