@@ -28,7 +28,7 @@ TIMEOUT = 8.0
 class WordSuite(SuiteBase):
     """Systems x words."""
 
-    kind: Literal["engine.test_run:Words"] = "bench.test_run:Words"
+    kind: Literal["engine.test_run:Words"] = "engine.test_run:Words"
     systems: Names
     words: Names
     batch: int = 1
