@@ -24,7 +24,7 @@ from camera_speed import scene
 
 from ssad.core.detections import Truth
 from ssad.detectors import make_detector
-from ssad.rendering.camera.render import View, _develop, render
+from ssad.rendering.camera.render import View, develop_radiance, render
 from ssad.rendering.camera.sensor import PINHOLE, Sensor
 from ssad.rendering.camera.texture import retexture, taps_of
 from ssad.rendering.camera.torch_jpeg import jpeg
@@ -61,7 +61,7 @@ def rendered(view: View, radiance: Any, exposure: float, repeats: int) -> dict[s
     found = {}
     for name, sensor in RENDERED.items():
         views = [View(view.camera, view.pose, sensor=sensor, seed=3)]
-        found[name] = median(lambda views=views: _develop(held, views, [exposure]), repeats)  # type: ignore[misc]
+        found[name] = median(lambda views=views: develop_radiance(held, views, [exposure]), repeats)  # type: ignore[misc]
     return found
 
 
