@@ -54,6 +54,13 @@ GROUPS = {
     "ssad.kinds",
     "ssad.attacks",
     "ssad.generators",
+    "ssad.shifts",
+    "ssad.lights",
+    "ssad.faults",
+    "ssad.perturbations",
+    "ssad.perceivers",
+    "ssad.trackers",
+    "ssad.planners",
 }  # of entry points
 
 
