@@ -141,18 +141,22 @@ def _commands(name: str, command: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _command_section(name: str, command: Any) -> list[str]:
-    arguments = [one for one in command.params if one.param_type_name == "argument"]
-    options = [one for one in command.params if one.param_type_name == "option" and not one.hidden]
+    arguments = [parameter for parameter in command.params if parameter.param_type_name == "argument"]
+    options = [
+        parameter for parameter in command.params if parameter.param_type_name == "option" and not parameter.hidden
+    ]
     usage = " ".join([name, *(["[OPTIONS]"] if options else []), *map(_argument_name, arguments)])
     lines = [f"## `{name}`", "", *_help(command.help or ""), "", "```text", usage, "```", ""]
     if arguments:
         lines += ["| Argument | Description |", "|---|---|"]
-        lines += [f"| `{_cell(_argument_name(one))}` | {_cell(_linked(one.help or ''))} |" for one in arguments]
+        lines += [
+            f"| `{_cell(_argument_name(argument))}` | {_cell(_linked(argument.help or ''))} |" for argument in arguments
+        ]
         lines.append("")
     if options:
         lines += ["| Option | Default | Description |", "|---|---|---|"]
         for option in options:
-            names = ", ".join(f"`{one}`" for one in (*option.opts, *option.secondary_opts))
+            names = ", ".join(f"`{flag}`" for flag in (*option.opts, *option.secondary_opts))
             kind = option.metavar or option.display_type(command.context_class(command))
             kind = str(kind).strip("<>").removesuffix(" range")
             value = "" if option.is_flag else f" `{_cell(KINDS_OF_VALUE.get(kind, kind).upper())}`"
@@ -232,22 +236,22 @@ def _type(annotation: Any) -> str:
 
 def _bounds(metadata: typing.Sequence[Any]) -> list[str]:
     """Return the bounds that constraints of pydantic state."""
-    found: list[str] = []
-    for one in metadata:
-        if isinstance(one, FieldInfo):
-            found += _bounds(one.metadata)
+    bounds: list[str] = []
+    for constraint in metadata:
+        if isinstance(constraint, FieldInfo):
+            bounds += _bounds(constraint.metadata)
             continue
-        found += [
-            words.format(f"{getattr(one, name):,}".removesuffix(".0"))
+        bounds += [
+            words.format(f"{getattr(constraint, name):,}".removesuffix(".0"))
             for name, words in BOUNDS.items()
-            if hasattr(one, name)
+            if hasattr(constraint, name)
         ]
         for name, words in (("min_length", "at least"), ("max_length", "at most")):
-            if (length := getattr(one, name, None)) is not None:
-                found.append("not empty" if name == "min_length" and length == 1 else f"length {words} {length}")
-        if pattern := getattr(one, "pattern", None):
-            found.append(f"matches `{pattern}`")
-    return list(dict.fromkeys(found))
+            if (length := getattr(constraint, name, None)) is not None:
+                bounds.append("not empty" if name == "min_length" and length == 1 else f"length {words} {length}")
+        if pattern := getattr(constraint, "pattern", None):
+            bounds.append(f"matches `{pattern}`")
+    return list(dict.fromkeys(bounds))
 
 
 def _default(field: FieldInfo) -> str:
@@ -262,7 +266,7 @@ def _yaml(value: Any) -> str:
     if isinstance(value, BaseModel):
         return _yaml(value.model_dump(exclude_defaults=True))
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_yaml(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {_yaml(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_yaml, value)) + "]"
     if value is None or isinstance(value, bool):

@@ -41,10 +41,10 @@ FAMILIES: Final = ("shift", "digital", "texture", "light", "fault")
 SPELLINGS: Final = {"attack": "digital", "perturbation": "own"}  # keys of an entry beside the families themselves
 GROUPS: Final = {"shift": "shift", "digital": "attack", "light": "light", "fault": "fault", "own": "perturbation"}
 RADII: Final = (1.0, 2.0, 4.0, 8.0, 16.0)  # code values that a digital attack may move a pixel by, by severity
-STEPPED: Final = ("pgd", "cw", "momentum", "apgd")  # attacks that take five steps where nothing else is said:
-STEPS: Final = 5  # two steps of 16 code values change nothing on YOLOv5n
+# Attacks that take five gradient steps unless a suite sets them: two steps of 16 code values change nothing on YOLOv5n.
+STEPPED: Final = ("pgd", "cw", "momentum", "apgd")
+STEPS: Final = 5
 LOSS: Final = "margin"  # of attacks: it hides objects, and needs no truth beside the detections
-RESERVED: Final = ("severity", "severities", "label", "options")
 
 Severity = Annotated[int, Field(ge=1, le=5)]
 
@@ -321,6 +321,8 @@ def parse_perturbation(value: Any) -> PerturbationEntry:
         problem = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in problem["loc"][2:])
         text = problem["msg"].removeprefix("Value error, ")
+        if text.startswith("perturbation "):  # it names itself
+            raise ConfigError(text) from None
         raise ConfigError(f"perturbation {value!r}: {place + ': ' if place else ''}{text}") from None
 
 
@@ -458,7 +460,7 @@ def family_of_name(name: str) -> str:
 
 def _check_name(family: str, name: str) -> None:
     """Raise UnknownNameError if a family has no such name."""
-    names = {known for known, own_family in registered_names().items() if own_family == family}
+    names = {registered for registered, its_family in registered_names().items() if its_family == family}
     if name in names or ":" in name or (family in ("texture", "light") and is_path(name)):
         return
     raise unknown_name("perturbation", name, names)
@@ -466,16 +468,16 @@ def _check_name(family: str, name: str) -> None:
 
 def _family_of_object(name: str) -> str:
     """Return the family of "module:object" from the methods of its object."""
-    found = resolve("perturbation", {}, name)
-    if inspect.isfunction(found):
-        found = make("perturbation", name, found, {}, ())
-    if isinstance(found, Perturbation) or (isinstance(found, type) and issubclass(found, Perturbation)):
+    candidate = resolve("perturbation", {}, name)
+    if inspect.isfunction(candidate):
+        candidate = make("perturbation", name, candidate, {}, ())
+    if isinstance(candidate, Perturbation) or (isinstance(candidate, type) and issubclass(candidate, Perturbation)):
         return "own"
     methods = {"digital": ("perturb",), "shift": ("shift",), "light": ("ranges", "edit"), "fault": ("apply",)}
     for family, needed in methods.items():
-        if all(callable(getattr(found, method, None)) for method in needed):
+        if all(callable(getattr(candidate, method, None)) for method in needed):
             return family
-    if any(callable(getattr(found, method, None)) for method in ("observe", "command")):
+    if any(callable(getattr(candidate, method, None)) for method in ("observe", "command")):
         return "fault"
     raise ConfigError(
         f"perturbation '{name}' has none of the methods perturb (attack), shift (shift), ranges and edit (light), "
@@ -501,21 +503,21 @@ def is_path(name: str) -> bool:
 
 def _made(kind: str, name: str, options: Mapping[str, Any], severity: int, needed: tuple[str, ...]) -> Any:
     """Return an object of the user's own, made with its options, and with the severity if it takes one."""
-    found = resolve(kind, {}, name)
-    given = dict(options)
+    factory = resolve(kind, {}, name)
+    arguments = dict(options)
     if _takes_severity(kind, name):
-        given["severity"] = severity
-    return make(kind, name, found, given, needed)
+        arguments["severity"] = severity
+    return make(kind, name, factory, arguments, needed)
 
 
 def _takes_severity(kind: str, name: str) -> bool:
     """Return True if a class or function of the user's own has an argument `severity`."""
-    found = resolve(kind, {}, name)
-    if not callable(found):
+    factory = resolve(kind, {}, name)
+    if not callable(factory):
         return False
     try:
-        return "severity" in inspect.signature(found).parameters
-    except (TypeError, ValueError):
+        return "severity" in inspect.signature(factory).parameters
+    except (TypeError, ValueError):  # a class written in C has no signature
         return False
 
 
@@ -538,7 +540,7 @@ class PerturbationTable(Schema):
     """Keys of every suite that takes perturbations.
 
     Attributes:
-        perturbations: Names, paths or module:object, with settings (docs/reference/gap.md); "none" always runs.
+        perturbations: Names, paths or module:object, with settings (docs/reference/perturbations.md).
         severities: Severities 1 to 5 of the perturbations that set none of their own.
     """
 

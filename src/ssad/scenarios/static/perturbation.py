@@ -76,7 +76,7 @@ class PerturbedScene:
 
     Attributes:
         look: Returns the images of camera frames; None: the unmodified files.
-        notes: Returns plain data for the record, complete after the last image.
+        notes: Returns counts for the record by name, complete after the last image; a digital attack returns its tally.
         ahead: Whether the next images may be made while a detector processes these.
         images_at_once: Camera images that should be asked for together; 0: any number.
         done: Called when the detections are stored.
