@@ -90,3 +90,13 @@ def test_textures_and_lights_are_scored_on_their_target(tiny_set: Path, tmp_path
 def test_a_wrong_suite_is_refused_before_it_runs(tiny_set: Path, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(SSADError, match=words):
         Perception().plan(suite_of(tiny_set, **changes))
+
+
+def test_two_spellings_of_a_target_are_recorded_once(tiny_set: Path) -> None:
+    suite = suite_of(tiny_set, detectors=["yolov5n"], perturbations=["grey", "das-yolov5n-twinford"])
+    cells = Perception().plan(suite).cells
+    assert [(cell.fields["data"], cell.fields["perturbation"]) for cell in cells] == [
+        ("sedan", "none"),
+        ("sedan", "grey"),
+        ("sedan", "das-yolov5n-twinford"),
+    ]

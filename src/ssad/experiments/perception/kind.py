@@ -34,7 +34,7 @@ from ssad.experiments.perception.sheets import detection_sheet
 from ssad.metrics.target_attacks import Sighting, precision, sightings, target_scores
 from ssad.recorders.target_images import record_all
 from ssad.recorders.target_recording import Clips
-from ssad.rendering.target import TargetCar, class_of_target, parse_target
+from ssad.rendering.target import Target, TargetCar, class_of_target, parse_target
 from ssad.scenarios.static.catalogue import NONE, PerturbationTable, parse_perturbation
 from ssad.scenarios.static.digital.perturbation import DigitalAttack
 from ssad.scenarios.static.digital.tally import sum_notes
@@ -95,9 +95,11 @@ class Perception(DetectorKind):
         ]
         on_scenes = [pair for pair in pairs if not pair[0].needs_target]
         targets: dict[str, list[tuple[Perturbation, Any]]] = {}
+        spellings: dict[Target, str] = {}  # "sedan" and "sedan:silver:0" are one target, recorded once
         for pair in pairs:
             if pair[0].needs_target:
-                targets.setdefault(pair[0].target, []).append(pair)
+                spelling = spellings.setdefault(parse_target(pair[0].target), pair[0].target)
+                targets.setdefault(spelling, []).append(pair)
         data = data_of(suite) if on_scenes or not targets else {}
         cells = []
         for detector in detectors:
