@@ -30,7 +30,7 @@ def own() -> Any:
 
 def test_it_is_short_and_the_page_names_it() -> None:
     assert len(FILE.read_text().splitlines()) < 100
-    assert "(own_detector.py)" in (FILE.parent / "detectors.md").read_text()
+    assert "(own_detector.py)" in (FILE.parent / "use-detectors.md").read_text()
 
 
 @pytest.mark.parametrize("size", [(96, 128), (50, 70)])

@@ -52,7 +52,7 @@ def test_adversaries_by_selection() -> None:
 
 
 def test_parts_of_a_perceiving_driver() -> None:
-    names = run(FOLDER / "how-to" / "perceiving-parts.md")
+    names = run(FOLDER / "perceiving-parts.md")
     assert [trace.end == "collision" for trace in names["traces"]] == [False, False]
     assert names["traces"][0].brake.max() == 1.0  # for the car ahead
 
