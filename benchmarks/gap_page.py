@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.provenance import origin, warning
+from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.experiments.gap.page import (
     COLOURS,
     Condition,
@@ -38,7 +39,6 @@ from ssad.experiments.gap.page import (
     sign_table,
     values,
 )
-from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.report.load import Run, load_run
 from ssad.report.tables import Cell, Row, Table, to_markdown

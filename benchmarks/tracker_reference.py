@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from ssad.core.perception import I64, Objects
 from ssad.core.types import F64, AgentKind
-from ssad.drivers.perceiving.objects import I64, Objects
 from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
 from ssad.metrics.tracking import TrackedFrame, TrackScores, track_scores
 
@@ -48,7 +48,7 @@ def boxes_of_drive(scenario: Any, detector: Any) -> Frames:
     from ssad import World, build_episode, load_town, make_system, rollout
     from ssad.core.rotations import upright_pose
     from ssad.drivers.perceiving.eyes import front, projected
-    from ssad.experiments.gap.component_metrics import in_view
+    from ssad.metrics.perception_in_drive import in_view
     from ssad.rendering.onboard import Onboard
     from ssad.world.models import MODELS
 

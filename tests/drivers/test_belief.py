@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.traces import trace_hash
 from ssad.core.types import ENDS, AgentKind, Controller, EpisodeAgent, Pose, SignalState
 from ssad.drivers import make_system
-from ssad.drivers.belief import DegradedBelief, LineOfSight, in_sight
+from ssad.drivers.belief import DegradedBelief, LineOfSight
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.belief import Lanes, rested
@@ -110,37 +110,6 @@ def test_beliefs_do_not_depend_on_batch_or_order() -> None:
     for k in (0, count - 1):
         # alone, and beside a wider scene that brings more slots
         assert hashes([episodes[k]], graphs, driver()) == [told[k]]
-
-
-def test_what_a_bus_hides_is_not_there() -> None:
-    """Eye at 0, a bus from 14.9 to 25.1 m and 2.5 m wide: it covers |y| < 1.25 x / 14.9 behind it, no more."""
-
-    def rows(*places, size=(0.5, 0.5)):
-        pose = np.array([[[20.0, 0.0, 0.0], *[(x, y, 0.0) for x, y in places]]], np.float32)
-        sizes = np.array([[(10.27, 2.5), *[size] * len(places)]], np.float32)
-        kind = np.array([[AgentKind.BUS, *[AgentKind.WALKER] * len(places)]], np.int32)
-        return Belief(pose, np.zeros(kind.shape, np.float32), sizes, kind)
-
-    eye = np.zeros((1, 2), np.float32)
-    edge = 1.25 / (20.0 - 5.135) * 30.0  # of the shadow, 30 m ahead
-    places = [
-        (30.0, 0.0),
-        (30.0, edge - 0.4),
-        (30.0, edge + 0.4),
-        (10.0, 0.0),
-        (99.0, 30.0),
-        (101.0, 0.0),
-        (0.0, 101.0),
-    ]
-    assert in_sight(eye, rows(*places)).tolist() == [[True, False, False, True, True, False, False, False]]
-    # a corner is enough: a walker whose middle lies in the shadow, 0.2 m from its edge
-    assert in_sight(eye, rows((30.0, edge - 0.2))).tolist() == [[True, True]]
-    people = rows((30.0, 0.0))
-    hedge = replace(people, kind=np.full((1, 2), AgentKind.WALKER, np.int32))
-    assert in_sight(eye, hedge).all()  # people hide nobody
-    unused = replace(people, kind=np.array([[AgentKind.NONE, AgentKind.WALKER]], np.int32))
-    assert in_sight(eye, unused).tolist() == [[False, True]]
-    assert in_sight(np.array([[20.0, 0.5]], np.float32), people).all()  # who looks from inside sees out
 
 
 def test_line_of_sight_drives_as_if_what_is_hidden_were_not_there() -> None:

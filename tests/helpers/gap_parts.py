@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ssad.core.geometry import to_local
+from ssad.core.perception import Tracks
 from ssad.core.types import AgentKind
 from ssad.drivers.perceiving.ego_boxes import EgoBoxes
-from ssad.drivers.perceiving.tracks import Tracks
 from ssad.rendering.camera.rig import rig_camera
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from helpers.run_folder import write_run
 
+from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.experiments.gap.page import scatter, sign_table
-from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.report.load import load_run
 
 ROOT = Path(__file__).parents[2]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.optional import import_or_skip
 
-from ssad.drivers.perceiving.objects import no_objects
+from ssad.core.perception import no_objects
 from ssad.drivers.perceiving.tracker import KalmanTracker
 from ssad.metrics.tracking import TrackedFrame, similarity_of, track_scores
 

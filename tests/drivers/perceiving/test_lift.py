@@ -13,11 +13,12 @@ from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, AgentKind
 from ssad.drivers.perceiving.eyes import boxes_of, projected
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
-from ssad.drivers.perceiving.objects import KINDS, SIZES, Objects, no_objects
+from ssad.drivers.perceiving.objects import KINDS, SIZES
 from ssad.rendering.camera.rig import RIG, rig_camera
 
 EGO = (120.0, -35.0, 2.1)

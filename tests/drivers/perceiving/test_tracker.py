@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError
+from ssad.core.perception import Objects, no_objects
 from ssad.core.types import AgentKind
-from ssad.drivers.perceiving.objects import Objects, no_objects
 from ssad.drivers.perceiving.tracker import KalmanTracker, KalmanTracks, Tracking
 from ssad.drivers.perceiving.tracks import believed
 

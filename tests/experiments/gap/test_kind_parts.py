@@ -10,10 +10,10 @@ import pytest
 from rich.console import Console
 
 from ssad.core.errors import ConfigError, SSADError
+from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Resources
 from ssad.engine.run import run as run_plan
 from ssad.experiments.gap.kind import Gap, GapSuite
-from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.experiments.suites import load_suite
 
 PARTS = "helpers.gap_parts"

@@ -16,7 +16,7 @@ from ssad.core.rotations import yaw_to_quaternion
 from ssad.core.types import EpisodeTrace, LaneType
 from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import PerfectEyes, front
-from ssad.experiments.gap.component_metrics import Watcher
+from ssad.drivers.perceiving.recorder import PerceptionRecorder
 from ssad.experiments.gap.drive_sheet import Seen
 from ssad.experiments.gap.mcap import need_mcap, write_mcap
 from ssad.world.rollout import rollout
@@ -26,7 +26,7 @@ def driven() -> tuple[EpisodeTrace, Seen, Any]:
     scenario = next(one for one in load_scenarios("precrash") if one.name == "StraightObstacle/00")
     town = load_town(scenario.town)
     cameras = front(96)
-    watcher = Watcher(cameras, 1)
+    watcher = PerceptionRecorder(cameras, 1)
     episode = build_episode(scenario, town, seed=0)
     (trace,) = rollout(World([episode], {town.name: town}), Perceiving(PerfectEyes(cameras), watch=watcher))
     pictures = [(0.2 * k, np.full((54, 96, 3), 20 * k, np.uint8)) for k in range(5)]

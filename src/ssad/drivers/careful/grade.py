@@ -12,7 +12,7 @@ import numpy as np
 from ssad.core.driving import Policies, Sensor
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Bool, Episode, EpisodeTrace
-from ssad.drivers.belief import in_sight
+from ssad.core.visibility import in_sight
 from ssad.drivers.careful.driver import REACH, Careful
 from ssad.drivers.careful.limit import Evasions, Limit, OwnSide, limit_of, manoeuvres
 from ssad.drivers.careful.models import MODELS

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ssad.core.driving import Belief, Observation
 from ssad.core.geometry import to_local
 from ssad.core.types import F64, AgentKind, Bool
-from ssad.drivers.belief import in_sight
+from ssad.core.visibility import in_sight
 from ssad.drivers.careful.encounter import Encounter
 
 BEHIND, BEYOND = 20.0, 80.0  # m of straight extension before the first and after the last point of the route

@@ -10,14 +10,14 @@ import numpy as np
 
 from ssad.core.driving import Observation, Reproducible, Sensor, Simulator
 from ssad.core.errors import ConfigError
+from ssad.core.perception import I64, Objects, Tracks, no_objects
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, AgentKind, Episode
 from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import PerfectEyes
-from ssad.drivers.perceiving.objects import I64, Objects, no_objects
 from ssad.drivers.perceiving.parts import Perceiver, Percepts, Planner, Tracker, restored, snapshot_of
 from ssad.drivers.perceiving.sensors import sensors_of
-from ssad.drivers.perceiving.tracks import Tracks, check_tracks
+from ssad.drivers.perceiving.tracks import check_tracks
 from ssad.rendering.onboard import Onboard
 from ssad.world.rollout import Loop, step_limit
 

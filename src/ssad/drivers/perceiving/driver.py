@@ -20,11 +20,11 @@ from ssad.core.detections import Detections
 from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.perception import I64, Objects, Tracks, no_objects
 from ssad.core.rotations import upright_poses
 from ssad.core.types import F32, F64, I32, U8, Bool, Controller, Episode
 from ssad.drivers.perceiving.ego_boxes import EgoBoxes, boxes_in_world, check_boxes, sign_places
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
-from ssad.drivers.perceiving.objects import I64, Objects, no_objects
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     Planner,
@@ -38,7 +38,7 @@ from ssad.drivers.perceiving.planner import AutopilotPlanner
 from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.signs import SignMemory, SignReading, read_signs, sign_labels
 from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
-from ssad.drivers.perceiving.tracks import Tracks, believed, check_tracks
+from ssad.drivers.perceiving.tracks import believed, check_tracks
 
 if TYPE_CHECKING:
     from ssad.rendering.lidar import Lidar

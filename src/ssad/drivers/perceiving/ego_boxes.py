@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssad.core.errors import ConfigError
+from ssad.core.perception import I64, Objects, no_objects
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64
 from ssad.drivers.perceiving.lift import Lifting, position_spread
-from ssad.drivers.perceiving.objects import I64, KINDS, Objects, no_objects
+from ssad.drivers.perceiving.objects import KINDS
 
 LEAST_SIZE = 0.2  # m, so that no object has an empty outline
 

@@ -19,13 +19,14 @@ from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import CAMERAS, MMDET3D_ATTRIBUTES, MMDET3D_CLASSES
+from ssad.core.perception import I64
 from ssad.core.protocols import Detector
 from ssad.core.rotations import Floats, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Episode
+from ssad.core.visibility import in_sight
 from ssad.detectors import make_detector
-from ssad.drivers.belief import in_sight
-from ssad.drivers.perceiving.objects import I64, SIZES
+from ssad.drivers.perceiving.objects import SIZES
 from ssad.drivers.perceiving.tracker import tracking_of
 from ssad.rendering.camera.rig import rig_camera
 
@@ -233,7 +234,7 @@ class PerfectEyes:
     """Perfect detector that knows the truth: it finds every visible object at its true position.
 
     An object is found if its centre is in front of a camera, a part of its outline is in the image, and it is not
-    hidden (see `ssad.drivers.belief.in_sight`). `missed`, `noise` and `phantoms` add the failures of real detectors.
+    hidden (see `ssad.core.visibility.in_sight`). `missed`, `noise` and `phantoms` add the failures of real detectors.
 
     Args:
         cameras: Cameras by name; None: the front camera of nuScenes.

@@ -19,8 +19,9 @@ from ssad.core.boxes import camera_axes
 from ssad.core.detections import Detections
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.perception import I64, Objects, no_objects
 from ssad.core.types import F64, Bool
-from ssad.drivers.perceiving.objects import I64, KINDS, LARGE, SIZES, Objects, no_objects
+from ssad.drivers.perceiving.objects import KINDS, LARGE, SIZES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,14 +46,13 @@ from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import CAMERAS
+from ssad.core.perception import I64, Objects, Tracks
 from ssad.core.registry import Reference, make, names, resolve
 from ssad.core.safeio import read_bytes
 from ssad.core.seeding import digest
 from ssad.core.source import source_version
 from ssad.core.types import F32, F64, I32, Controller, Episode
 from ssad.drivers.perceiving.ego_boxes import EgoBoxes
-from ssad.drivers.perceiving.objects import I64, Objects
-from ssad.drivers.perceiving.tracks import Tracks
 from ssad.rendering.camera.rig import rig_camera
 
 Percepts = Sequence[EgoBoxes | None] | Mapping[str, Sequence[Detections | None]]

@@ -9,12 +9,12 @@ import numpy as np
 
 from ssad.core.driving import Belief, Observation
 from ssad.core.frames import Camera
+from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import Bool
-from ssad.drivers.belief import in_sight
+from ssad.core.visibility import in_sight
 from ssad.drivers.perceiving.eyes import PerfectEyes, boxes_of, projected
 from ssad.drivers.perceiving.lift import Lifting, lift
-from ssad.drivers.perceiving.objects import Objects, no_objects
 
 AROUND = 5.0  # m around the object within which what was found is taken for it
 

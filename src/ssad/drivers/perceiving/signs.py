@@ -15,11 +15,11 @@ import numpy as np
 from ssad.core.detections import Detections
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.perception import SIGN_MATCH_SHARE
 from ssad.core.types import F32, F64, I32, U8
 
 NAMES: Final = ("stop_sign", "stop sign")  # of our detectors and of COCO
 FACE: Final = 0.762  # m, height of the face of a sign R1-1 (30 inches) on a street
-SAME: Final = 0.35  # share of its distance within which another reading belongs to the same sign
 AHEAD, ASIDE, BEHIND = 70.0, 14.0, 2.0  # m around the ego, along and across its heading, within which a sign counts
 
 
@@ -118,7 +118,7 @@ class SignMemory:
         """
         updated: set[int] = set()
         for place in places:
-            reach = SAME * float(np.linalg.norm(place - eye)) + 1.0
+            reach = SIGN_MATCH_SHARE * float(np.linalg.norm(place - eye)) + 1.0
             distances = [
                 (float(np.linalg.norm(sign.place - place)), sign_index)
                 for sign_index, sign in enumerate(self._known[scene])

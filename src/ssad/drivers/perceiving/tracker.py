@@ -23,11 +23,10 @@ from scipy.optimize import linear_sum_assignment
 
 from ssad.core.columns import concatenate
 from ssad.core.errors import ConfigError
+from ssad.core.perception import I64, Objects, Tracks
 from ssad.core.registry import Reference
 from ssad.core.types import F64, I32, AgentKind, Episode
 from ssad.drivers.perceiving.kalman import distance, predict, update
-from ssad.drivers.perceiving.objects import I64, Objects
-from ssad.drivers.perceiving.tracks import Tracks
 
 MEMORY = 0.8  # weight of the earlier sizes, kinds and headings at each hit
 SCORES = {

@@ -1,55 +1,16 @@
-"""Tracks of the objects around egos, as a tracker reports them, and the belief that they make."""
+"""Checks of the tracks that a tracker returns, and the belief that they make."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
-from ssad.core.types import F64, I32, AgentKind
-from ssad.drivers.perceiving.objects import I64
-
-
-@dataclass(frozen=True, slots=True)
-class Tracks:
-    """Table of N tracked objects of several scenes, in the world frame.
-
-    Attributes:
-        scene: [N] index of the scene.
-        ident: [N] number of the track, unique in its scene for the whole episode.
-        place: [N, 2] x, y of the centre, m.
-        velocity: [N, 2] along x and y, m/s.
-        yaw: [N] heading, rad.
-        size: [N, 2] length and width, m; above 0.
-        kind: [N] `ssad.core.types.AgentKind`; not NONE.
-        score: [N] confidence of the last detection, 0 to 1.
-    """
-
-    scene: I64
-    ident: I64
-    place: F64
-    velocity: F64
-    yaw: F64
-    size: F64
-    kind: I64
-    score: F64
-
-    def __len__(self) -> int:
-        return len(self.scene)
-
-    def take(self, index: npt.NDArray[Any] | slice) -> Self:
-        """Return the rows selected by indices, a mask or a slice."""
-        return type(self)(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
-
-
-def no_tracks() -> Tracks:
-    """Return a table without rows."""
-    floats, integers, pairs = np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 2))
-    return Tracks(integers, integers, pairs, pairs, floats, pairs, integers, floats)
+from ssad.core.perception import I64, Tracks
+from ssad.core.types import I32, AgentKind
 
 
 def check_tracks(tracks: Any, scenes: I32 | I64, tracker: str) -> None:
@@ -65,8 +26,7 @@ def check_tracks(tracks: Any, scenes: I32 | I64, tracker: str) -> None:
     """
     if not isinstance(tracks, Tracks):
         raise ConfigError(
-            f"tracker {tracker}: confirmed returned {type(tracks).__name__}; return a "
-            "ssad.drivers.perceiving.tracks.Tracks"
+            f"tracker {tracker}: confirmed returned {type(tracks).__name__}; return a ssad.core.perception.Tracks"
         )
     count = len(np.atleast_1d(tracks.scene))
     for column in fields(Tracks):

@@ -12,8 +12,9 @@ import numpy as np
 from ssad.core.geometry import to_local
 from ssad.core.images import captioned
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.perception import Perceived
 from ssad.core.types import F64, U8, EpisodeTrace
-from ssad.experiments.gap.component_metrics import Perceived, in_view
+from ssad.metrics.perception_in_drive import in_view
 
 WIDTH, TALL, SCALE, BEHIND = 360, 360, 6.0, 8.0  # pixels, pixels a metre, m behind the ego
 GROUND, LANE, THERE, UNSEEN, FOUND, KNOWN, EGO = (

@@ -17,9 +17,14 @@ from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.core.machine import quiet_warp
 from ssad.core.traces import first_difference, load_trace
+from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
 from ssad.experiments.gap import page
-from ssad.experiments.gap.component_metrics import (
+from ssad.experiments.gap.drive_sheet import Seen, drive_film, drive_sheet
+from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired
+from ssad.experiments.gap.verdict import verdict
+from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
+from ssad.metrics.perception_in_drive import (
     BANDS,
     SIGN_BANDS,
     cause_of_collision,
@@ -29,11 +34,6 @@ from ssad.experiments.gap.component_metrics import (
     phantom_stop,
     sign_metrics,
 )
-from ssad.experiments.gap.drive_sheet import Seen, drive_film, drive_sheet
-from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired
-from ssad.experiments.gap.perceiving_system import PerceivingSystem
-from ssad.experiments.gap.verdict import verdict
-from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.scenarios.static.catalogue import NONE, PerturbationTable

@@ -10,11 +10,11 @@ import numpy as np
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
 from ssad.core.types import Episode, EpisodeTrace
+from ssad.drivers.perceiving.recorder import PerceptionRecorder
 from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.sensors import sensor_suite
-from ssad.experiments.gap.component_metrics import Watcher
+from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.experiments.gap.other_drives import images_of_other_drives
-from ssad.experiments.gap.perceiving_system import PerceivingSystem
 from ssad.metrics import episode_metrics
 from ssad.scenarios.static.catalogue import parse_perturbation
 from ssad.scenarios.static.perturbation import Perturbation
@@ -28,7 +28,7 @@ def drive_perceiving(
     seed: int,
     repair: Repair | None = None,
     every: float | None = 0.5,
-) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
+) -> tuple[list[Episode], list[EpisodeTrace], PerceptionRecorder | None]:
     """Episodes and traces of orders of one system under one perturbation, and what was perceived in them.
 
     Args:
@@ -43,7 +43,7 @@ def drive_perceiving(
     if spec["settings"] is None:
         return *drive(orders, device=device, key=_paired)[:2], None
     system = PerceivingSystem.model_validate(spec["settings"])
-    watcher = Watcher(system.views, len(orders), every)
+    watcher = PerceptionRecorder(system.views, len(orders), every)
     driver = system.make(watcher, repair=repair, device=device)
     perturbation = perturbation_of(spec)
     if perturbation is not None and perturbation.needs_victim and driver.detector is None:

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.perception import Objects, Tracks, no_tracks
 from ssad.core.types import Episode
-from ssad.drivers.perceiving.objects import Objects
-from ssad.drivers.perceiving.tracks import Tracks, no_tracks
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

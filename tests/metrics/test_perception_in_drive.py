@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace, straight
 
+from ssad.core.perception import Objects, Perceived, Tracks, no_objects
 from ssad.core.types import AgentKind, Contact, EpisodeTrace
-from ssad.drivers.perceiving.objects import Objects, no_objects
 from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
-from ssad.drivers.perceiving.tracks import Tracks
-from ssad.experiments.gap.component_metrics import (
-    Perceived,
+from ssad.metrics.perception_in_drive import (
     cause_of_collision,
     component_metrics,
     hard_braking,
