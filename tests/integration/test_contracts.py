@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
 import tomllib
@@ -18,6 +20,45 @@ def test_imports_run_one_way() -> None:
     tool = Path(sys.executable).with_name("lint-imports")
     done = subprocess.run([str(tool), "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def rank_of_packages() -> dict[str, int]:
+    """Layer of each top-level package, from the contract of imports: the core is 0."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layers = contracts[0]["layers"]
+    return {name.strip(): rank for rank, layer in enumerate(reversed(layers)) for name in layer.split("|")}
+
+
+def packages_named(source: str) -> list[tuple[int, str]]:
+    """Lines and top-level packages of the strings of a module, docstrings aside, that name a module of SSAD."""
+    tree = ast.parse(source)
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }
+    # The string under an assignment is the documentation of that name.
+    docstrings |= {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    return [
+        (node.lineno, package)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
+        for package in re.findall(r"\bssad\.([a-z_]+)\.", node.value)
+    ]
+
+
+def test_no_string_names_a_layer_above_or_beside() -> None:
+    """A name that is resolved at run time, "ssad.x.y:Z", is an import that the contracts do not see."""
+    ranks, offences = rank_of_packages(), []
+    for path in SOURCE:
+        package = path.relative_to(ROOT / "src" / "ssad").parts[0].removesuffix(".py")
+        for line, named_package in packages_named(path.read_text()):
+            if named_package != package and ranks.get(named_package, -1) >= ranks.get(package, len(ranks)):
+                offences.append(f"{path.relative_to(ROOT)}:{line} names {named_package}")
+    assert offences == []
+    assert packages_named('"""ssad.cli.run"""\nX = {"a": "ssad.interchange.scenic:S"}') == [(2, "interchange")]
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -12,13 +12,15 @@ import math
 import random
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from ssad.core.errors import ConfigError, MissingExtraError, RouteError, SSADError
-from ssad.core.generators import Base, Outcome, Proposal
+from ssad.core.generators import Base, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import describe
 from ssad.core.rotations import wrap_angle
@@ -154,6 +156,17 @@ def map_of(town: str) -> Path:
 
 
 # ---------------------------------------------------------------- a generator
+
+
+def scenic_search(path: str) -> GeneratorFactory:
+    """Return the search that samples a Scenic program; the entry point behind "scenic:FILE".
+
+    Raises:
+        MissingExtraError: Scenic is not installed.
+    """
+    if find_spec("scenic") is None:
+        raise MissingExtraError(f"generator 'scenic:{path}'", "scenic")
+    return partial(ScenicSearch, path)
 
 
 class ScenicSearch:

@@ -12,7 +12,7 @@ import pytest
 from helpers.metric_traces import make_trace
 
 from ssad.core.driving import Observation, WorldState
-from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.errors import ConfigError, MissingExtraError, UnknownNameError
 from ssad.core.generators import Base, Generator, Outcome, Proposal
 from ssad.core.types import Bool, Controller, Pose
 from ssad.drivers import make_system
@@ -269,3 +269,22 @@ def test_efforts_beyond_a_body_are_seen(graph: Any) -> None:
     assert jerky.jerk is not None
     assert jerky.jerk > 12.65 * 1.1
     assert not jerky.within_limits
+
+
+def test_an_entry_point_makes_generators_from_files(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    package, info = tmp_path / "acme_programs.py", tmp_path / "acme_programs-1.0.dist-info"
+    package.write_text("def program(file):\n    return lambda bases, *, seeds, budget: (file, budget)\n")
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-programs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[ssad.generator_files]\nprogram = acme_programs:program\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    factory: Any = generator_factory("program:C:/drives/brake.prg")
+    assert factory([], seeds=[], budget=3) == ("C:/drives/brake.prg", 3)
+    with pytest.raises(ConfigError, match="importing programme failed"):
+        generator_factory("programme:brake.prg")
+
+
+def test_scenic_is_offered_to_those_who_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ssad.interchange.scenic_programs.find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"scenic:a\.scenic.*extra scenic"):
+        generator_factory("scenic:a.scenic")

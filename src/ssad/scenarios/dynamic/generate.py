@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from importlib.util import find_spec
-from typing import Any, cast
+from importlib.metadata import entry_points
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -41,25 +40,28 @@ GENERATORS: dict[str, str] = {
     "cat": "ssad.scenarios.dynamic.transition.trajectory:Cat",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""
-SCENIC = "scenic:"
-"""scenic:FILE.scenic is a generator that samples a Scenic program."""
-_PROGRAMS = {SCENIC: "ssad.interchange.scenic_programs:ScenicSearch"}
+FILE_GENERATORS = "ssad.generator_files"
+"""Group of entry points of generators that read a file, named PREFIX:FILE, such as "scenic:brake.scenic".
+
+Each is a function that takes FILE and returns a `GeneratorFactory`. Formats lie above scenarios in the order of
+imports, so this module knows none of them.
+"""
 BATCH = 8  # rollouts of a base side by side
 SCENES = 256  # episodes of one world
 _STILL = 0.05  # m; an agent that moves less is no adversary
 
 
 def generator_factory(name: str) -> GeneratorFactory:
-    """Return the factory of a generator by name, entry point or "module:object".
+    """Return the factory of a generator by name, entry point, PREFIX:FILE or "module:object".
 
     Raises:
+        MissingExtraError: It needs an extra that is not installed.
         UnknownNameError: No generator has that name; the message lists the closest ones.
         ConfigError: It cannot be imported, or cannot be called.
     """
-    if name.startswith(SCENIC):
-        if find_spec("scenic") is None:
-            raise MissingExtraError(f"generator '{name}'", "scenic")
-        return partial(cast(Any, resolve("generator", _PROGRAMS, SCENIC)), name.removeprefix(SCENIC))
+    prefix, _, file = name.partition(":")
+    if file and prefix in entry_points(group=FILE_GENERATORS).names:
+        return cast(GeneratorFactory, resolve("generator_file", {}, prefix)(file))
     resolved = resolve("generator", GENERATORS, name)
     if not callable(resolved):
         raise ConfigError(f"generator '{name}': expected a class or function (bases, *, seeds, budget)")
