@@ -259,7 +259,9 @@ def order_table(run: DetectionRun) -> Table | None:
 
     The levels of other images and detectors cannot be compared, but the order of the shifts can.
     """
-    published_by_detector = {name: column for name, column in zip(run.detectors, published_names(run), strict=True) if column}
+    published_by_detector = {
+        name: column for name, column in zip(run.detectors, published_names(run), strict=True) if column
+    }
     shifts = [shift for shift in run.shifts if shift in PUBLISHED]
     if len(shifts) < 3 or not published_by_detector:
         return None
