@@ -122,7 +122,7 @@ def beside() -> list[str]:
 def camera() -> list[str]:
     """Frames a second of the camera."""
     cpu, gpu = read("camera-cpu"), read("camera-h200")
-    loop, many, closed = read("camera-loop-cpu"), read("camera-loop-h200"), read("gap/speed")
+    loop, many, closed = read("camera-loop-cpu"), read("camera-loop-h200"), read("closed-loop")
     case, flat = (next(one for one in closed["cases"] if one["case"] == name) for name in ("fcos3d", "yolo"))
     stages = sorted(case["share"].items(), key=lambda one: -one[1])
     return [
