@@ -310,9 +310,9 @@ def page() -> str:
         "# Benchmarks",
         "",
         "> **Stored result.** Commit: of each section the last of its file in `benchmarks/results`, at most "
-        "e190b41 (2026-11-25). Weights: not recorded. Torch: 2.15.0 (attacks, detectors on a processor) and "
-        "2.11.0, which `pyproject.toml` no longer allows (detectors on GPUs); else not recorded. Make it "
-        "anew: the script that each section names, then `python benchmarks/page.py`.",
+        "e190b41 (2026-11-25). Weights: not recorded. Torch: where a file names it, 2.15.0 on processors and "
+        "2.11.0, which `pyproject.toml` no longer allows, on GPUs; else not recorded. Make it anew: the "
+        "script that each section names, then `python benchmarks/page.py`.",
         "",
         "`benchmarks/page.py` makes this page from the measurements in `benchmarks/results`. Only some of these files",
         "name the commit or the versions that they were measured with; sections say so where they do.",

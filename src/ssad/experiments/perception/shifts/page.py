@@ -259,9 +259,8 @@ def order_table(run: DetectionRun) -> Table | None:
 
     The levels of other images and detectors cannot be compared, but the order of the shifts can.
     """
-    published_by_detector = {
-        name: column for name, column in zip(run.detectors, published_names(run), strict=True) if column
-    }
+    names = zip(run.detectors, published_names(run), strict=True)
+    published_by_detector = {detector: name for detector, name in names if name}
     shifts = [shift for shift in run.shifts if shift in PUBLISHED]
     if len(shifts) < 3 or not published_by_detector:
         return None
