@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -25,7 +26,6 @@ from unittest.mock import patch
 import numpy as np
 import warp as wp
 
-from benchmarks.adversarial_page import cluster
 from benchmarks.make_scenario_sets import with_crossing_traffic
 from ssad.core.driving import Choice, Driver, WorldState
 from ssad.core.generators import Base, Proposal
@@ -216,6 +216,11 @@ def reg157_avoids(collisions: Sequence[Base]) -> list[bool]:
         driver = Careful("reg157", keep_speed=True)
         endings.append(Ending(*drive, [Takeover(driver, begin * trace.dt)], end + AFTER))
     return [not bool(hits[0]) for hits in play(endings)] if endings else []
+
+
+def cluster(name: str) -> str:
+    """A scenario, or the route of one with random traffic."""
+    return re.sub(r"^(natural[\w-]*/\w+)/\d+$", r"\1", name)
 
 
 def share(values: dict[str, float]) -> str:

@@ -441,6 +441,9 @@ def page() -> str:
     lines = [
         "# Accuracy of the shipped detectors",
         "",
+        "> **Stored result.** Commit: f0dc6d2 (2026-11-26). Weights: not recorded. Torch: not recorded. Make "
+        "it anew: `python benchmarks/detector_accuracy.py`, then the same with `--page`.",
+        "",
         "`benchmarks/detector_accuracy.py` measures it and makes this page. The stored file names neither commit nor",
         "versions nor weights. All images show towns that were not used for training (Oldmarket and Larkhill):",
         "```",

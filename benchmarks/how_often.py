@@ -5,7 +5,7 @@
 
 `brute` runs episodes of one scenario of the set lane-traffic until so many have ended in a collision, and saves after
 each batch; what FILE has of the same case is added to. `coverage` repeats both accelerated estimates (with other seeds
-in several processes); how many intervals hold, benchmarks/how_often_page.py counts.
+in several processes), and prints how many intervals of importance sampling hold their mean.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def beside() -> list[str]:
 def camera() -> list[str]:
     """Frames a second of the camera."""
     cpu, gpu = read("camera-cpu"), read("camera-h200")
-    loop, many, closed = read("camera-loop-cpu"), read("camera-loop-h200"), read("gap/speed")
+    loop, many, closed = read("camera-loop-cpu"), read("camera-loop-h200"), read("closed-loop")
     case, flat = (next(one for one in closed["cases"] if one["case"] == name) for name in ("fcos3d", "yolo"))
     stages = sorted(case["share"].items(), key=lambda one: -one[1])
     return [
@@ -308,6 +308,11 @@ def page() -> str:
     """The page."""
     lines = [
         "# Benchmarks",
+        "",
+        "> **Stored result.** Commit: of each section the last of its file in `benchmarks/results`, at most "
+        "e190b41 (2026-11-25). Weights: not recorded. Torch: where a file names it, 2.15.0 on processors and "
+        "2.11.0, which `pyproject.toml` no longer allows, on GPUs; else not recorded. Make it anew: the "
+        "script that each section names, then `python benchmarks/page.py`.",
         "",
         "`benchmarks/page.py` makes this page from the measurements in `benchmarks/results`. Only some of these files",
         "name the commit or the versions that they were measured with; sections say so where they do.",

@@ -4,8 +4,7 @@ A shadow can only take the sun's light where the sun shines, and a lamp only sho
 each hour, over pictures of drives of Oldmarket: how much of the light on the target's rear is the sun's, what is left
 of YOLOv5n's score when all of the sun is kept off the whole target (no card can do more), how many lux there are, how
 many the lamps of the suite physical-lights give at full power, and what the brightest of them leaves when it lights the
-whole rear. Writes benchmarks/results/physical_lights.json; benchmarks/physical_page.py shows it. Pictures are recorded
-once, in the folder --home.
+whole rear. Writes benchmarks/results/physical_lights.json. Pictures are recorded once, in the folder --home.
 """
 
 from __future__ import annotations

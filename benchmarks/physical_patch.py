@@ -4,8 +4,8 @@ Adv. Patch is trained against YOLOv5n on pictures of Twinford and shown in Oldma
 is, with one thing after the other made easier for the attack (no changes of print and place, no regularisers, colours
 that nothing can have, more epochs, other rates, whole pictures, one picture alone), and on more of the rear. `own` is
 the score in the pictures that it was trained on, printed exactly: the most that a variant can reach. A row is added to
-benchmarks/results/physical_patch.json, of which benchmarks/physical_page.py makes a table; --join adds the rows of
-other files. Pictures are recorded once, in the folder --home.
+benchmarks/results/physical_patch.json; --join adds the rows of other files. Pictures are recorded once, in the folder
+--home.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pages of numbers are what the measurements in benchmarks/results say, and tell when these are out of date."""
+"""Stored results say where they come from; pages that scripts make are what benchmarks/results says."""
 
 from __future__ import annotations
 
@@ -12,35 +12,51 @@ from pathlib import Path
 
 import pytest
 
-from ssad.core.checkpoints import state_hash
-from ssad.experiments.perception.scene_boxes import detector_of
+from benchmarks import avoidable
 from ssad.recorders.nuscenes import WEATHERS, draw_weather, weather_words
 from ssad.recorders.viewpoints import weather_name
-from ssad.scenarios.static.shifts import VERSIONS
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize(
-    ("script", "name"),
-    [
-        ("page", "speed"),
-        ("shift_page", "shifts"),
-        ("digital_page", "digital"),
-        ("detector_accuracy", "accuracy"),
-        ("how_often_page", "how-often"),
-    ],
+RESULTS = sorted(path.stem for path in (ROOT / "docs" / "results").glob("*.md") if path.stem != "index")
+COMMIT = re.compile(r"\b[0-9a-f]{7}\b[^.]* \(2\d{3}-\d{2}-\d{2}\)|\bnot recorded\b")
+HEADER = re.compile(
+    r"> \*\*Stored result\.\*\* Commit: (?P<commit>.+?)\. Weights: (?P<weights>.+?)\. Torch: (?P<torch>.+?)\. "
+    r"Make it anew: (?P<command>.+)\."
 )
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_begins_with_commit_weights_versions_and_command(name: str) -> None:
+    title, blank, line, *_ = (ROOT / "docs" / "results" / f"{name}.md").read_text().splitlines()
+    assert title.startswith("# ")
+    assert blank == ""
+    header = HEADER.fullmatch(line)
+    assert header, line
+    assert COMMIT.search(header["commit"])
+    assert re.search(r"\d+\.\d+\.\d+|not recorded|not used|on the pages", header["torch"])
+    for suite in re.findall(r"ssad run (\S+)", header["command"]):
+        assert (ROOT / suite).is_file() or (ROOT / "suites" / f"{suite}.yaml").is_file(), suite
+    assert "ssad run" not in header["command"] or "`ssad report DIR --markdown`" in header["command"]
+
+
+@pytest.mark.parametrize(("script", "name"), [("page", "speed"), ("detector_accuracy", "accuracy")])
 def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
     page = runpy.run_path(str(ROOT / "benchmarks" / f"{script}.py"))["page"]()
     assert page == (ROOT / "docs" / "results" / f"{name}.md").read_text(), f"run python -m benchmarks.{script}"
 
 
-def test_the_pages_of_physical_attacks_are_made_from_the_measurements() -> None:
-    pages = runpy.run_path(str(ROOT / "benchmarks" / "physical_page.py"))["pages"]()
-    assert {"physical", "physical-3d", "physical-limits"} <= set(pages)
-    for name, page in pages.items():
-        assert page == (ROOT / "docs" / "results" / f"{name}.md").read_text(), "run python -m benchmarks.physical_page"
+def test_the_table_of_trainings_is_what_its_command_makes() -> None:
+    shown = avoidable.DOCUMENT.read_text(encoding="utf-8").partition(avoidable.BEGIN)[2].partition(avoidable.END)[0]
+    assert shown.strip() == "\n".join(avoidable.table(json.loads(avoidable.RESULTS.read_text()))).strip()
+
+
+def test_every_draw_of_a_route_counts_in_the_table_of_trainings() -> None:
+    hits = {f"natural/Here_{k // 2}/{k % 2:02d}": float(k < 6) for k in range(12)}
+    assert avoidable.share(hits).startswith("0.50 ["), "and not the first of each route alone"
+    odd = {f"natural/Here_{k // 2}/{k % 2:02d}": float(k % 2) for k in range(12)}
+    assert avoidable.share(odd).startswith("0.50 "), "0.00 if later draws were taken for copies"
 
 
 @pytest.mark.parametrize("kind", WEATHERS)
@@ -49,25 +65,6 @@ def test_the_light_of_a_recorded_drive_is_read_from_its_words(kind: str) -> None
     for k in range(20):
         weather = draw_weather(("drive", k), kind)
         assert read(f"Town, {weather_words(weather)}") == weather_name(weather)
-
-
-@pytest.mark.parametrize("run", ["shifts", "shifts-paper"])
-def test_a_page_says_which_results_are_older_than_weights_and_shifts(run: str) -> None:
-    told = json.loads((ROOT / "benchmarks" / "results" / run / "run.json").read_text())
-    current = told["versions"]["shifts"] == str(VERSIONS[told["suite"]["calibration"]])
-    current &= told["weights"] == {
-        name: state_hash(detector_of(name, "", "cpu")) for name in ("fcos3d-light", "pgd-det-light")
-    }
-    warnings = [
-        line for line in (ROOT / "docs" / "results" / "shifts.md").read_text().splitlines() if line.startswith("> **")
-    ]
-    assert any(f"`{run}` with" in line for line in warnings) is not current
-
-
-def test_the_page_of_attacks_says_whether_weights_have_changed() -> None:
-    told = json.loads((ROOT / "benchmarks" / "results" / "digital" / "run.json").read_text())
-    current = told["weights"] == {name: state_hash(detector_of(name, "", "cpu")) for name in told["weights"]}
-    assert ("**Measured with earlier weights" in (ROOT / "docs" / "results" / "digital.md").read_text()) is not current
 
 
 def test_every_page_has_a_place_on_the_site_and_its_links_lead_somewhere(tmp_path: Path) -> None:

@@ -48,7 +48,9 @@ SIGNS = {
     "sign_read_at": "first read at, m",
     "stop_signs": "signs run",
 }
-BOUNDED = ("AP", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
+ERRORS = {"recall": "missed", "missed_burst": "burst", "distance_share": "noise", "phantoms": "phantoms"}
+"""Metric of a detector's errors -> setting of a perfect detector."""
+BOUNDED = ("AP", "recall", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
 CONDITION = {
     "System": field("system"),
     "Perturbation": field("perturbation"),
@@ -79,10 +81,9 @@ def summary(run: Run) -> Table:
 
 def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page and its tables."""
-    main, drop, rank, cause, signs = (
-        build_table(run) for build_table in (main_table, drop_table, rank_table, cause_table, sign_table)
-    )
-    tables = [main, drop, rank, cause, *([signs] if signs.rows else [])]
+    main, drop, rank, cause = (build_table(run) for build_table in (main_table, drop_table, rank_table, cause_table))
+    ceilings, errors, signs = (build_table(run) for build_table in (ceiling_table, error_table, sign_table))
+    tables = [main, drop, rank, cause, *(table for table in (ceilings, errors, signs) if table.rows)]
     failures = [
         ([line["system"], line["perturbation"], str(line["severity"]), line["cluster"]], line["reason"])
         for line in run.failures
@@ -92,6 +93,8 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
         run,
         verdict=verdict,
         main=main,
+        ceilings=ceilings,
+        errors=errors,
         drop=drop,
         rank=rank,
         cause=cause,
@@ -119,6 +122,48 @@ def main_table(run: Run) -> Table:
         "counts steps. CR: "
         "share of the drives with a collision. RC: share of the route completed. Hard braking: times above 4 m/s² a "
         f"drive. {METHODS}",
+    )
+
+
+def ceiling_table(run: Run) -> Table:
+    """Return the difference of each system from those that receive the ground truth, without perturbations."""
+    clean = clean_lines(run)
+    ceilings = [ceiling for ceiling in run.suite.get("ceilings", ()) if ceiling in clean]
+    metrics = ("collision", "route_completion")
+    return Table.pivot(
+        "ceilings",
+        "Against systems that receive the ground truth",
+        [line for system, lines in clean.items() if ceilings and system not in ceilings for line in lines],
+        rows={"System": field("system")},
+        columns={(ceiling, name): f"{MAIN[name]} less {ceiling}" for ceiling in ceilings for name in metrics},
+        metric=lambda lines, column: _difference(lines, clean[column[0]], column[1]),
+        note="Without perturbations, in the same drives: what perception costs. Without brackets: the range over the "
+        "drives, where too few of them differ for an interval.",
+    )
+
+
+def error_table(run: Run) -> Table:
+    """Return the errors of the detectors, in the settings that give a perfect detector the same errors."""
+    lines = [line for lines in clean_lines(run).values() for line in lines]
+
+    def metric(lines: Sequence[Line], name: str) -> Cell:
+        cell = _cell(lines, name)
+        if name == "recall":
+            return replace(cell, mean=1.0 - cell.mean, low=1.0 - cell.high, high=1.0 - cell.low)
+        return cell
+
+    return Table.pivot(
+        "errors",
+        "Errors of the detectors, as settings of a perfect one",
+        lines,
+        rows={"System": field("system")},
+        columns={
+            name: setting for name, setting in ERRORS.items() if not all(math.isnan(metric_of(x, name)) for x in lines)
+        },
+        metric=metric,
+        having=lambda lines: not all(math.isnan(metric_of(line, "recall")) for line in lines),
+        note="Without perturbations. Missed: share of the objects in view that are not found within 2 m; burst: looks "
+        "in a row that an object is missed; noise: error of the distance, as a share of it; phantoms: a look.",
     )
 
 
@@ -309,11 +354,11 @@ def clean_lines(run: Run) -> dict[str, list[Line]]:
 
 def _change(lines: Sequence[Line], clean_by_system: Mapping[str, Sequence[Line]], name: str) -> Cell:
     """Return the change of a metric in the lines of a condition against the same drives without it."""
-    perturbed, clean = (values(part, name) for part in (lines, clean_by_system.get(lines[0]["system"], [])))
-    return Cell.of(
-        paired_difference(
-            perturbed,
-            {drive: clean[drive] for drive in perturbed if drive in clean},
-            kind="share" if name == "collision" else "mean",
-        )
-    )
+    return _difference(lines, clean_by_system.get(lines[0]["system"], []), name)
+
+
+def _difference(lines: Sequence[Line], other_lines: Sequence[Line], name: str) -> Cell:
+    """Return the difference of a metric from that of other lines of the same drives."""
+    cases, others = values(lines, name), values(other_lines, name)
+    shared = {drive: others[drive] for drive in cases if drive in others}
+    return Cell.of(paired_difference(cases, shared, kind="share" if name == "collision" else "mean"))

@@ -14,6 +14,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.registry import split_weights
 from ssad.metrics import replicate_estimate
 from ssad.metrics.intervals import MIN_CLUSTERS
+from ssad.metrics.rank import family_correlation
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
 from ssad.report.artefacts import pictures
 from ssad.report.figures import Panel, Point, panels
@@ -28,6 +29,8 @@ TEMPLATE = Path(__file__).with_name("page.html")
 SOURCE = "published by the paper: nuScenes val, severities drawn from 1 to 5"
 FAMILIES = {"environment": "Environment", "sensor": "Sensor", "object": "Object", "clean": "Clean"}
 TITLES = {"uniform": "uniform noise", "gaussian": "gaussian noise", "impulse": "impulse noise", "": "clean"}
+SCORES = ("mAP", "NDS")
+"""Scores of a table, in the order of the published ones."""
 CLASSES = (
     "car",
     "truck",
@@ -219,7 +222,7 @@ def factors(run: DetectionRun) -> dict[str, Callable[[str], str]]:
 
 def score_columns(run: DetectionRun) -> dict[tuple[str, str], str]:
     """Return the columns of detector x score."""
-    return {(detector, metric): f"{detector} {metric}" for detector in run.detectors for metric in ("mAP", "NDS")}
+    return {(detector, metric): f"{detector} {metric}" for detector in run.detectors for metric in SCORES}
 
 
 def left_table(run: DetectionRun) -> Table:
@@ -247,6 +250,35 @@ def left_table(run: DetectionRun) -> Table:
         published=published,
         note="Percent of each detector's own clean score, which is what other pictures and detectors can be compared "
         "by." + (f" Shaded rows: from the numbers {SOURCE}." if has_published else ""),
+        source=SOURCE,
+    )
+
+
+def order_table(run: DetectionRun) -> Table | None:
+    """Return the rank correlation of the shifts with the paper's; None without three published shifts.
+
+    The levels of other images and detectors cannot be compared, but the order of the shifts can.
+    """
+    names = zip(run.detectors, published_names(run), strict=True)
+    published_by_detector = {detector: name for detector, name in names if name}
+    shifts = [shift for shift in run.shifts if shift in PUBLISHED]
+    if len(shifts) < 3 or not published_by_detector:
+        return None
+
+    def metric(detector: str, score: str) -> Cell:
+        scores = [summary_cell(run, detector, shift, score).mean for shift in shifts]
+        published = [PUBLISHED[shift][published_by_detector[detector]][SCORES.index(score)] for shift in shifts]
+        return Cell.of(family_correlation(scores, published, shifts))
+
+    return Table.listing(
+        "order",
+        "Order of the shifts, against the paper's",
+        list(published_by_detector),
+        rows={"Detector": str},
+        columns={score: score for score in SCORES},
+        metric=metric,
+        note=f"Spearman's rank correlation over {len(shifts)} shifts of the score under a shift with the published "
+        "one (1: the same order); 95 % interval by a bootstrap over the shifts, from five on.",
         source=SOURCE,
     )
 
@@ -420,7 +452,7 @@ def summary(found: Run) -> Table:
 def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a detection run and its tables."""
     run = load_detection_run(found)
-    robust = robustness_table(run)
+    robust, order = robustness_table(run), order_table(run)
     main_rows, left_rows, severities = main_table(run), left_table(run), severity_table(run)
     car_rows, class_rows = car_table(run), class_table(run)
     page = render(
@@ -429,6 +461,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
         verdict=verdict,
         main=main_rows,
         left=left_rows,
+        order=order,
         severities=severities,
         cars=car_rows,
         classes=class_rows,
@@ -446,9 +479,8 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
             if record["status"] != "ok"
         ],
     )
-    return page, [
-        table for table in (main_rows, left_rows, robust, severities, car_rows, class_rows) if table is not None
-    ]
+    tables = main_rows, left_rows, order, robust, severities, car_rows, class_rows
+    return page, [table for table in tables if table is not None]
 
 
 def _skipped(run: DetectionRun) -> list[str]:
