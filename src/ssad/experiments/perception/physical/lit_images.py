@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ssad.core.detections import Truth
 from ssad.core.images import decode_image, encode_jpeg
+from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.experiments.perception.physical.target_views import TargetClips, drive_of, target_truth
 from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturedClip, seen_part
@@ -197,7 +198,25 @@ class LightableClips(TargetClips):
     """Recorded images of a target that can wear textures, and be shown at another hour in any light.
 
     It is the `TargetImages` of `ssad.scenarios.static.perturbation`.
+
+    Attributes:
+        hour: Hour of the clean images (see `HOURS`); None: as they were recorded.
     """
+
+    hour: str | None = None
+
+    @classmethod
+    def of(cls, folder: Path, count: int, detector: Detector, device: str, *, hour: str | None = None) -> Self:
+        """Return the first images of a recording for a detector."""
+        return cls(folder, count, tuple(detector.classes), device, detector.task == "3d", hour)
+
+    def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, at the hour of the images.
+
+        Raises:
+            FormatError: The folder holds no recording of this version.
+        """
+        return TargetClips.clean(self) if self.hour is None else self.lit(self.hour, NO_EDIT)
 
     def lit(self, hour: str, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, at an hour and with an edit around the target.
