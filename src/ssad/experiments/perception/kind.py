@@ -19,7 +19,7 @@ from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan
-from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow
+from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow, TargetCondition
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, score_scenes, sum_applied
 from ssad.experiments.perception.scored_data import Victims, data_of, detectors_of
@@ -136,18 +136,12 @@ class Perception(OpenLoopKind):
         notes = sum_notes if is_attack else sum_applied
         return score_scenes(examination, cell.system, scenes, replicates=job.settings["replicates"], notes=notes)
 
-    def target_images(self, cell: Cell, job: Job, detector: Detector) -> LightableClips:
-        """Return the images of the cell's target."""
-        folder = job.folder / "data" / target_folder(cell.fields["data"])
-        return LightableClips.of(folder, job.settings["target_images"], detector, job.device)
-
-    def target_name(self, cell: Cell, job: Job) -> str:
-        """Return the target as the suite writes it."""
-        return str(cell.fields["data"])
-
-    def target_perturbation(self, cell: Cell, job: Job) -> Perturbation | None:
-        """Return the perturbation of a cell; None: it is clean."""
-        return perturbation_of(cell)
+    def target(self, cell: Cell, job: Job, detector: Detector) -> TargetCondition:
+        """Return the images of the cell's target, and its perturbation."""
+        target: str = cell.fields["data"]
+        folder = job.folder / "data" / target_folder(target)
+        images = LightableClips.of(folder, job.settings["target_images"], detector, job.device)
+        return TargetCondition(images, perturbation_of(cell), target)
 
     def sheet(
         self, examination: Examination, suite: PerceptionSuite, cell: Cell | None = None

@@ -20,6 +20,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
 from ssad.core.machine import default_workers, keep_memory, quiet_warp
+from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -84,6 +85,24 @@ class TableRow:
     inputs: Sequence[object] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class TargetCondition:
+    """Recorded images of a target under one perturbation.
+
+    Attributes:
+        images: The images.
+        perturbation: The perturbation; None: the images are clean.
+        name: The target in words.
+    """
+
+    images: LightableClips
+    perturbation: Perturbation | None
+    name: str
+
+
+Sightings = Sequence[Sighting]
+
+
 class OpenLoopKind(Kind):
     """Kind whose cells are detectors under a perturbation, scored on scenes or on images of a target.
 
@@ -110,7 +129,7 @@ class OpenLoopKind(Kind):
 
     def data(self, suite: Any) -> dict[str, Any]:
         """Return what the results depend on of the recorded scenes of a suite; {}: it needs none."""
-        return data_of(suite)
+        return data_of(suite) if isinstance(suite, DetectorSuite) else {}
 
     def rows(self, suite: Any, victims: Victims, data: Mapping[str, Any]) -> Iterable[TableRow]:
         """Return the rows of the table of a suite, in order."""
@@ -141,34 +160,21 @@ class OpenLoopKind(Kind):
         """Return further scenes, whose boxes those of a cell are compared with."""
         return ()
 
-    def target_images(self, cell: Cell, job: Job, detector: Any) -> LightableClips:
+    def target(self, cell: Cell, job: Job, detector: Detector) -> TargetCondition:
         """Return the images of a target that a cell without scenes is scored on, for a detector."""
         raise NotImplementedError
 
-    def target_name(self, cell: Cell, job: Job) -> str:
-        """Return the target of a cell without scenes, in words."""
-        raise NotImplementedError
-
-    def target_perturbation(self, cell: Cell, job: Job) -> Perturbation | None:
-        """Return the perturbation of a cell without scenes; None: it is clean."""
-        raise NotImplementedError
-
     def target_columns(
-        self,
-        cell: Cell,
-        job: Job,
-        images: LightableClips,
-        clean: Sequence[Sighting],
-        attacked: Sequence[Sighting] | None,
+        self, cell: Cell, job: Job, shown: TargetCondition, clean: Sightings, attacked: Sightings | None
     ) -> dict[str, Any]:
         """Return further columns of the record of a cell without scenes.
 
         Args:
             cell: The cell.
             job: Data that the workers share.
-            images: Images of its target.
-            clean: Sightings in the clean images.
-            attacked: Sightings under the perturbation; None for a clean cell.
+            shown: Its images and its perturbation.
+            clean: Detections in the clean images.
+            attacked: Detections under the perturbation; None for a clean cell.
         """
         return {}
 
@@ -248,26 +254,26 @@ class OpenLoopKind(Kind):
 
     def _target_result(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Return the scores of a cell on images of its target."""
-        settings, perturbation = job.settings, self.target_perturbation(cell, job)
-        weights = settings["detectors"].get(cell.system) or None
+        settings, weights = job.settings, job.settings["detectors"].get(cell.system) or None
         detector = loaded_detector(cell.system, weights=weights, device=job.device)
-        images = self.target_images(cell, job, detector)
+        shown = self.target(cell, job, detector)
+        images, perturbation = shown.images, shown.perturbation
         bootstrap = {"replicates": settings["replicates"], "seed": settings["seed"]}
         if perturbation is None or type(perturbation).clean_target is Perturbation.clean_target:
             clean = _clean_sightings(images, cell.system, weights)
         else:
             clean = tuple(sightings(detector, perturbation.clean_target(images)))
         if perturbation is None:
-            return target_scores(clean, **bootstrap) | self.target_columns(cell, job, images, clean, None)
-        clean_precision = round(precision(clean) or 0.0, 6)
-        if clean_precision < settings["floor"]:  # what is not found anyway cannot be hidden
+            return target_scores(clean, **bootstrap) | self.target_columns(cell, job, shown, clean, None)
+        clean_precision, floor = round(precision(clean) or 0.0, 6), settings["floor"]
+        if clean_precision < floor:  # what is not found anyway cannot be hidden
             raise CellError(
-                f"{cell.system} finds the clean {self.target_name(cell, job)} with AP50 {clean_precision:.3f}, which "
-                f"is less than the floor of {settings['floor']:g}"
+                f"{cell.system} finds the clean {shown.name} with AP50 {clean_precision:.3f}, which is less than the "
+                f"floor of {floor:g}"
             )
         attacked = tuple(sightings(detector, perturbation.on_target(images)))
         scores = target_scores(attacked, clean, **bootstrap) | {"clean_AP50": clean_precision}
-        return scores | self.target_columns(cell, job, images, clean, attacked)
+        return scores | self.target_columns(cell, job, shown, clean, attacked)
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[SceneCondition], job: Job) -> dict[str, Any]:
         """Return the record of a cell whose boxes are there."""

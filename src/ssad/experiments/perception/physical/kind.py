@@ -14,7 +14,7 @@ from ssad.core.protocols import Detector
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources, SuiteBase, find_cell
 from ssad.engine.progress import Live
-from ssad.experiments.perception.open_loop import OpenLoopKind, TableRow
+from ssad.experiments.perception.open_loop import OpenLoopKind, Sightings, TableRow, TargetCondition
 from ssad.experiments.perception.physical import page
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_attacks import SearchedLight, TargetAttacks, TrainedTexture, see_all
@@ -23,7 +23,6 @@ from ssad.experiments.perception.physical.target_table import CLEAN, GRID, Targe
 from ssad.experiments.perception.physical.verdict import verdict
 from ssad.experiments.perception.scored_data import Victims, detectors_of
 from ssad.experiments.runs import read_plan
-from ssad.metrics.target_attacks import Sighting
 from ssad.metrics.target_grid import grid_scores
 from ssad.recorders.target_recording import Clips
 from ssad.rendering.target import class_of_target, parse_target
@@ -91,10 +90,6 @@ class Physical(OpenLoopKind):
                 )
         return victims
 
-    def data(self, suite: PhysicalSuite) -> dict[str, Any]:
-        """Return {}: no scenes are needed."""
-        return {}
-
     def rows(self, suite: PhysicalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
         """Yield the rows of the table."""
         for row in rows_of(suite):
@@ -136,50 +131,34 @@ class Physical(OpenLoopKind):
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """Return the training of the cell's texture, or the search of its light, unless it is done."""
-        made = self.target_perturbation(cell, job)
+        made = perturbation_of(cell, job)
         return {f"{made.family} {made.name}": cell} if made is not None and made.is_missing else {}
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
         """Train a texture, or search a light."""
-        made = self.target_perturbation(data, job)
+        made = perturbation_of(data, job)
         assert made is not None
         made.make()
 
-    def target_images(self, cell: Cell, job: Job, detector: Detector) -> LightableClips:
-        """Return the images in the town of the test, at the hour of the light."""
+    def target(self, cell: Cell, job: Job, detector: Detector) -> TargetCondition:
+        """Return the images in the town of the test, at the hour of the light, and the texture or light."""
         light, is_grid = cell.spec.get("light"), cell.fields["view"] == GRID
         pair = (light or cell.spec)["pair"]
         folder = job.folder / "data" / f"{pair['test']}{'-grid' if is_grid else ''}"
         count = job.settings["grid"] if is_grid else pair["test_images"]
-        return LightableClips.of(folder, count, detector, job.device, hour=light["hour"] if light else None)
-
-    def target_name(self, cell: Cell, job: Job) -> str:
-        """Return the class of the target, and the hour of the light."""
-        light = cell.spec.get("light")
-        class_name = class_of_target(parse_target(job.settings["target"])).replace("_", " ")
-        return f"{class_name} ({light['hour']})" if light else class_name
-
-    def target_perturbation(self, cell: Cell, job: Job) -> TrainedTexture | SearchedLight | None:
-        """Return the texture or the light of a cell; None: it is clean."""
-        attacks, light = attacks_of(job), cell.spec.get("light")
-        if cell.fields["attack"] == CLEAN:
-            return None
-        return attacks.light(LightSpec.of_row(light)) if light else attacks.texture(TextureSpec.of_row(cell.spec))
+        images = LightableClips.of(folder, count, detector, job.device, hour=light["hour"] if light else None)
+        name = class_of_target(parse_target(job.settings["target"])).replace("_", " ")
+        return TargetCondition(images, perturbation_of(cell, job), f"{name} ({light['hour']})" if light else name)
 
     def target_columns(
-        self,
-        cell: Cell,
-        job: Job,
-        images: LightableClips,
-        clean: Sequence[Sighting],
-        attacked: Sequence[Sighting] | None,
+        self, cell: Cell, job: Job, shown: TargetCondition, clean: Sightings, attacked: Sightings | None
     ) -> dict[str, Any]:
         """Return the scores of the grid by view, and the record of the texture or light."""
         columns: dict[str, Any] = {}
         if cell.fields["view"] == GRID:
-            columns = grid_scores(images.rows(), clean, attacked, floor=job.settings["floor"])
-        made = self.target_perturbation(cell, job)
-        return columns if made is None else columns | made.about()
+            columns = grid_scores(shown.images.rows(), clean, attacked, floor=job.settings["floor"])
+        made = shown.perturbation
+        return columns | made.about() if isinstance(made, TrainedTexture | SearchedLight) else columns
 
     def finish(self, plan: Plan, folder: Path) -> None:
         """Pictures of each test town under each texture, of the grid from four sides, and of lights: DIR/pictures."""
@@ -203,6 +182,14 @@ class Physical(OpenLoopKind):
 def attacks_of(job: Job) -> TargetAttacks:
     """Return the textures and lights of a run."""
     return TargetAttacks(job.folder, job.settings["target"], job.settings["seed"], job.device)
+
+
+def perturbation_of(cell: Cell, job: Job) -> TrainedTexture | SearchedLight | None:
+    """Return the texture or the light of a cell; None: it is clean."""
+    if cell.fields["attack"] == CLEAN:
+        return None
+    attacks, light = attacks_of(job), cell.spec.get("light")
+    return attacks.light(LightSpec.of_row(light)) if light else attacks.texture(TextureSpec.of_row(cell.spec))
 
 
 def shown_by(folder: Path, name: str) -> tuple[TargetAttacks, Cell]:

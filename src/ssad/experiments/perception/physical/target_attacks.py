@@ -20,7 +20,7 @@ from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.detectors import loaded_detector
 from ssad.engine.pool import open_pool, run_all
-from ssad.experiments.perception.physical.lit_images import LightableClips, LitPictures
+from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
 from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
 from ssad.recorders.target_recording import Clips
@@ -221,23 +221,20 @@ class SearchedLight(Perturbation):
         car = parse_target(attacks.target)
         assert isinstance(car, TargetCar)
 
-        def training_images() -> LitPictures:
-            return LitPictures.of(attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source), spec.hour)
+        def training_images() -> LightableClips:
+            return attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)
 
         def projected(edit: SceneEdit) -> list[View]:
             texture_size = edit.textures[0].shape[1], edit.textures[0].shape[2]
-            lit_set = training_images()
+            images = training_images()
             return [
-                View(
-                    lit_image.projected(edit).prepare({0: texture_size}, device=attacks.device),
-                    lit_set.truth(lit_image),
-                )
-                for lit_image in lit_set.clips()
+                View(clip.projected(edit).prepare({0: texture_size}, device=attacks.device), images.lit_truth(clip))
+                for clip in images.clips_at(spec.hour)
             ]
 
         def views() -> list[LitView]:
-            lit_set = training_images()
-            return [LitView(lit_image.lit(attacks.device), lit_set.truth(lit_image)) for lit_image in lit_set.clips()]
+            images = training_images()
+            return [LitView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.clips_at(spec.hour)]
 
         return attacks.lights.edit(
             spec,
