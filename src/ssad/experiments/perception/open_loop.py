@@ -17,7 +17,7 @@ from pydantic import Field
 from rich.console import Console
 
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, FormatError
+from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.images import save_picture
 from ssad.core.machine import default_workers, keep_memory, quiet_warp
 from ssad.core.protocols import Detector
@@ -51,6 +51,7 @@ from ssad.metrics.target_attacks import Sighting, precision, sightings, target_s
 from ssad.recorders.nuscenes import record_nuscenes
 from ssad.recorders.target_images import record_all
 from ssad.recorders.target_recording import Clips
+from ssad.scenarios.static.catalogue import registered_names
 from ssad.scenarios.static.digital.defences import make_defence
 from ssad.scenarios.static.perturbation import Perturbation
 
@@ -107,7 +108,12 @@ class OpenLoopKind(Kind):
     """Kind whose cells are detectors under a perturbation, scored on scenes or on images of a target.
 
     A shared piece of work is a scene under a perturbation.
+
+    Attributes:
+        families: Key of a suite -> family of the perturbations that it names.
     """
+
+    families: ClassVar[Mapping[str, str]] = {}
 
     columns: ClassVar[tuple[Column, ...]] = (
         Column("mAP", "mean average precision", "", "higher"),
@@ -141,6 +147,7 @@ class OpenLoopKind(Kind):
 
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
         """Build perturbations and detectors once, and inspect the data."""
+        self._check_families(suite)
         self.check(suite)
         victims = self.victims(suite)
         data = self.data(suite)
@@ -151,6 +158,17 @@ class OpenLoopKind(Kind):
             cells.setdefault(cell.key, cell)
         inputs_by_name = {"weights": victims.weights, **({"data": data} if data else {})}
         return Plan(self, suite, device, tuple(cells.values()), inputs_by_name, self.versions(suite), victims.files)
+
+    def _check_families(self, suite: Any) -> None:
+        """Raise UnknownNameError for a name that is registered in another family than its key takes."""
+        for key, family in self.families.items():
+            for name in (getattr(entry, "name", entry) for entry in getattr(suite, key)):
+                other = registered_names().get(name, family)
+                if other != family:
+                    raise UnknownNameError(
+                        f"suite {suite.name}: {key}: '{name}' is of the family {other}, not {family}; suites of kind "
+                        "perception take every family"
+                    )
 
     def scenes(self, cell: Cell, job: Job) -> Sequence[SceneCondition]:
         """Return the scenes that a cell is scored on, each under its perturbation; none for a cell of a target."""

@@ -83,7 +83,7 @@ def attack_record(
 
 
 class Eye:
-    """Eye of a system: in the world for 3D detectors, in the images for 2D detectors.
+    """Comparisons of the boxes of a system: in the world for 3D detectors, in the images for 2D detectors.
 
     Attributes:
         flat: True if the system finds 2D boxes.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -59,6 +59,7 @@ class Digital(OpenLoopKind):
     """Kind `digital`. A piece is a scene under an attack on one system, shown to all systems that need it."""
 
     name = "digital"
+    families: ClassVar = {"attacks": "digital"}
     suite = DigitalSuite
     columns = (*OpenLoopKind.columns, Column("drop", "share of the clean mAP that is lost", "", "higher"))
     factors = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -50,6 +50,7 @@ class Physical(OpenLoopKind):
     """Kind `physical`. A piece is the training of a texture, or the search of a light, which several cells use."""
 
     name = "physical"
+    families: ClassVar = {"attacks": "texture", "lights": "light"}
     suite = PhysicalSuite
     patience = None
     columns = (

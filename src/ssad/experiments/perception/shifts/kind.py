@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -48,6 +48,7 @@ class Detection(OpenLoopKind):
     name = "detection"
     suite = DetectionSuite
     factors = ("detector", "shift", "severity")
+    families: ClassVar = {"shifts": "shift"}
 
     def check(self, suite: DetectionSuite) -> None:
         """Raise ConfigError for a shift or severity that appears twice or does not exist."""
