@@ -59,6 +59,11 @@ def test_a_preset_takes_the_names_of_its_family_as_perception_does(
         assert len({cell.key for cell in cells}) == len(cells)
 
 
+def test_a_name_of_two_families_is_the_one_that_the_preset_takes() -> None:
+    for kind in (Digital, Physical):
+        assert len(cells_of(kind, attacks=["noise"])) >= 2
+
+
 @pytest.mark.parametrize(("family", "preset", "key"), KEYS)
 def test_a_preset_refuses_every_other_family_with_the_same_words(
     family: str, preset: type[OpenLoopKind], key: str

@@ -147,8 +147,11 @@ class OpenLoopKind(Kind):
 
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
         """Build perturbations and detectors once, and inspect the data."""
-        self._check_families(suite)
-        self.check(suite)
+        try:
+            self.check(suite)
+        except UnknownNameError as error:
+            self._check_families(suite, error)
+            raise
         victims = self.victims(suite)
         data = self.data(suite)
         cells: dict[str, Cell] = {}
@@ -159,16 +162,16 @@ class OpenLoopKind(Kind):
         inputs_by_name = {"weights": victims.weights, **({"data": data} if data else {})}
         return Plan(self, suite, device, tuple(cells.values()), inputs_by_name, self.versions(suite), victims.files)
 
-    def _check_families(self, suite: Any) -> None:
-        """Raise UnknownNameError for a name that is registered in another family than its key takes."""
+    def _check_families(self, suite: Any, error: UnknownNameError) -> None:
+        """Raise UnknownNameError if the unknown name of an error is registered in another family."""
         for key, family in self.families.items():
             for name in (getattr(entry, "name", entry) for entry in getattr(suite, key)):
                 other = registered_names().get(name, family)
-                if other != family:
+                if other != family and f"'{name}'" in str(error):
                     raise UnknownNameError(
                         f"suite {suite.name}: {key}: '{name}' is of the family {other}, not {family}; suites of kind "
                         "perception take every family"
-                    )
+                    ) from None
 
     def scenes(self, cell: Cell, job: Job) -> Sequence[SceneCondition]:
         """Return the scenes that a cell is scored on, each under its perturbation; none for a cell of a target."""

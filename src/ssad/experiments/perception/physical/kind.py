@@ -67,7 +67,7 @@ class Physical(OpenLoopKind):
     factors = ("test", "view", "detector", "attack", "carrier", "source")
 
     def check(self, suite: PhysicalSuite) -> None:
-        """Check towns and recordings."""
+        """Check towns and rows."""
         target_of(suite)
         for pair in suite.pairs:
             for town in (pair.train, pair.test):
@@ -76,7 +76,8 @@ class Physical(OpenLoopKind):
         for town in (suite.grid.towns or ()) if suite.grid is not None else ():
             if town not in {pair.test for pair in suite.pairs}:
                 raise ConfigError(f"suite {suite.name}: grid: no pair is tested in {town}")
-        suite.recordings(Path(), "cpu")
+        for _ in rows_of(suite):
+            pass
 
     def victims(self, suite: PhysicalSuite) -> Victims:
         """Return the detectors and judges of the suite."""
@@ -92,12 +93,13 @@ class Physical(OpenLoopKind):
         return victims
 
     def rows(self, suite: PhysicalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
-        """Yield the rows of the table."""
+        """Yield the rows of the table; check the recordings."""
         for row in rows_of(suite):
             source = row.spec.get("light", row.spec).get("source", "")
             grid = suite.grid.model_dump_json() if suite.grid and row.fields["view"] == GRID else ""
             inputs = suite.target, suite.place, suite.size, suite.floor, grid, victims.weights.get(source, "")
             yield replace(row, inputs=inputs)
+        suite.recordings(Path(), "cpu")
 
     def order(self, cell: Cell) -> float:
         """From behind before from all around; clean first, then controls, then what is trained."""
