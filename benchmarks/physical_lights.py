@@ -22,7 +22,7 @@ import torch
 
 from ssad.core.machine import quiet_warp
 from ssad.detectors import make_detector
-from ssad.experiments.perception.physical.lit_images import LitClip, LitPictures
+from ssad.experiments.perception.physical.lit_images import LightableClips, LitClip
 from ssad.experiments.perception.physical.target_views import drive_of
 from ssad.metrics.target_attacks import sightings, target_scores
 from ssad.recorders.target_images import record_clips
@@ -70,13 +70,13 @@ def flood(clip: LitClip) -> SceneEdit:
     return Flashlight().edit(values, clip.target)
 
 
-def scores(pictures: LitPictures, clips: list[LitClip], detector: Any, edit: Any) -> dict[str, float | None]:
+def scores(pictures: LightableClips, clips: list[LitClip], detector: Any, edit: Any) -> dict[str, float | None]:
     """AP50 and mean score of the target under an edit of each picture."""
 
     def shown() -> Any:
         for clip in clips:
             image = torch.from_numpy(clip.render(edit(clip))).to(pictures.device).permute(2, 0, 1)[None].float() / 255
-            yield drive_of(clip.clip.row), image, pictures.truth(clip)
+            yield drive_of(clip.clip.row), image, pictures.lit_truth(clip)
 
     metrics = target_scores(list(sightings(detector, shown())), replicates=0)["metrics"]
     return {name: metrics[name] for name in ("AP50", "confidence")}
@@ -98,8 +98,8 @@ def main() -> None:
     detector = make_detector("yolov5n", device=given.device)
     rows = []
     for hour in HOURS:
-        pictures = LitPictures(home, hour, given.pictures, tuple(detector.classes), given.device)
-        clips = list(pictures.clips())[:: given.every]
+        pictures = LightableClips(home, given.pictures, tuple(detector.classes), given.device)
+        clips = list(pictures.clips_at(hour))[:: given.every]
         sun, lux = np.array([rear(clip) for clip in clips]).T
         none = SceneEdit(cards=(BLIND,))
         row: dict[str, Any] = {

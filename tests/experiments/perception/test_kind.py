@@ -57,6 +57,13 @@ def test_shifts_faults_attacks_and_a_users_own_are_scored_beside_clean_data(tiny
     assert again.difference is None
 
 
+def test_a_2d_detector_is_scored_on_scenes_by_its_boxes_in_the_images(tiny_set: Path, tmp_path: Path) -> None:
+    plan = Perception().plan(suite_of(tiny_set, detectors=["yolov5n"], perturbations=["fog"]))
+    records = go(plan, tmp_path / "run")
+    assert [row["status"] for row in records] == ["ok", "ok"], [row.get("reason") for row in records]
+    assert all(0.0 <= row["metrics"]["mAP"] <= 1.0 for row in records)
+
+
 def test_textures_and_lights_are_scored_on_their_target(tiny_set: Path, tmp_path: Path) -> None:
     suite = suite_of(
         tiny_set,

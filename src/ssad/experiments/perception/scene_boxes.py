@@ -331,7 +331,7 @@ def score_scenes(
     """
     boxes, scene_notes = read_scenes(examination, detector, scenes)
     truth = truth_of(examination, [condition.scene for condition in scenes])
-    return {**score_found(examination, boxes, truth, replicates=replicates), **notes(scene_notes)}
+    return {**score_found(examination, detector, boxes, truth, replicates=replicates), **notes(scene_notes)}
 
 
 def truth_of(examination: Examination, scenes: Sequence[str]) -> GroundTruth:
@@ -365,35 +365,24 @@ def read_scenes(
 
 
 def score_found(
-    examination: Examination, found: Sequence[SampleBoxes], truth: GroundTruth, *, replicates: int
+    examination: Examination, detector: str, found: Sequence[Any], truth: GroundTruth, *, replicates: int
 ) -> dict[str, Any]:
-    """As `score_scenes`, of boxes that are at hand.
+    """As `score_scenes`, of boxes that are at hand: in the world, or of a 2D detector in the images.
 
     Args:
         examination: of the run.
-        found: boxes of all samples.
-        truth: of the same samples.
-        replicates: of the bootstrap over scenes.
-    """
-    matches = match_boxes(found, truth)
-    figures = lambda weights, summary_only: numbers(matches.scores(weights), few=summary_only)  # noqa: E731
-    return _resampled(examination, figures, truth, replicates)
-
-
-def score_pictures(
-    examination: Examination, detector: Any, found: Sequence[SamplePictures], truth: GroundTruth, *, replicates: int
-) -> dict[str, Any]:
-    """As `score_found`, of a 2D detector's boxes in the images.
-
-    Args:
-        examination: of the run.
-        detector: which found them.
+        detector: name.
         found: boxes of all samples.
         truth: of the same samples; it says which scenes are copies.
         replicates: of the bootstrap over scenes.
     """
-    matches = match_pictures(found, picture_truth_of(examination, truth), detector.classes)
-    figures = lambda weights, summary_only: picture_figures(matches.scores(weights), few=summary_only)  # noqa: E731
+    if isinstance(found[0], SamplePictures):
+        classes = system_of(examination, detector).classes
+        pictures = match_pictures(found, picture_truth_of(examination, truth), classes)
+        figures = lambda weights, summary_only: picture_figures(pictures.scores(weights), few=summary_only)  # noqa: E731
+    else:
+        matches = match_boxes(found, truth)
+        figures = lambda weights, summary_only: numbers(matches.scores(weights), few=summary_only)  # noqa: E731
     return _resampled(examination, figures, truth, replicates)
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import Field
 
@@ -21,6 +21,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
 from ssad.experiments.perception.scene_boxes import detector_of
 from ssad.recorders.nuscenes import Recording
+from ssad.rendering.target import Target, class_of_target
 
 RECORDED = "recorded"
 
@@ -63,28 +64,42 @@ class DetectorTable(Schema):
     recorded: Recorded = Recorded()
 
 
+class Victims(NamedTuple):
+    """Detectors of a suite, by name.
+
+    Attributes:
+        weights: Hashes of weights and, for detectors of the user's own, of their source.
+        files: Files of weights; "" for the shipped ones.
+        tasks: 2d or 3d.
+    """
+
+    weights: dict[str, str]
+    files: dict[str, str]
+    tasks: dict[str, str]
+
+
 def detectors_of(
-    table: DetectorTable, names: Sequence[str] | None = None, *, flat: bool = False
-) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
-    """By name of the detectors: versions of weights and own source; files of weights ("": shipped); tasks (2d, 3d).
+    suite: str, entries: Sequence[str], *, flat: bool = False, scenes: bool = True, targets: Iterable[Target] = ()
+) -> Victims:
+    """Build detectors once, and check that they fit the data.
 
     Args:
-        table: Which names them.
-        names: Those that are meant, as a suite writes them; None: `table.detectors`.
-        flat: Whether 2D detectors with a class of nuScenes are welcome too.
+        suite: Name of the suite, for messages.
+        entries: Detectors as the suite writes them.
+        flat: Whether 2D detectors are accepted too.
+        scenes: Whether they are scored on scenes.
+        targets: Targets that they are scored on.
 
     Raises:
-        ConfigError: A detector appears twice, has no weights, or is not of the kind that is welcome.
+        ConfigError: A detector appears twice, has no weights, or does not fit the data.
     """
-    weights: dict[str, str] = {}
-    files: dict[str, str] = {}
-    tasks: dict[str, str] = {}
-    for entry in table.detectors if names is None else names:
+    victims = Victims({}, {}, {})
+    target_classes = list(dict.fromkeys(map(class_of_target, targets)))
+    for entry in entries:
         name, weights_file = split_weights(entry)
-        if name in files:
+        if name in victims.files:
             raise ConfigError(
-                f"suite {table.name}: detectors: {name} appears twice; tell two of a kind apart by a label, "
-                f"{name}@mine=FILE"
+                f"suite {suite}: detectors: {name} appears twice; tell two of a kind apart by a label, {name}@mine=FILE"
             )
         # Workers may run in another folder; "random" stands for untrained weights.
         path = (
@@ -95,19 +110,22 @@ def detectors_of(
         detector_name = Reference.of(name).name
         if not path and detector_name in DETECTORS and not (SHIPPED / f"{detector_name}.json").is_file():
             raise ConfigError(
-                f"suite {table.name}: no weights of {detector_name} are shipped; give a file, {detector_name}=FILE "
+                f"suite {suite}: no weights of {detector_name} are shipped; give a file, {detector_name}=FILE "
                 f"(docs/how-to/train-detectors.md: ssad train detector {detector_name}, or official ones)"
             )
         detector = detector_of(name, path, "cpu")
-        tasks[name] = str(getattr(detector, "task", ""))
-        if tasks[name] != "3d":
-            if not flat:
-                raise ConfigError(f"suite {table.name}: {name} finds 2D boxes; this suite takes 3D detectors")
-            if not set(detector.classes) & set(MMDET3D_CLASSES):
-                raise ConfigError(f"suite {table.name}: {name} knows none of the ten classes of nuScenes")
+        task = str(getattr(detector, "task", ""))
+        if task != "3d" and not flat:
+            raise ConfigError(f"suite {suite}: {name} finds 2D boxes; this suite takes 3D detectors")
+        if task != "3d" and scenes and not set(detector.classes) & set(MMDET3D_CLASSES):
+            raise ConfigError(f"suite {suite}: {name} knows none of the ten classes of nuScenes")
+        for class_name in target_classes:
+            if class_name not in detector.classes:
+                raise ConfigError(f"suite {suite}: {name} has no class {class_name}, which wears a texture or light")
         user_source = f" {source_version(detector_name.partition(':')[0])}" if ":" in detector_name else ""
-        weights[name], files[name] = state_hash(detector) + user_source, path
-    return weights, files, tasks
+        victims.weights[name], victims.files[name] = state_hash(detector) + user_source, path
+        victims.tasks[name] = task
+    return victims
 
 
 def data_of(table: DetectorTable) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from ssad.scenarios.static.physical import Expectation, TextureSpec, make_physic
 
 ROOT = Path(__file__).parents[4]
 PAIR = {"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_images": 2}
+SETTINGS: dict[str, Any] = {"detectors": {}, "target": "sedan:silver:0", "seed": 0, "floor": 0.0, "replicates": 0}
 
 
 def suite(**changes: Any) -> PhysicalSuite:
@@ -176,7 +177,7 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"pairs": [PAIR | {"test": "Nowhere"}]}, ConfigError, "unknown town 'Nowhere'"),
         ({"target": "stop_sign"}, ConfigError, "no panel 'rear'"),
         ({"target": "stop_sign", "attacks": [], "lights": ["laser"]}, ConfigError, "lights and around are for cars"),
-        ({"judges": ["yolov5n"]}, ConfigError, "named twice"),
+        ({"judges": ["yolov5n"]}, ConfigError, "yolov5n appears twice"),
         ({"grid": {"distances": [1.0]}}, ConfigError, "distances: 3 to 80 m"),
         ({"grid": {"weathers": ["hail"]}}, UnknownNameError, "hail"),
         ({"grid": {"towns": ["Twinford"]}}, ConfigError, "no pair is tested in Twinford"),
@@ -340,7 +341,7 @@ def test_a_run_of_lights_from_the_search_to_the_picture(tmp_path: Path) -> None:
     assert read_image(tmp_path / "pictures" / "lights.jpg").shape[1] == 3 * 644
     for path in (tmp_path / "lights").iterdir():
         path.unlink()
-    job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.0, "replicates": 0})
+    job = Job(tmp_path, "cpu", SETTINGS)
     again = Physical().execute(plan.cells, job)
     assert {cell.key: again[cell.key]["metrics"] for cell in plan.cells} == {r["key"]: r["metrics"] for r in records}
     assert {path.name: path.read_bytes() for path in (tmp_path / "lights").glob("*.json")} == kept
@@ -373,10 +374,10 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert "ASR_25" not in clean["metrics"]
     assert trained["epochs"] == 1
     assert "epochs" not in random
-    job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.0, "replicates": 0})
+    job = Job(tmp_path, "cpu", SETTINGS)
     cell = next(cell for cell in plan.cells if cell.fields["attack"] == "vanishing, all sides")
     spec = TextureSpec.of_row(cell.spec)
-    colour = attacks_of(job).texture(spec)
+    colour = attacks_of(job).texture(spec).make()
     picture = read_image(tmp_path / trained["artefacts"]["texture"])
     assert picture.shape == (128, 128, 3)
     kept = np.abs(picture / 255 - colour.permute(1, 2, 0).numpy()).max(2) < 0.005
@@ -389,11 +390,11 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert (tmp_path / "results.jsonl").read_bytes() == results
     texture = tmp_path / trained["artefacts"]["texture"].replace(".png", ".npz")
     texture.unlink()
-    assert np.array_equal(attacks_of(job).texture(spec), colour), "the checkpoint goes on where it ended"
+    assert np.array_equal(attacks_of(job).texture(spec).make(), colour), "the checkpoint goes on where it ended"
     texture.unlink()
     texture.with_suffix(".checkpoint.npz").unlink()
     Physical().execute([cell], job)  # which needs no piece of work done before it
-    assert np.array_equal(attacks_of(job).texture(spec), colour), "trained anew, the same to the bit"
+    assert np.array_equal(attacks_of(job).texture(spec).make(), colour), "trained anew, the same to the bit"
 
 
 def test_a_texture_is_trained_against_a_3d_detector(tmp_path: Path) -> None:
@@ -443,9 +444,9 @@ def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch:
     from ssad.metrics.target_attacks import Sighting
 
     nothing = Sighting("a", np.zeros((0, 4)), np.zeros(0), np.array([[0.0, 0.0, 9.0, 9.0]]), np.zeros(1, bool))
-    monkeypatch.setattr("ssad.experiments.perception.physical.kind._clean_sightings", lambda *given: (nothing,))
+    monkeypatch.setattr("ssad.experiments.perception.open_loop._clean_sightings", lambda *given: (nothing,))
     plan = Physical().plan(suite(floor=0.9))
-    job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.9, "replicates": 0})
+    job = Job(tmp_path, "cpu", SETTINGS | {"floor": 0.9})
     (clean,) = Physical().execute([plan.cells[0]], job).values()
     assert clean["metrics"]["AP50"] == 0.0
     for target, noun in (("sedan:silver:0", "car"), ("stop_sign", "stop sign"), ("pedestrian", "pedestrian")):

@@ -15,9 +15,9 @@ from rich.console import Console
 
 from ssad.core.errors import ConfigError, FormatError
 from ssad.engine.kind import Job, Plan, Resources
-from ssad.experiments.perception import detector_kind
+from ssad.experiments.perception import open_loop
 from ssad.experiments.perception.scene_boxes import Examination, boxes_path
-from ssad.experiments.perception.scored_data import Recorded, recording_of
+from ssad.experiments.perception.scored_data import Recorded, Victims, recording_of
 from ssad.experiments.perception.shifts import kind as shifts_kind
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite, shifted_scene
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
@@ -26,7 +26,7 @@ from ssad.scenarios.static.shifts.perturbation import Shift
 
 def replace_name(monkeypatch: pytest.MonkeyPatch, name: str, value: Any) -> None:
     """Replace a name in the kind and in its base, wherever it is used."""
-    modules = [module for module in (detector_kind, shifts_kind) if hasattr(module, name)]
+    modules = [module for module in (open_loop, shifts_kind) if hasattr(module, name)]
     assert modules, name
     for module in modules:
         monkeypatch.setattr(module, name, value)
@@ -50,9 +50,9 @@ def suite(**changes: Any) -> DetectionSuite:
 def no_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Detectors are names; looking at data is another matter."""
 
-    def detectors(suite: DetectionSuite) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
-        hashes = {name: f"hash of {name}" for name in suite.detectors}
-        return hashes, {name: f"{name}.pth" for name in suite.detectors}, dict.fromkeys(suite.detectors, "3d")
+    def detectors(suite: str, names: list[str]) -> Victims:
+        hashes = {name: f"hash of {name}" for name in names}
+        return Victims(hashes, {name: f"{name}.pth" for name in names}, dict.fromkeys(names, "3d"))
 
     replace_name(monkeypatch, "detectors_of", detectors)
 
@@ -178,20 +178,24 @@ def test_scenes_of_a_cell(tmp_path: Path) -> None:
     kind = Detection()
     clean, _, fog, dealt = plan_of(detectors=["one"], seed=4).cells
 
-    def of(cell: Any) -> list[list[Any]]:
-        return list(kind.pieces(cell, job(tmp_path)).values())
+    def of(cell: Any) -> list[str]:
+        pieces = kind.pieces(cell, job(tmp_path))
+        assert all(data == cell for data in pieces.values())
+        return list(pieces)
 
-    assert of(clean) == [[None, 0, "physical", scene] for scene in SCENES]
-    assert of(fog) == [["fog", 3, "physical", scene] for scene in SCENES]
+    assert of(clean) == [f"clean/{scene}" for scene in SCENES]
+    assert of(fog) == [f"fog-3/{scene}" for scene in SCENES]
     severities = dealt_severities(ShiftSpec("fog", seed=4), list(SCENES.values()))
     assert severities != dealt_severities(ShiftSpec("fog", seed=5), list(SCENES.values()))
-    assert of(dealt) == [["fog", severities[token], "physical", scene] for scene, token in SCENES.items()]
+    assert of(dealt) == [f"fog-{severities[token]}/{scene}" for scene, token in SCENES.items()]
     *_, drawn = plan_of(detectors=["one"], calibration="paper").cells
-    assert of(drawn) == [["fog", "random", "paper", scene] for scene in SCENES], "drawn by sample"
+    expected = [shifted_scene("fog", "random", "paper", scene) for scene in SCENES]
+    assert kind.scenes(drawn, job(tmp_path)) == expected, "drawn by sample"
+    assert of(drawn) == [scene.name for scene in expected]
     there = boxes_path(tmp_path, "one", shifted_scene("fog", 3, "physical", "scene-2"))
     there.parent.mkdir(parents=True)
     there.touch()
-    assert of(fog) == [["fog", 3, "physical", scene] for scene in SCENES if scene != "scene-2"]
+    assert of(fog) == [f"fog-3/{scene}" for scene in SCENES if scene != "scene-2"]
 
 
 def test_boxes_are_found_and_scored_with_what_the_job_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,7 +209,7 @@ def test_boxes_are_found_and_scored_with_what_the_job_says(tmp_path: Path, monke
     replace_name(monkeypatch, "score_scenes", score)
     kind, cell = Detection(), plan_of(detectors=["one"]).cells[2]
     expected = Examination(tmp_path, Path("/data"), "v1.0-mini", (("one", "one.pth"),), 7, "cuda", 3)
-    kind.make("name", ["fog", 3, "physical", "scene-1"], ["one", "two"], job(tmp_path))
+    kind.make("fog-3/scene-1", cell, ["one", "two"], job(tmp_path))
     assert found == [(expected, shifted_scene("fog", 3, "physical", "scene-1"), ["one", "two"])]
     results = kind.execute([cell], job(tmp_path))
     assert found[1:] == [(expected, shifted_scene("fog", 3, "physical", scene), ["one"]) for scene in SCENES]

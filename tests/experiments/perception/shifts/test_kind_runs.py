@@ -31,7 +31,7 @@ from ssad.engine.kind import Plan, Resources
 from ssad.engine.local import WORKER_MEMORY
 from ssad.engine.replay import difference
 from ssad.engine.run import run, run_json
-from ssad.experiments.perception import detector_kind as detection
+from ssad.experiments.perception import open_loop as detection
 from ssad.experiments.perception.scene_boxes import SceneCondition, boxes_path, find_boxes, forget_failures, read_boxes
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
 from ssad.experiments.perception.shifts.page import left_table, load_detection_run, main_table, robustness_table

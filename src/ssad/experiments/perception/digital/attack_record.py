@@ -18,7 +18,6 @@ from ssad.experiments.perception.scene_boxes import (
     picture_truth_of,
     read_scenes,
     score_found,
-    score_pictures,
     system_of,
     truth_of,
 )
@@ -55,7 +54,7 @@ def attack_record(
     truth = truth_of(examination, [condition.scene for condition in clean_scenes])
     clean_boxes, _ = read_scenes(examination, system, clean_scenes)
     # Under an attack the clean score is only a reference; its intervals stand in the clean record.
-    clean_result = scorer.score(clean_boxes, truth, replicates=replicates if not specs else 0)
+    clean_result = score_found(examination, system, clean_boxes, truth, replicates=replicates if not specs else 0)
     if not specs:
         return {**clean_result, "metrics": clean_result["metrics"] | scorer.by_distance(clean_boxes, truth)}
     member_scenes = [scenes[start : start + len(clean_scenes)] for start in range(0, len(scenes), len(clean_scenes))]
@@ -67,7 +66,7 @@ def attack_record(
     if len(specs) > 1:
         candidates = dict(zip((spec.name for spec in specs), member_boxes, strict=True))
         worst_column["worst"], boxes = worst_of(candidates, truth, scorer.match(truth))
-    attacked_result = scorer.score(boxes, truth, replicates=replicates)
+    attacked_result = score_found(examination, system, boxes, truth, replicates=replicates)
     metrics = attacked_result["metrics"] | scorer.by_distance(boxes, truth)
     clean_score = clean_result["metrics"]["mAP"]
     metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None
@@ -84,7 +83,7 @@ def attack_record(
 
 
 class Eye:
-    """Scorer of the boxes of a system: in the world for 3D detectors, in the images for 2D detectors.
+    """Comparisons of the boxes of a system: in the world for 3D detectors, in the images for 2D detectors.
 
     Attributes:
         flat: True if the system finds 2D boxes.
@@ -93,12 +92,6 @@ class Eye:
     def __init__(self, examination: Examination, system: str) -> None:
         self._examination, self._detector = examination, system_of(examination, system)
         self.flat = self._detector.task == "2d"
-
-    def score(self, boxes: Sequence[Any], truth: GroundTruth, *, replicates: int) -> dict[str, Any]:
-        """See `score_found` and `score_pictures`."""
-        if self.flat:
-            return score_pictures(self._examination, self._detector, boxes, truth, replicates=replicates)
-        return score_found(self._examination, boxes, truth, replicates=replicates)
 
     def match(self, truth: GroundTruth) -> Match | None:
         """Return the function by which `worst_of` compares; None: its default."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -15,7 +15,6 @@ from ssad.core.registry import split_weights
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources
-from ssad.experiments.perception.detector_kind import DetectorKind, DetectorSuite
 from ssad.experiments.perception.digital import page
 from ssad.experiments.perception.digital.attack_record import attack_record
 from ssad.experiments.perception.digital.attack_sheet import attack_sheet
@@ -30,8 +29,9 @@ from ssad.experiments.perception.digital.points import (
     transfers_of,
 )
 from ssad.experiments.perception.digital.verdict import verdict
-from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, boxes_path
-from ssad.experiments.perception.scored_data import data_of, detectors_of
+from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow
+from ssad.experiments.perception.scene_boxes import Examination, SceneCondition
+from ssad.experiments.perception.scored_data import Victims, detectors_of
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.scenarios.static.digital.perturbation import DigitalAttack
@@ -55,12 +55,13 @@ class DigitalSuite(DetectorSuite, AttackTable):
     hardened: list[str] = Field(default=[])
 
 
-class Digital(DetectorKind):
+class Digital(OpenLoopKind):
     """Kind `digital`. A piece is a scene under an attack on one system, shown to all systems that need it."""
 
     name = "digital"
+    families: ClassVar = {"attacks": "digital"}
     suite = DigitalSuite
-    columns = (*DetectorKind.columns, Column("drop", "share of the clean mAP that is lost", "", "higher"))
+    columns = (*OpenLoopKind.columns, Column("drop", "share of the clean mAP that is lost", "", "higher"))
     factors = (
         "detector",
         "attack",
@@ -76,21 +77,26 @@ class Digital(DetectorKind):
         "subset",
     )
 
-    def plan(self, suite: DigitalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Build attacks, defences and detectors once, and inspect the data set."""
-        points = points_of(suite)
-        detector_names = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
-        weights, detectors, tasks = detectors_of(suite, detector_names, flat=True)
+    def check(self, suite: DigitalSuite) -> None:
+        """Build attacks and defences, so that errors show up here."""
+        points_of(suite)
         if suite.transfer_detectors and not suite.transfer:
             raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
+
+    def victims(self, suite: DigitalSuite) -> Victims:
+        """Return all detectors of the suite."""
+        names = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
+        return detectors_of(suite.name, names, flat=True)
+
+    def rows(self, suite: DigitalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+        """Yield the attacks on each detector, and the images that are made against others."""
+        points = points_of(suite)
         main_detectors, hardened_detectors = (
             [split_weights(text)[0] for text in entries] for entries in (suite.detectors, suite.hardened)
         )
-        data = data_of(suite)
-        cells = []
-        for detector in detectors:
+        for detector in victims.files:
             transfer_sources = [
-                candidate for candidate in detectors if candidate not in (detector, *hardened_detectors)
+                candidate for candidate in victims.files if candidate not in (detector, *hardened_detectors)
             ]
             transferred_points = [
                 replace(one, source=candidate) for one in transfers_of(suite) for candidate in transfer_sources
@@ -101,19 +107,17 @@ class Digital(DetectorKind):
                 source = point.source or (system if point.aware or not point.defence else detector)
                 title = f"{system}/{point.attack}{f'@{source}' if point.specs and source != system else ''}"
                 title += f"/{point.scenes}" if point.scenes else ""
-                inputs: list[Any] = [weights[detector], safeio.dump_json(data), device, suite.replicates]
-                inputs += [weights[point.source]] if point.source else []
-                cell_spec = {"attacks": [one.row for one in point.specs], "source": source, "scenes": point.scenes}
-                fields = {"detector": detector, **point.fields, "task": tasks[detector]}
-                cells.append(self.make_cell(title, system, suite.seed, fields, cell_spec, *inputs))
-        return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, {}, detectors)
+                inputs = [safeio.dump_json(data), *([victims.weights[point.source]] if point.source else [])]
+                spec = {"attacks": [one.row for one in point.specs], "source": source, "scenes": point.scenes}
+                fields = {"detector": detector, **point.fields, "task": victims.tasks[detector]}
+                yield TableRow(title, system, fields, spec, inputs)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """Prepare as `DetectorKind` does, and print how many gradients the suite takes."""
+        """Prepare as `OpenLoopKind` does, and print how many gradients the suite takes."""
         settings = super().prepare(plan, folder, resources, retry=retry)
         job, images = Job(folder, plan.device, settings), settings["images"]
         passes_by_scene: dict[str, Any] = {
-            f"{scene.source}/{scene.name}": scene.perturbation.spec.passes_in(images[scene.scene])
+            scene.name: scene.perturbation.spec.passes_in(images[scene.scene])
             for cell in plan.cells
             for scene in self.scenes(cell, job)
             if isinstance(scene.perturbation, DigitalAttack)
@@ -143,43 +147,21 @@ class Digital(DetectorKind):
         specs = [AttackSpec.of_row(row) for row in cell.spec["attacks"]]
         return [SceneCondition(scene, DigitalAttack(spec), source, batch) for spec in specs for scene in scenes]
 
-    def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """Return the scenes whose boxes are still to be found.
+    def compared_scenes(self, cell: Cell, job: Job) -> list[SceneCondition]:
+        """Return the clean scenes, which every cell is compared with."""
+        return [SceneCondition(scene) for scene in dict.fromkeys(one.scene for one in self.scenes(cell, job))]
 
-        Clean scenes, which every cell is compared with, are done for all systems at once; so are images that are made
-        against one system and shown to several.
-        """
-        found: dict[str, Any] = {}
-        for scene in self.scenes(cell, job):
-            clean = SceneCondition(scene.scene)
-            if not boxes_path(job.folder, cell.system, clean).is_file():
-                found[clean.name] = {"scene": scene.scene}
-            attack = scene.perturbation
-            if isinstance(attack, DigitalAttack) and not boxes_path(job.folder, cell.system, scene).is_file():
-                piece = {"scene": scene.scene, "batch": scene.batch, "source": scene.source, **attack.spec.row}
-                found[f"{scene.source}/{scene.name}"] = piece
-        return found
-
-    def condition(self, data: Any) -> SceneCondition:
-        """Return the attacked or clean scene of a piece."""
-        if "attack" not in data:
-            return SceneCondition(data["scene"])
-        attack = DigitalAttack(AttackSpec.of_row(data))
-        return SceneCondition(data["scene"], attack, data["source"], data["batch"])
-
-    def settings(self, suite: DigitalSuite) -> dict[str, Any]:
-        """Return the batch size and the defended detectors."""
+    def settings(self, suite: DigitalSuite, scenes: Mapping[str, SceneData]) -> dict[str, Any]:
+        """Return the batch size, the defended detectors, and towns and numbers of camera images of the scenes."""
         defended = {
             system_name(detector, defence): [detector, defence.name, dict(defence.options)]
             for detector in (split_weights(text)[0] for text in suite.detectors)
             for defence in dict.fromkeys(guard_of(suite, attack) for attack in suite.attacks if attack.defence)
             if defence
         }
-        return {"batch": suite.batch, "defended": defended}
-
-    def about(self, scenes: Mapping[str, SceneData]) -> dict[str, Any]:
-        """Return the towns, and the numbers of camera images."""
         return {
+            "batch": suite.batch,
+            "defended": defended,
             "towns": {name: scene.log.location if scene.log else "" for name, scene in scenes.items()},
             "images": {
                 name: sum(frame.modality == "camera" and frame.key_frame for frame in scene.frames)

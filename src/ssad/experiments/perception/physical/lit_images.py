@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ssad.core.detections import Truth
 from ssad.core.images import decode_image, encode_jpeg
+from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.experiments.perception.physical.target_views import TargetClips, drive_of, target_truth
 from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturedClip, seen_part
@@ -139,48 +140,6 @@ def lit_clips(
         yield LitClip(recorded, scene_pair[1], len(recorded.scene.meshes))
 
 
-@dataclass(frozen=True, slots=True)
-class LitPictures:
-    """The first images of a recording at an hour, for a detector.
-
-    Attributes:
-        folder: Folder that `record_clips` wrote.
-        hour: See `HOURS`.
-        count: Number of images.
-        classes: Names of the detector's classes, in its order.
-        device: Device that renders and shows them.
-    """
-
-    folder: Path
-    hour: str
-    count: int
-    classes: tuple[str, ...]
-    device: str = "cpu"
-
-    @classmethod
-    def of(cls, clips: TargetClips, hour: str) -> Self:
-        """The same pictures at an hour."""
-        return cls(clips.folder, hour, clips.count, clips.classes, clips.device)
-
-    def clips(self) -> tuple[LitClip, ...]:
-        """Kept, since their scenes take longer to make than their pictures. FormatError as for `lit_clips`."""
-        return _kept(self.folder, self.hour, self.count, self.device)
-
-    def truth(self, clip: LitClip) -> Truth:
-        """What is annotated in a picture, the target first."""
-        return target_truth(clip.clip.row, clip.clip.objects, self.classes)
-
-    def under(self, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, with an edit around the target."""
-        for lit_image in self.clips():
-            tensor = torch.from_numpy(lit_image.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
-            yield drive_of(lit_image.clip.row), tensor, self.truth(lit_image)
-
-    def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Yield the same without an edit."""
-        return self.under(NO_EDIT)
-
-
 @lru_cache(maxsize=4)
 def _kept(folder: Path, hour: str, count: int, device: str) -> tuple[LitClip, ...]:
     return tuple(lit_clips(folder, hour, count=count, device=device, stages=_stages(folder, device)))
@@ -197,7 +156,25 @@ class LightableClips(TargetClips):
     """Recorded images of a target that can wear textures, and be shown at another hour in any light.
 
     It is the `TargetImages` of `ssad.scenarios.static.perturbation`.
+
+    Attributes:
+        hour: Hour of the clean images (see `HOURS`); None: as they were recorded.
     """
+
+    hour: str | None = None
+
+    @classmethod
+    def of(cls, folder: Path, count: int, detector: Detector, device: str, *, hour: str | None = None) -> Self:
+        """Return the first images of a recording for a detector."""
+        return cls(folder, count, tuple(detector.classes), device, detector.task == "3d", hour)
+
+    def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, at the hour of the images.
+
+        Raises:
+            FormatError: The folder holds no recording of this version.
+        """
+        return TargetClips.clean(self) if self.hour is None else self.lit(self.hour, NO_EDIT)
 
     def lit(self, hour: str, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, at an hour and with an edit around the target.
@@ -206,4 +183,18 @@ class LightableClips(TargetClips):
             FormatError: The folder holds no recording of this version.
             UnknownNameError: There is no such hour.
         """
-        return LitPictures.of(self, hour).under(edit)
+        for lit_image in self.clips_at(hour):
+            tensor = torch.from_numpy(lit_image.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
+            yield drive_of(lit_image.clip.row), tensor, self.lit_truth(lit_image)
+
+    def clips_at(self, hour: str) -> tuple[LitClip, ...]:
+        """Return the images at an hour; they are kept, since scenes take longer to make than images.
+
+        Raises:
+            FormatError, UnknownNameError: See `lit`.
+        """
+        return _kept(self.folder, hour, self.count, self.device)
+
+    def lit_truth(self, clip: LitClip) -> Truth:
+        """Return the truth of an image at an hour."""
+        return target_truth(clip.clip.row, clip.clip.objects, self.classes)

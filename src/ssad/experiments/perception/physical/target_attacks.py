@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -20,13 +20,14 @@ from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.detectors import loaded_detector
 from ssad.engine.pool import open_pool, run_all
-from ssad.experiments.perception.physical.lit_images import LightableClips, LitPictures
+from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
 from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
 from ssad.recorders.target_recording import Clips
 from ssad.rendering.camera.scene import Decal, Layer
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.target import TargetCar, parse_target
+from ssad.scenarios.static.perturbation import Perturbation, TargetImages
 from ssad.scenarios.static.physical import Surface, TextureSpec, View, albedo_of, make_carrier
 from ssad.scenarios.static.physical.lights import LitView, Target
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec
@@ -69,82 +70,15 @@ class TargetAttacks:
 
     def clips(self, recording: str, count: int, detector: str) -> LightableClips:
         """Return the first images of a recording, clean or ready for a texture."""
-        victim = self.detector(detector)
-        folder = self.folder / "data" / recording
-        return LightableClips(folder, count, tuple(victim.classes), self.device, whole=victim.task == "3d")
+        return LightableClips.of(self.folder / "data" / recording, count, self.detector(detector), self.device)
 
-    def texture(self, spec: TextureSpec) -> Tensor:
-        """Return a texture [3, H, W], sRGB; it is trained now if necessary.
+    def texture(self, spec: TextureSpec) -> TrainedTexture:
+        """Return a texture as a perturbation of the target."""
+        return TrainedTexture(self, spec)
 
-        Raises:
-            ConfigError: See `TextureFolder.texture`.
-        """
-        surface = surface_of(self.target, spec.surface)
-
-        def views() -> list[View]:
-            image_sets = [self.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
-            if spec.around:
-                image_sets.append(self.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
-            return [view for image_set in image_sets for _, view in image_set.wearing(surface, solid=image_set.whole)]
-
-        base_paint = paint_under(self.target, spec.surface)
-        return self.textures.texture(
-            spec, surface, views=views, detector=lambda: self.detector(spec.source), paint=base_paint
-        )
-
-    def worn(self, clips: LightableClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Yield drive, image and truth of recorded images under a texture, which is trained now if necessary."""
-        return worn(clips, albedo_of(self.texture(spec)), surface_of(self.target, spec.surface))
-
-    def about(self, spec: TextureSpec) -> dict[str, Any]:
-        """Return the record of a texture: its file, the distance of its colours from the paint, and its training."""
-        artefacts = {"texture": str(self.textures.picture(spec).relative_to(self.folder))}
-        mask = torch.from_numpy(surface_of(self.target, spec.surface).mask.copy())
-        albedo = albedo_of(self.texture(spec).detach())
-        colour_distance = conspicuousness(albedo, paint_under(self.target, spec.surface), mask)
-        return {"artefacts": artefacts, "delta_e": round(float(colour_distance), 2), **self.textures.history(spec)}
-
-    def light(self, spec: LightSpec) -> SceneEdit:
-        """Return a light as an edit of a scene; it is searched now if necessary.
-
-        Raises:
-            ConfigError: See `LightFolder.edit`.
-        """
-        car = parse_target(self.target)
-        assert isinstance(car, TargetCar)
-
-        def training_images() -> LitPictures:
-            return LitPictures.of(self.clips(spec.pair["train"], spec.pair["train_images"], spec.source), spec.hour)
-
-        def projected(edit: SceneEdit) -> list[View]:
-            texture_size = edit.textures[0].shape[1], edit.textures[0].shape[2]
-            lit_set = training_images()
-            return [
-                View(lit_image.projected(edit).prepare({0: texture_size}, device=self.device), lit_set.truth(lit_image))
-                for lit_image in lit_set.clips()
-            ]
-
-        def views() -> list[LitView]:
-            lit_set = training_images()
-            return [LitView(lit_image.lit(self.device), lit_set.truth(lit_image)) for lit_image in lit_set.clips()]
-
-        return self.lights.edit(
-            spec,
-            Target(*car.full_size),
-            views=views,
-            projected=projected,
-            detector=lambda: self.detector(spec.source),
-        )
-
-    def under(self, pictures: LitPictures, spec: LightSpec) -> Iterator[tuple[str, Tensor, Truth]]:
-        """Drive, picture and truth of pictures under a light."""
-        return pictures.under(self.light(spec))
-
-    def about_light(self, spec: LightSpec) -> dict[str, Any]:
-        """Return the record of a light: its file and its search."""
-        path = self.lights.picture(spec)
-        artefacts = {"light": str((path if path.is_file() else self.lights.kept(spec)).relative_to(self.folder))}
-        return {"artefacts": artefacts, **self.lights.history(spec)}
+    def light(self, spec: LightSpec) -> SearchedLight:
+        """Return a light as a perturbation of the target."""
+        return SearchedLight(self, spec)
 
     def sheet(
         self,
@@ -177,7 +111,7 @@ class TargetAttacks:
                 if view_index in view_numbers
             ]
 
-        textured_views = {title: select(self.worn(all_images, spec)) for title, spec in textures.items()}
+        textured_views = {title: select(self.texture(spec).on_target(all_images)) for title, spec in textures.items()}
         sheets = []
         for index, (_, image, truth) in enumerate(select(all_images.clean())):
             titled_images = [
@@ -192,10 +126,134 @@ class TargetAttacks:
         """Draw the first image of a recording under lights: by title the hour and the light (None: none)."""
         victim, titled_images = self.detector(detector), []
         for title, (hour, spec) in lights.items():
-            lit_set = LitPictures.of(self.clips(recording, 1, detector), hour)
-            ((_, tensor, truth),) = lit_set.clean() if spec is None else self.under(lit_set, spec)
+            images = replace(self.clips(recording, 1, detector), hour=hour)
+            ((_, tensor, truth),) = images.clean() if spec is None else self.light(spec).on_target(images)
             titled_images.append((title, tensor))
         return target_sheet(victim, titled_images, truth, self.device)
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedTexture(Perturbation):
+    """Texture of a results folder, which is trained on first use, or a control.
+
+    Attributes:
+        attacks: Textures of the folder.
+        spec: All that decides the texture.
+    """
+
+    attacks: TargetAttacks
+    spec: TextureSpec
+    family: str = field(default="texture", init=False)
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """Name of the texture."""
+        return self.spec.name
+
+    @property
+    def is_missing(self) -> bool:
+        """True if it is to be trained, and is not yet."""
+        return bool(self.spec.trained) and not self.attacks.textures.kept(self.spec).is_file()
+
+    def make(self) -> Tensor:
+        """Return the texture [3, H, W], sRGB; it is trained now if necessary.
+
+        Raises:
+            ConfigError: See `TextureFolder.texture`.
+        """
+        attacks, spec = self.attacks, self.spec
+        surface = surface_of(attacks.target, spec.surface)
+
+        def views() -> list[View]:
+            image_sets = [attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
+            if spec.around:
+                image_sets.append(attacks.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
+            return [view for image_set in image_sets for _, view in image_set.wearing(surface, solid=image_set.whole)]
+
+        base_paint = paint_under(attacks.target, spec.surface)
+        return attacks.textures.texture(
+            spec, surface, views=views, detector=lambda: attacks.detector(spec.source), paint=base_paint
+        )
+
+    def on_target(self, images: TargetImages) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Yield drive, image and truth of the recorded target that wears the texture."""
+        return worn(images, albedo_of(self.make()), surface_of(self.attacks.target, self.spec.surface))
+
+    def about(self) -> dict[str, Any]:
+        """Return the record of the texture: its file, the distance of its colours from the paint, and its training."""
+        textures, spec, target = self.attacks.textures, self.spec, self.attacks.target
+        artefacts = {"texture": str(textures.picture(spec).relative_to(self.attacks.folder))}
+        mask = torch.from_numpy(surface_of(target, spec.surface).mask.copy())
+        colour_distance = conspicuousness(albedo_of(self.make().detach()), paint_under(target, spec.surface), mask)
+        return {"artefacts": artefacts, "delta_e": round(float(colour_distance), 2), **textures.history(spec)}
+
+
+@dataclass(frozen=True, slots=True)
+class SearchedLight(Perturbation):
+    """Light of a results folder, which is searched on first use, or drawn at random.
+
+    Attributes:
+        attacks: Lights of the folder.
+        spec: All that decides the light.
+    """
+
+    attacks: TargetAttacks
+    spec: LightSpec
+    family: str = field(default="light", init=False)
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """Name of the light."""
+        return self.spec.name
+
+    @property
+    def is_missing(self) -> bool:
+        """True if it is to be searched, and is not yet."""
+        return bool(self.spec.source) and not self.attacks.lights.kept(self.spec).is_file()
+
+    def make(self) -> SceneEdit:
+        """Return the light as an edit of a scene; it is searched now if necessary.
+
+        Raises:
+            ConfigError: See `LightFolder.edit`.
+        """
+        attacks, spec = self.attacks, self.spec
+        car = parse_target(attacks.target)
+        assert isinstance(car, TargetCar)
+
+        def training_images() -> LightableClips:
+            return attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)
+
+        def projected(edit: SceneEdit) -> list[View]:
+            texture_size = edit.textures[0].shape[1], edit.textures[0].shape[2]
+            images = training_images()
+            return [
+                View(clip.projected(edit).prepare({0: texture_size}, device=attacks.device), images.lit_truth(clip))
+                for clip in images.clips_at(spec.hour)
+            ]
+
+        def views() -> list[LitView]:
+            images = training_images()
+            return [LitView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.clips_at(spec.hour)]
+
+        return attacks.lights.edit(
+            spec,
+            Target(*car.full_size),
+            views=views,
+            projected=projected,
+            detector=lambda: attacks.detector(spec.source),
+        )
+
+    def on_target(self, images: TargetImages) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Yield drive, image and truth of the recorded target in the light, at its hour."""
+        return images.lit(self.spec.hour, self.make())
+
+    def about(self) -> dict[str, Any]:
+        """Return the record of the light: its file and its search."""
+        lights, spec = self.attacks.lights, self.spec
+        path = lights.picture(spec)
+        artefacts = {"light": str((path if path.is_file() else lights.kept(spec)).relative_to(self.attacks.folder))}
+        return {"artefacts": artefacts, **lights.history(spec)}
 
 
 def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:

@@ -21,7 +21,7 @@ def export_shown_texture(
 
     Args:
         attacks: Attacks of the run.
-        row: Its spec, as of `TargetRow`.
+        row: Its spec, as of `TableRow`.
         out: Folder to write to.
         name: Name of the texture.
         dots: Dots of the print per metre.
@@ -54,7 +54,7 @@ def export_shown_light(attacks: TargetAttacks, row: Mapping[str, Any], out: Path
 
     Args:
         attacks: Attacks of the run.
-        row: Its spec, as of `TargetRow`.
+        row: Its spec, as of `TableRow`.
         out: Folder to write to.
         name: Name of the light.
 

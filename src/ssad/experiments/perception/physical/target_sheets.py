@@ -16,7 +16,7 @@ from ssad.scenarios.static.physical.lights.folder import LightSpec
 
 SIDES = (0.0, 90.0, 180.0, 270.0)  # of the grid that pictures show
 
-Cells = Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]  # fields and spec, as of `TargetRow`
+Cells = Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]  # fields and spec, as of `TableRow`
 
 
 def write_sheets(attacks: TargetAttacks, table: TargetTable, cells: Cells) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -14,6 +13,7 @@ from pydantic import Field, field_validator, model_validator
 from ssad.core.errors import ConfigError
 from ssad.core.schema import Names, Schema
 from ssad.experiments.perception.digital.points import named
+from ssad.experiments.perception.open_loop import TableRow
 from ssad.recorders.nuscenes import WEATHERS
 from ssad.recorders.target_recording import AZIMUTHS, ELEVATIONS, Clips
 from ssad.rendering.camera.render import Weather
@@ -226,22 +226,7 @@ class TargetTable(Schema):
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class TargetRow:
-    """One condition of a detector, as plain data.
-
-    Attributes:
-        title: Title of the cell.
-        fields: Columns of its record.
-        spec: Data to build it from: see `TextureSpec.of_row`, or `light` for `LightSpec.of_row`.
-    """
-
-    title: str
-    fields: Mapping[str, Any]
-    spec: Mapping[str, Any]
-
-
-def rows_of(table: TargetTable) -> Iterator[TargetRow]:
+def rows_of(table: TargetTable) -> Iterator[TableRow]:
     """Yield all rows of a table: textures, each beside the clean images, then lights.
 
     Raises:
@@ -266,7 +251,7 @@ def rows_of(table: TargetTable) -> Iterator[TargetRow]:
 
 def _texture_rows(  # noqa: PLR0917
     table: TargetTable, pair: Pair, view: str, detector: str, row: Mapping[str, Any], called: str
-) -> Iterator[TargetRow]:
+) -> Iterator[TableRow]:
     """A texture before a detector, from each detector that it is trained against, and with each seed."""
     attack = row["attack"]
     is_trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
@@ -288,10 +273,10 @@ def _texture_rows(  # noqa: PLR0917
         }
         title_parts = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
         title = "/".join(map(str, title_parts)) + (f"/{GRID}" if view == GRID else "")
-        yield TargetRow(title, fields, spec)
+        yield TableRow(title, detector, fields, spec)
 
 
-def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
+def _light_rows(table: TargetTable) -> Iterator[TableRow]:
     """Yield, for each hour, the clean images, then each light and its controls."""
     check_lights(table)
     for pair, detector in product(table.pairs, table.detectors):
@@ -320,7 +305,8 @@ def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
                 "number": light["number"],
             }
             title_parts = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
-            yield TargetRow("/".join(map(str, title_parts)), fields, {"attack": None, "light": light})
+            title = "/".join(map(str, title_parts))
+            yield TableRow(title, detector, fields, {"attack": None, "light": light})
 
 
 def _title(table: TargetTable, row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.types import U8
-from ssad.engine.kind import Cell, Job, Names, Plan
-from ssad.experiments.perception.detector_kind import DetectorKind, DetectorSuite
-from ssad.experiments.perception.scene_boxes import (
-    Examination,
-    SceneCondition,
-    boxes_path,
-)
-from ssad.experiments.perception.scored_data import data_of, detectors_of
+from ssad.engine.kind import Cell, Job, Names
+from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow
+from ssad.experiments.perception.scene_boxes import Examination, SceneCondition
+from ssad.experiments.perception.scored_data import Victims
 from ssad.experiments.perception.sheets import STRONG, detection_sheet
 from ssad.experiments.perception.shifts import page
 from ssad.experiments.perception.shifts.verdict import verdict
@@ -45,38 +42,36 @@ class DetectionSuite(DetectorSuite):
     calibration: Literal["physical", "paper"] = "physical"
 
 
-class Detection(DetectorKind):
+class Detection(OpenLoopKind):
     """See the module. Cells of all detectors share the work of shifting a scene: a piece is a scene under a shift."""
 
     name = "detection"
     suite = DetectionSuite
     factors = ("detector", "shift", "severity")
+    families: ClassVar = {"shifts": "shift"}
 
-    def plan(self, suite: DetectionSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Build detectors once, and inspect the data set."""
+    def check(self, suite: DetectionSuite) -> None:
+        """Raise ConfigError for a shift or severity that appears twice or does not exist."""
         lists: dict[str, Sequence[object]] = {"shift": suite.shifts, "severity": suite.severities}
         for key, values in lists.items():
             if len(set(values)) != len(values):
                 raise ConfigError(f"suite {suite.name}: a {key} appears twice")
         for name in suite.shifts:
             ShiftSpec(name, calibration=suite.calibration)
-        weights, detectors, _ = detectors_of(suite)
-        data = data_of(suite)
-        conditions: list[tuple[str | None, int | str]] = [
-            (None, 0),
-            *((shift, level) for shift in suite.shifts for level in suite.severities),
-        ]
-        cells = []
-        for detector in detectors:
-            for shift, severity in conditions:
-                family = KNOWN[shift][0] if shift else "clean"
-                fields = {"detector": detector, "shift": shift, "family": family, "severity": severity}
-                spec = {"calibration": suite.calibration, "labels": "original"}
-                title = f"{detector}/{shift or 'clean'}/{severity}"
-                inputs = weights[detector], safeio.dump_json(data), device, suite.replicates
-                cells.append(self.make_cell(title, detector, suite.seed, fields, spec, *inputs))
-        versions = {"shifts": str(VERSIONS[suite.calibration])}
-        return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, versions, detectors)
+
+    def rows(self, suite: DetectionSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+        """Yield the clean data, then each shift at each severity."""
+        shifted = list(product(suite.shifts, suite.severities))
+        for detector, (shift, severity) in product(victims.files, [(None, 0), *shifted]):
+            family = KNOWN[shift][0] if shift else "clean"
+            fields = {"detector": detector, "shift": shift, "family": family, "severity": severity}
+            spec = {"calibration": suite.calibration, "labels": "original"}
+            title = f"{detector}/{shift or 'clean'}/{severity}"
+            yield TableRow(title, detector, fields, spec, [safeio.dump_json(data)])
+
+    def versions(self, suite: DetectionSuite) -> dict[str, str]:
+        """Return the version of the shifts."""
+        return {"shifts": str(VERSIONS[suite.calibration])}
 
     def order(self, cell: Cell) -> float:
         """Clean first, then what the main table tells, the middle severity, the others."""
@@ -84,16 +79,6 @@ class Detection(DetectorKind):
         if cell.fields["shift"] is None:
             return 0
         return 1 if isinstance(severity, str) else 2 + abs(severity - 3)
-
-    def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """Return the scenes whose boxes are still to be found."""
-        scenes = self.scenes(cell, job)
-        missing = [scene for scene in scenes if not boxes_path(job.folder, cell.system, scene).is_file()]
-        calibration = cell.spec["calibration"]
-        return {
-            scene.name: [cell.fields["shift"], getattr(scene.perturbation, "severity", 0), calibration, scene.scene]
-            for scene in missing
-        }
 
     def scenes(self, cell: Cell, job: Job) -> list[SceneCondition]:
         """Return the scenes of a cell under its shift.
@@ -107,14 +92,6 @@ class Detection(DetectorKind):
         spec = ShiftSpec(shift, seed=cell.seed, calibration=calibration)
         severity_by_token = dealt_severities(spec, tokens.values())
         return [shifted_scene(shift, severity_by_token[token], calibration, scene) for scene, token in tokens.items()]
-
-    def condition(self, data: Any) -> SceneCondition:
-        """Return the shifted scene of a piece."""
-        return shifted_scene(*data)
-
-    def settings(self, suite: DetectionSuite) -> dict[str, Any]:
-        """Return no further settings."""
-        return {}
 
     def sheet(
         self, examination: Examination, suite: DetectionSuite, cell: Cell | None = None
