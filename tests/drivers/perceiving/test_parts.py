@@ -439,7 +439,7 @@ class Keeping(KalmanTracker):
     """Does not forget."""
 
     def reset(self, episodes: Any) -> None:
-        if len(self._born) != len(episodes):
+        if len(self._track_counts) != len(episodes):
             super().reset(episodes)
 
 

@@ -109,7 +109,7 @@ def danger_start(trace: EpisodeTrace, agent: int, contact: int, is_triggered: Bo
         trace: The drive.
         agent: Index of the agent that was hit.
         contact: The step of the contact.
-        is_is_triggered: [T] True once its script has begun.
+        is_triggered: [T] True once its script has begun.
         is_visible: [T] True where the ego sees it.
 
     Returns:
