@@ -34,8 +34,8 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.types import Bool, Scenario
 from ssad.drivers import make_system
 from ssad.drivers.careful.driver import Careful
-from ssad.drivers.careful.grade import AFTER, _Onlooker, danger_begins
-from ssad.drivers.careful.replay import Ending, Takeover, play
+from ssad.drivers.careful.grade import AFTER, _ReplayObserver, danger_start
+from ssad.drivers.careful.replay import ReplayPlan, Takeover, run_replays
 from ssad.metrics import CaseValue, estimate
 from ssad.metrics.driving import first_contact
 from ssad.scenarios.dynamic.generate import Trials, scenario_of
@@ -207,15 +207,15 @@ def reg157_avoids(collisions: Sequence[Base]) -> list[bool]:
     drives = [(base.episode, base.graph, base.trace) for base in collisions]
     contacts = [first_contact(trace) for _, _, trace in drives]
     ends = [step * trace.dt for (step, _), (_, _, trace) in zip(contacts, drives, strict=True)]
-    watch = _Onlooker(drives, [agent for _, agent in contacts])
+    watch = _ReplayObserver(drives, [agent for _, agent in contacts])
     nobody, endings = Takeover(Careful(), math.inf), []
-    play([Ending(*drive, [nobody], end) for drive, end in zip(drives, ends, strict=True)], watch=watch)
+    run_replays([ReplayPlan(*drive, [nobody], end) for drive, end in zip(drives, ends, strict=True)], watch=watch)
     for k, (drive, (step, agent), end) in enumerate(zip(drives, contacts, ends, strict=True)):
         trace = drive[2]
-        begin = danger_begins(trace, agent, step, watch.triggered[k, : len(trace.x)], watch.seen[k, : len(trace.x)])
+        begin = danger_start(trace, agent, step, watch.triggered[k, : len(trace.x)], watch.seen[k, : len(trace.x)])
         driver = Careful("reg157", keep_speed=True)
-        endings.append(Ending(*drive, [Takeover(driver, begin * trace.dt)], end + AFTER))
-    return [not bool(hits[0]) for hits in play(endings)] if endings else []
+        endings.append(ReplayPlan(*drive, [Takeover(driver, begin * trace.dt)], end + AFTER))
+    return [not bool(hits[0]) for hits in run_replays(endings)] if endings else []
 
 
 def cluster(name: str) -> str:

@@ -37,9 +37,9 @@ from ssad.core.seeding import generator
 from ssad.core.types import Controller, Limits
 from ssad.rendering.bodies import draw_paint, make_body
 from ssad.rendering.camera.lamps import own_lamps
-from ssad.rendering.camera.render import PLAIN, Quality, View, Weather, render
-from ssad.rendering.camera.scene import Layer, Scene, Thing
-from ssad.rendering.camera.texture import retexture, taps_of
+from ssad.rendering.camera.render import PLAIN, RenderQuality, SceneWeather, View, render
+from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureLayer
+from ssad.rendering.camera.texture import retexture, texture_taps
 from ssad.rendering.onboard import Onboard
 from ssad.rendering.street import build_street
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -56,12 +56,12 @@ def place(x: float, y: float, yaw: float) -> Any:
     return pose
 
 
-def scene(size: int, device: str) -> tuple[Scene, View]:
+def scene(size: int, device: str) -> tuple[RenderScene, View]:
     """A stage and a view with 30 vehicles on the lanes before the camera."""
     graph = load_town("Twinford")
     kinds = ["car"] * 7 + ["truck", "bus", "motorcycle"]
     meshes = [make_body(kind, generator=generator("camera speed", k)) for k, kind in enumerate(kinds)]
-    stage = Scene(build_street(graph, seed=0), meshes, device=device)
+    stage = RenderScene(build_street(graph, seed=0), meshes, device=device)
     lanes = [k for k in range(len(graph.kind)) if graph.kind[k] == 1 and graph.junction[k] < 0]
     start = next(k for k in lanes if graph.s[graph.offset[k + 1] - 1] > 50)
     first = graph.offset[start] + 6
@@ -74,12 +74,13 @@ def scene(size: int, device: str) -> tuple[Scene, View]:
     spots = spots[ahead][np.argsort(local[ahead, 0])][:29]
     draws = generator("camera speed")
     things = [
-        Thing(k % len(meshes), place(*graph.xy[i], graph.yaw[i]), draw_paint(draws), k + 1) for k, i in enumerate(spots)
+        SceneObject(k % len(meshes), place(*graph.xy[i], graph.yaw[i]), draw_paint(draws), k + 1)
+        for k, i in enumerate(spots)
     ]
-    things.append(Thing(0, ego @ place(21.7, 0, 0), tag=100, layers=(Layer(0),)))
+    things.append(SceneObject(0, ego @ place(21.7, 0, 0), tag=100, layers=(TextureLayer(0),)))
     focal = 0.79 * size
     camera = Camera(size, size, np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]))
-    return stage, View(camera, ego @ FORWARD, tuple(things), Weather(0.8, 0.9))
+    return stage, View(camera, ego @ FORWARD, tuple(things), SceneWeather(0.8, 0.9))
 
 
 def median(run: Callable[[], object], device: str, repeats: int) -> float:
@@ -158,15 +159,15 @@ def main() -> None:
     result: dict[str, Any] = {
         "device": wp.get_device(device).name if device != "cpu" else platform.machine(),
         "batch": options.batch,
-        "things": len(view.things),
+        "things": len(view.objects),
         "ms_per_frame": 1e3 * seconds / options.batch,
         "frames_per_s": options.batch / seconds,
     }
     print(f"{result['ms_per_frame']:.2f} ms a frame, {result['frames_per_s']:.0f} frames/s")
-    dark = Weather(-0.15, 0.9)
+    dark = SceneWeather(-0.15, 0.9)
     lamps = own_lamps(view.pose @ np.linalg.inv(FORWARD), dark)
     night = replace(view, weather=dark, lamps=lamps)
-    for name, one, quality in (("plain", view, PLAIN), ("night", night, Quality())):
+    for name, one, quality in (("plain", view, PLAIN), ("night", night, RenderQuality())):
         seconds = median(
             partial(render, stage, [one] * options.batch, quality=quality, download=False), device, options.repeats
         )
@@ -174,7 +175,7 @@ def main() -> None:
         print(f"{result[f'{name}_ms_per_frame']:.2f} ms a frame, {name}")
     if device == "cpu":
         picture = render(stage, [view])
-        taps = taps_of(picture, 256)
+        taps = texture_taps(picture, 256)
         radiance = torch.tensor(picture.radiance)
         texture = torch.full((3, 256, 256), 0.4, requires_grad=True)
         both = median(lambda: retexture(taps, texture, radiance).sum().backward(), device, 15)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ssad.core.types import Bool
-from ssad.drivers.careful.cut_in import CutIns, crashes, grid, slower
+from ssad.drivers.careful.cut_in import CutIns, crashes, cut_in_grid, speed_pairs
 from ssad.drivers.careful.models import FSM, RSS, CarefulHuman, Reg157
 
 PAGE = Path(__file__).parents[1] / "docs" / "results" / "careful-drivers.md"
@@ -31,7 +31,7 @@ SPEEDS = {"low": (range(10, 61, 10), range(2, 61)), "high": (range(70, 131, 10),
 def cases(name: str, lateral: float) -> CutIns:
     """A grid: the driver's speeds with all lower ones, and gaps, both in steps of 1 (10 km/h; 1 m)."""
     speeds, gaps = SPEEDS[name]
-    return grid(slower(speeds), gaps, lateral=lateral)
+    return cut_in_grid(speed_pairs(speeds), gaps, lateral=lateral)
 
 
 def shares(found: dict[str, Bool]) -> dict[str, float]:

@@ -26,7 +26,7 @@ import numpy as np
 from ssad import World, build_episode, load_scenarios, load_town, make_system
 from ssad.core.machine import quiet_warp, versions
 from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import CameraEyes, front
+from ssad.drivers.perceiving.eyes import CameraEyes, nuscenes_cameras
 from ssad.rendering.onboard import Onboard
 from ssad.world.rollout import Loop
 
@@ -83,7 +83,7 @@ def measured(name: str, *, device: str, seconds: float, warm: int, width: int, s
     detector, channels, count, rate, inside = CASES[name]
     scenes = scenes or count
     cuda = device.startswith("cuda")
-    cameras = front(width, channels)
+    cameras = nuscenes_cameras(width, channels)
     options = {} if inside is None else {"input_width": min(inside, width)}
     eyes = CameraEyes(detector, cameras, **options)
     driver = Perceiving(eyes, rate=rate)

@@ -38,7 +38,7 @@ from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
 from ssad.recorders.target_images import clip_views
 from ssad.recorders.viewpoints import weather_name
 from ssad.rendering.camera.labels import label_picture
-from ssad.rendering.camera.render import Weather, render
+from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.sensor import BRIGHTEST, noise_levels
 from ssad.training.detector import describe_data
 
@@ -64,7 +64,7 @@ def weather_of(description: str) -> str:
     height = np.radians(float(found[1])) * (1 if found[2] == "above" else -1)
     fog, wet = (re.search(rf"{name} ([\d.]+)", description) for name in ("fog of", "wet road"))
     return weather_name(
-        Weather(
+        SceneWeather(
             height,
             clouds=float(found[3]) / 100,
             fog=float(fog[1]) if fog else 0.0,
@@ -124,7 +124,7 @@ class Clips:
         for folder in dict.fromkeys(file.parents[1] for file in self.files):
             names = {file.name for file in wanted if file.parents[1] == folder}
             for one in clip_views(folder, split="test", only=names):
-                picture, street = render(one.scene, [one.view]), render(one.scene, [replace(one.view, things=())])
+                picture, street = render(one.scene, [one.view]), render(one.scene, [replace(one.view, objects=())])
                 light, behind = (
                     np.minimum(p.radiance[0] * p.exposure[0], BRIGHTEST).mean(-1) for p in (picture, street)
                 )

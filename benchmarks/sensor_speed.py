@@ -25,23 +25,23 @@ from camera_speed import scene
 from ssad.core.detections import Truth
 from ssad.detectors import make_detector
 from ssad.rendering.camera.render import View, develop_radiance, render
-from ssad.rendering.camera.sensor import PINHOLE, Sensor
-from ssad.rendering.camera.texture import retexture, taps_of
+from ssad.rendering.camera.sensor import PINHOLE, SensorModel
+from ssad.rendering.camera.texture import retexture, texture_taps
 from ssad.rendering.camera.torch_jpeg import jpeg
-from ssad.rendering.camera.torch_sensor import Window, develop, draw_noise
+from ssad.rendering.camera.torch_sensor import ChangedWindow, develop, draw_noise
 
 NOISE = 0.012
 RENDERED = {
     "pinhole": PINHOLE,
-    "lens and mosaic": Sensor(),
-    "lens": Sensor(mosaic=False),
-    "pinhole, noise": Sensor(blur=0.0, mosaic=False, noise=NOISE),
-    "lens, mosaic, noise": Sensor(noise=NOISE),
+    "lens and mosaic": SensorModel(),
+    "lens": SensorModel(mosaic=False),
+    "pinhole, noise": SensorModel(blur=0.0, mosaic=False, noise=NOISE),
+    "lens, mosaic, noise": SensorModel(noise=NOISE),
 }
-TORCH: dict[str, tuple[Sensor, int | None]] = {
+TORCH: dict[str, tuple[SensorModel, int | None]] = {
     "curve": (PINHOLE, None),
-    "lens, mosaic, noise": (Sensor(noise=NOISE), None),
-    "lens, mosaic, noise, JPEG": (Sensor(noise=NOISE), 92),
+    "lens, mosaic, noise": (SensorModel(noise=NOISE), None),
+    "lens, mosaic, noise, JPEG": (SensorModel(noise=NOISE), 92),
 }
 
 
@@ -67,20 +67,22 @@ def rendered(view: View, radiance: Any, exposure: float, repeats: int) -> dict[s
 
 def in_torch(picture: Any, repeats: int) -> dict[str, dict[str, float]]:
     """Ms from texture to picture and back, of all pixels and of the touched ones."""
-    taps, radiance = taps_of(picture, 256), torch.tensor(picture.radiance)
+    taps, radiance = texture_taps(picture, 256), torch.tensor(picture.radiance)
     exposure, texture = float(picture.exposure[0]), torch.full((3, 256, 256), 0.4)
     found = {}
     for name, (sensor, quality) in TORCH.items():
         noise = draw_noise(radiance.shape[:3], sensor, torch.Generator().manual_seed(0))
-        window = Window.around(taps.pixel, radiance.shape[:3], sensor, quality=quality)
+        window = ChangedWindow.around(taps.pixel, radiance.shape[:3], sensor, quality=quality)
         part, part_noise, part_taps = window.crop(radiance), window.crop(noise), window.taps(taps)
 
-        def whole(sensor: Sensor = sensor, quality: int | None = quality, noise: torch.Tensor = noise) -> None:
+        def whole(sensor: SensorModel = sensor, quality: int | None = quality, noise: torch.Tensor = noise) -> None:
             leaf = texture.clone().requires_grad_()
             image = develop(retexture(taps, leaf, radiance), exposure, sensor, noise)
             (image if quality is None else jpeg(image, quality)).sum().backward()
 
-        def touched(part: Any = part, noise: Any = part_noise, taps: Any = part_taps, window: Window = window) -> None:
+        def touched(
+            part: Any = part, noise: Any = part_noise, taps: Any = part_taps, window: ChangedWindow = window
+        ) -> None:
             leaf = texture.clone().requires_grad_()
             window.develop(retexture(taps, leaf, part), exposure, noise).sum().backward()
 

@@ -47,14 +47,14 @@ def boxes_of_drive(scenario: Any, detector: Any) -> Frames:
 
     from ssad import World, build_episode, load_town, make_system, rollout
     from ssad.core.rotations import upright_pose
-    from ssad.drivers.perceiving.eyes import front, projected
+    from ssad.drivers.perceiving.eyes import nuscenes_cameras, project_boxes
     from ssad.metrics.perception_in_drive import in_view
     from ssad.rendering.onboard import Onboard
     from ssad.world.models import MODELS
 
     town = load_town(scenario.town)
     (trace,) = rollout(World([build_episode(scenario, town, seed=0)], {town.name: town}), make_system("autopilot"))
-    cameras = front(640)
+    cameras = nuscenes_cameras(640)
     (camera,) = cameras.values()
     steps = list(range(0, len(trace.x), round(1.0 / RATE / trace.dt)))
     seen = in_view(trace, steps, cameras)
@@ -75,7 +75,7 @@ def boxes_of_drive(scenario: Any, detector: Any) -> Frames:
                 [int(trace.kind[agent])],
                 np.zeros((1, 2)),
             )
-            box = projected(body, to_camera, camera).box.numpy()
+            box = project_boxes(body, to_camera, camera).box.numpy()
             if len(box):
                 there.append(box)
                 who.append(agent)

@@ -15,7 +15,7 @@ from ssad.rendering.bodies import BODIES
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, class_of
 from ssad.rendering.camera.rig import RIG, rig_camera
 from ssad.rendering.camera_sheets import SHOWN, class_sheet
-from ssad.rendering.episode_scene import EpisodeScene, body_of, moments_of
+from ssad.rendering.episode_scene import EpisodeScene, agent_poses, body_of
 from ssad.rendering.trace_sheet import above, moments, onboard_sheet, pick_trace
 from ssad.world.models import MODELS
 from ssad.world.roads import load_town
@@ -63,9 +63,9 @@ def test_an_episode_is_shown_from_the_ego_and_from_above() -> None:
     trace = rollout(World([episode], {graph.name: graph}), make_system("blind"))[0]
     assert len(moments(trace)) == 3
     town = EpisodeScene(graph)
-    looks = town.looks_of_trace(trace)
-    town.cast(looks.bodies())
-    people = [thing for thing in town.things(looks, moments_of(trace)[0], without=0) if thing.tag]
+    looks = town.appearance_of_trace(trace)
+    town.add_bodies(looks.bodies())
+    people = [thing for thing in town.objects(looks, agent_poses(trace)[0], without=0) if thing.tag]
     assert {t.tag for t in people} == {a + 1 for a in range(1, len(trace.models)) if trace.active[0, a]}
     camera, pose = above(np.eye(4), 40.0, 64, 36)
     assert pose[:3, 2] == pytest.approx([0, 0, -1])

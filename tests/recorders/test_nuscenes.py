@@ -30,7 +30,7 @@ from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.recorders.drives import MIX, drive_street, make_drive, thinned
+from ssad.recorders.drives import MIX, drive_street, make_drive, thin_shares
 from ssad.recorders.nuscenes import AHEAD, Recording, drive, record_nuscenes
 from ssad.recorders.target_images import record_clips
 from ssad.recorders.target_recording import Clips
@@ -217,7 +217,7 @@ def test_only_what_is_drawn_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
     objects.make("pedestrian", "adult", (0.6, 0.6, 1.8), phases=3)
     assert not built
     assert len(objects.meshes) == 4
-    some = objects.meshes.only({0})
+    some = objects.meshes.select({0})
     assert built == ["car"]
     assert some[0] is objects.meshes[0]
     assert [len(mesh.faces) for mesh in some[1:]] == [0, 0, 0]
@@ -369,7 +369,7 @@ def test_the_official_toolkit_scores_true_boxes_as_perfect(recorded: Path, tmp_p
 
 
 def test_streets_of_any_kind_have_fewer_cars_and_the_same_mix_of_all_else() -> None:
-    town, other = thinned(MIX, "town"), thinned(MIX, "any")
+    town, other = thin_shares(MIX, "town"), thin_shares(MIX, "any")
     assert sum(town.values()) == pytest.approx(1.0)
     assert sum(other.values()) == pytest.approx(1.0)
     assert town == pytest.approx(MIX)

@@ -35,8 +35,8 @@ from ssad.recorders.target_images import CLASSES, HIDDEN, SECONDS, SEEN, TARGET,
 from ssad.recorders.target_recording import FOCAL, SMALL, Clips, pair_images
 from ssad.recorders.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
 from ssad.rendering.camera.labels import label_picture
-from ssad.rendering.camera.render import Weather, render
-from ssad.rendering.camera.scene import Layer
+from ssad.rendering.camera.render import SceneWeather, render
+from ssad.rendering.camera.scene import TextureLayer
 from ssad.rendering.scene_objects import SceneObjects
 from ssad.rendering.target import Target, TargetCar, TargetSign, TargetWalker, parse_target
 from ssad.world.roads import load_town
@@ -219,7 +219,7 @@ def test_boxes_are_in_the_picture_and_the_target_lies_in_its_3d_box(mode: str, r
         image = cv2.imread(str(root / "images" / row["file_name"]))
         assert image is not None
         assert image.shape == (row["height"], row["width"], 3)
-        assert row["weather"] == weather_name(Weather(**row["light"]))
+        assert row["weather"] == weather_name(SceneWeather(**row["light"]))
         thing = target_of(data, row)
         assert not thing["iscrowd"]
         assert thing["visible"] >= SEEN
@@ -295,10 +295,10 @@ def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -
         target = next(o for o in seen.objects if o["target"])
         x, y, w, h = target["bbox"]
         assert labels.box[labels.tag == TARGET][0].tolist() == [x, y, x + w, y + h]
-        assert seen.view.things[0].tag == TARGET
-        worn = seen.wearing(Layer(4)).things
-        assert worn[0].layers == (Layer(4),)
-        assert worn[1:] == seen.view.things[1:]
+        assert seen.view.objects[0].tag == TARGET
+        worn = seen.wearing(TextureLayer(4)).objects
+        assert worn[0].layers == (TextureLayer(4),)
+        assert worn[1:] == seen.view.objects[1:]
 
 
 def test_an_orbit_of_a_stop_sign_shows_its_face(tmp_path: Path) -> None:
@@ -540,7 +540,7 @@ def test_a_camera_looks_at_its_point_upright() -> None:
 
 def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: EpisodeTrace) -> None:
     def shots(behind: float) -> list[Any]:
-        return follow(market, Weather(), behind=behind, height=2.0, count=4, draws=generator(1))
+        return follow(market, SceneWeather(), behind=behind, height=2.0, count=4, draws=generator(1))
 
     found = shots(20.0)
     assert len(found) > 20

@@ -12,7 +12,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import Controller, Limits
 from ssad.rendering import episode_scene
-from ssad.rendering.agent_edit import LiveAttack
+from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.hours import at_hour
 from ssad.rendering.onboard import DAY, Onboard
@@ -46,13 +46,13 @@ class Watcher:
         return np.tile(np.array([0.0, 1.0, 0.0], np.float32), (len(view.scene), 1))
 
 
-def worn(carrier: str, target: str, value: float) -> LiveAttack:
+def worn(carrier: str, target: str, value: float) -> AgentEdit:
     """A texture of one grey."""
     size = make_carrier(carrier, {}).on(parse_target(target).mesh()).size
     return Print(torch.full((3, *size), value), carrier, {}, target).live(1)
 
 
-def shadow() -> LiveAttack:
+def shadow() -> AgentEdit:
     """On the rear of a white car."""
     corners = {"left_a": -1.5, "up_a": 0.2, "left_b": 1.5, "up_b": 0.2, "left_c": 0.0, "up_c": 1.6}
     return Shining("shadow", {}, "sun_behind", "sedan:white:0", corners).live(1)
@@ -68,7 +68,7 @@ def shadow() -> LiveAttack:
     ids=["shirt", "road", "shadow"],
 )
 def test_what_a_driver_sees_of_an_attack_is_what_the_trace_shows(
-    scenario: str, attack: LiveAttack, brighter: bool, monkeypatch: pytest.MonkeyPatch
+    scenario: str, attack: AgentEdit, brighter: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the bit; beside the same target without it, it is seen, and changes little else."""
     monkeypatch.setattr(episode_scene, "PHASES", 1)  # bodies are made faster

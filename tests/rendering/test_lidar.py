@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.lidar import HDL32E, Lidar, points_in_boxes, sweep
 from ssad.rendering.meshes.mesh import Material, Mesh, box, build, sphere
 from ssad.rendering.street.model import Street
@@ -35,25 +35,27 @@ def plane() -> Mesh:
 
 
 @functools.cache
-def stage() -> Scene:
+def stage() -> RenderScene:
     meshes = [plane(), sphere(RADIUS, material=GREY, segments=256), box(SIZE, material=GREY)]
     meshes += [make_body("car", generator=generator("lidar"), detail=1), box(SIZE, material=PAINT)]
     meshes += [box((0.01, 60.0, 60.0), material=GLASS), box((1.0, 60.0, 60.0), material=GREY)]
-    return Scene(None, meshes)
+    return RenderScene(None, meshes)
 
 
-def at(x: float, y: float = 0.0, z: float = 0.0, *, mesh: int, tag: int = 1, yaw: float = 0.0) -> Thing:
+def at(x: float, y: float = 0.0, z: float = 0.0, *, mesh: int, tag: int = 1, yaw: float = 0.0) -> SceneObject:
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pose[:3, 3] = x, y, z
-    return Thing(mesh, pose, tag=tag)
+    return SceneObject(mesh, pose, tag=tag)
 
 
 def ego(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> np.ndarray:
     return at(x, y, mesh=0, yaw=yaw).pose
 
 
-def shot(things: list[Thing], lidar: Lidar = COARSE, pose: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def shot(
+    things: list[SceneObject], lidar: Lidar = COARSE, pose: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     return sweep(stage(), lidar, ego() if pose is None else pose, things, key=("test",))
 
 
@@ -186,7 +188,7 @@ def loose_street(count: int) -> Street:
 def test_a_street_equals_a_plain_search_over_its_triangles() -> None:
     street = loose_street(300)
     block = at(5.0, 0.0, 1.8, mesh=0)
-    town = Scene(street, [box(SIZE, material=GREY)])
+    town = RenderScene(street, [box(SIZE, material=GREY)])
     lidar = replace(COARSE, blind=0.0)
     points, tags = sweep(town, lidar, ego(), [block], key=(1,))
     a, b, c = np.moveaxis(street.vertices[street.faces[::2]].astype(np.float64), 1, 0)
@@ -277,7 +279,7 @@ def test_the_same_key_gives_the_same_bytes() -> None:
     first = sweep(stage(), lidar, ego(), things, key=(3, "a"))
     again = sweep(stage(), lidar, ego(), things[::-1], key=(3, "a"))
     other = sweep(stage(), lidar, ego(), things, key=(3, "b"))
-    fresh = Scene(None, [plane(), *[make_body("car", generator=generator("lidar"), detail=1)] * 3])
+    fresh = RenderScene(None, [plane(), *[make_body("car", generator=generator("lidar"), detail=1)] * 3])
     anew = sweep(fresh, lidar, ego(), [replace(t, mesh=min(t.mesh, 1)) for t in things], key=(3, "a"))
     for a, b, c in zip(first, again, anew, strict=True):
         assert a.tobytes() == b.tobytes() == c.tobytes()
@@ -297,13 +299,13 @@ def test_the_noise_of_a_beam_does_not_depend_on_the_rest() -> None:
 def test_motion_of_the_ego_is_taken_out() -> None:
     things = [at(20.0, mesh=WALL, tag=3), at(0, mesh=PLANE, tag=9)]
     pose, past = ego(1.0, 0.3, 0.05), ego(0.0, 0.0, 0.0)
-    points, tags = sweep(stage(), EXACT, pose, things, key=(1,), motion=True, before=(past, things))
+    points, tags = sweep(stage(), EXACT, pose, things, key=(1,), motion=True, previous=(past, things))
     world = in_world(points, pose)
     face = (tags == 3) & (np.abs(world[:, 1]) < 29.9)
     assert np.abs(world[face, 0] - 19.5).max() < 2e-4
     assert np.abs(world[tags == 9, 2]).max() < 2e-4
     still, _ = sweep(stage(), EXACT, pose, things, key=(1,))
-    same, _ = sweep(stage(), EXACT, pose, things, key=(1,), motion=True, before=(pose, things))
+    same, _ = sweep(stage(), EXACT, pose, things, key=(1,), motion=True, previous=(pose, things))
     assert np.allclose(still, same, atol=1e-4)
 
 
@@ -311,7 +313,7 @@ def test_moving_things_are_smeared() -> None:
     speed = 30.0
     now = at(20.0, mesh=WALL, tag=3)
     before = replace(now, pose=at(20.0 - speed * EXACT.period, mesh=WALL).pose)
-    points, _ = sweep(stage(), EXACT, ego(), [now], key=(1,), motion=True, before=(ego(), [before]))
+    points, _ = sweep(stage(), EXACT, ego(), [now], key=(1,), motion=True, previous=(ego(), [before]))
     share = (np.arctan2(points[:, 0], points[:, 1]) + np.pi) / (2 * np.pi)  # of the turn, when the beam was fired
     world = in_world(points)
     face = np.abs(world[:, 1]) < 29.9
@@ -319,7 +321,7 @@ def test_moving_things_are_smeared() -> None:
     # what has no tag, or was not there before, rests
     for old in ([replace(before, tag=0)], []):
         untagged = replace(now, tag=0 if old else 3)
-        points, _ = sweep(stage(), EXACT, ego(), [untagged], key=(1,), motion=True, before=(ego(), old))
+        points, _ = sweep(stage(), EXACT, ego(), [untagged], key=(1,), motion=True, previous=(ego(), old))
         world = in_world(points)
         assert np.abs(world[np.abs(world[:, 1]) < 29.9, 0] - 19.5).max() < 1e-4
 
@@ -338,8 +340,8 @@ def test_bad_input_is_one_line() -> None:
         (replace(EXACT, azimuths=0), ego(), [], "one azimuth"),
         (replace(EXACT, reach=-1.0), ego(), [], "reach"),
         (EXACT, nowhere, [], "pose of the ego"),
-        (EXACT, ego(), [Thing(99, ego(), tag=4)], "mesh 99"),
-        (EXACT, ego(), [Thing(0, nowhere, tag=4)], "thing 4"),
+        (EXACT, ego(), [SceneObject(99, ego(), tag=4)], "mesh 99"),
+        (EXACT, ego(), [SceneObject(0, nowhere, tag=4)], "thing 4"),
     ):
         with pytest.raises(ConfigError, match=words) as caught:
             sweep(stage(), lidar, pose, things, key=(1,))

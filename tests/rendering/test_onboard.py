@@ -15,12 +15,12 @@ from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeTrace, Limits, SignalState
 from ssad.rendering import onboard as loop_sensors
-from ssad.rendering.agent_edit import LiveAttack
-from ssad.rendering.camera.lamps import Lamp
-from ssad.rendering.camera.render import Weather, render
+from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.lamps import SceneLamp
+from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.rig import rig_camera
-from ssad.rendering.camera.scene_edit import Card, SceneEdit
-from ssad.rendering.episode_scene import LENSES, Moment, moments_of
+from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
+from ssad.rendering.episode_scene import LENSES, AgentPoses, agent_poses
 from ssad.rendering.lidar import Lidar
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.onboard import Onboard
@@ -173,14 +173,14 @@ def test_legs_follow_the_way_that_was_walked_whoever_looks_and_after_a_restore(d
     _, traces = driven
     onboard = Onboard()
     scene = onboard.town(town())
-    looks = scene.looks_of_trace(traces[0])
-    scene.cast(looks.bodies())
+    looks = scene.appearance_of_trace(traces[0])
+    scene.add_bodies(looks.bodies())
     walker = next(a for a, model in enumerate(looks.models) if model == "walker")
-    moment = moments_of(traces[0])[0]
+    moment = agent_poses(traces[0])[0]
     meshes = set()
     for metres in np.arange(8) * 1.45 / 8:
         later = replace(moment, walked=moment.walked + metres)
-        (body,) = [t for t in scene.things(looks, later) if t.tag == walker + 1]
+        (body,) = [t for t in scene.objects(looks, later) if t.tag == walker + 1]
         meshes.add(body.mesh)
     assert len(meshes) == PHASES
 
@@ -209,7 +209,7 @@ def test_legs_follow_the_way_that_was_walked_whoever_looks_and_after_a_restore(d
     assert far > 0.0
 
     (trace,) = rollout(world(1), {0: Watcher(), late: watcher}, sensors={"front": onboard.camera(FRONT)})
-    for known, moment in zip(onboard._tracks[0].walked, moments_of(trace), strict=False):
+    for known, moment in zip(onboard._tracks[0].walked, agent_poses(trace), strict=False):
         assert np.array_equal(known, moment.walked)
     assert len(onboard._tracks[0].walked) >= STEPS - 2
 
@@ -218,7 +218,7 @@ def test_legs_follow_the_way_that_was_walked_whoever_looks_and_after_a_restore(d
 def test_lit_signals_are_seen(lit: SignalState) -> None:
     onboard = Onboard()
     scene = onboard.town(town())
-    looks = scene.looks(episodes()[2])
+    looks = scene.appearance(episodes()[2])
     assert len(looks.signals)
     heads = scene.street.heads.astype(float)
     head = next(n for n, s in enumerate(scene.street.head_signal.tolist()) if s == looks.signals[0])
@@ -229,7 +229,7 @@ def test_lit_signals_are_seen(lit: SignalState) -> None:
     pose = np.zeros((agents, 3), np.float32)
     pose[0] = x + 4.0 * np.cos(yaw), y + 4.0 * np.sin(yaw), yaw + np.pi
     off = np.zeros(len(looks.signals), np.uint8)
-    dark = Moment(0, pose, np.zeros(agents, bool), np.zeros(agents), off)
+    dark = AgentPoses(0, pose, np.zeros(agents, bool), np.zeros(agents), off)
     moment = replace(dark, signal=np.full(len(looks.signals), lit, np.uint8))
     pictures = []
     for now in (dark, moment):
@@ -248,7 +248,7 @@ def test_lit_signals_are_seen(lit: SignalState) -> None:
 
 def test_weather_goes_by_episode_and_lamps_are_on_by_night(driven) -> None:
     watcher, traces = driven
-    night = Onboard(weather=lambda key: Weather(-0.2, 0.0) if key == traces[0].key else loop_sensors.DAY)
+    night = Onboard(weather=lambda key: SceneWeather(-0.2, 0.0) if key == traces[0].key else loop_sensors.DAY)
     camera = night.camera(FRONT)
     dark = camera.of_trace(traces[0], town(), steps=[0])[0]
     day = camera.of_trace(traces[1], town(), steps=[0])[0]
@@ -332,11 +332,11 @@ def patched(mesh: Mesh) -> SceneEdit:
     draws = torch.Generator().manual_seed(1)
     surface = Camouflage(texels=16).on(mesh)
     pose = np.array([[0.0, 0, 1, -8], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
-    lamp = Lamp(pose, 2000.0, (0.2, 0.2))
+    lamp = SceneLamp(pose, 2000.0, (0.2, 0.2))
     return SceneEdit(
         (surface.layer,),
         (lamp,),
-        cards=(Card(np.array([[0.0, -1, 0], [0, 1, 0], [0, 0, 2]])),),
+        cards=(ShadowCard(np.array([[0.0, -1, 0], [0, 1, 0], [0, 0, 2]])),),
         textures={0: torch.rand((3, *surface.size), generator=draws)},
         masks={0: surface.mask},
     )
@@ -347,7 +347,7 @@ def test_an_attack_in_the_loop_is_what_is_rendered_from_the_trace() -> None:
     rear = Camera.typical(96, 64, channel="REAR")
     back = np.diag([-1.0, -1.0, 1.0, 1.0])
     cameras = {"front": FRONT, "rear": replace(rear, to_ego=back @ rear.to_ego)}
-    attack = LiveAttack(patched, TargetCar("sedan", "red"), agent=1)
+    attack = AgentEdit(patched, TargetCar("sedan", "red"), agent=1)
 
     def sensors(onboard: Onboard) -> dict:
         return {name: onboard.camera(camera) for name, camera in cameras.items()} | {"lidar": onboard.lidar(BEAMS)}
@@ -366,7 +366,7 @@ def test_an_attack_in_the_loop_is_what_is_rendered_from_the_trace() -> None:
 
 def test_an_attack_that_does_not_fit_ends_in_one_line() -> None:
     for agent, message in ((1, "agent 1 is a walker"), (7, "agent 7 cannot be attacked")):
-        onboard = Onboard(attack=LiveAttack(patched, TargetCar(), agent=agent))
+        onboard = Onboard(attack=AgentEdit(patched, TargetCar(), agent=agent))
         with pytest.raises(ConfigError, match=message):
             rollout(world(0), Watcher("front"), sensors={"front": onboard.camera(FRONT)})
 

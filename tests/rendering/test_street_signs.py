@@ -15,7 +15,7 @@ from ssad.datasets.coco import coco_data
 from ssad.recorders.target_images import CLASSES, faces, label_of
 from ssad.recorders.target_recording import BEHIND
 from ssad.rendering.bodies import make_body
-from ssad.rendering.scene_objects import Clear, SceneObjects, _signs
+from ssad.rendering.scene_objects import GroundOccupancy, SceneObjects, _signs
 from ssad.rendering.street import cached_street
 from ssad.rendering.street_signs import StreetSign, plate_and_post, street_signs
 from ssad.world.roads import load_town
@@ -24,13 +24,13 @@ from ssad.world.roads import load_town
 @functools.cache
 def ground(town: str) -> tuple[LaneGraph, frozenset[tuple[int, int]]]:
     graph = load_town(town)
-    return graph, frozenset(Clear(cached_street(graph)).taken)
+    return graph, frozenset(GroundOccupancy(cached_street(graph)).occupied_squares)
 
 
-def clear_ground(town: str) -> Clear:
+def clear_ground(town: str) -> GroundOccupancy:
     """What stands in a town's street, to be changed at will."""
-    clear = Clear.__new__(Clear)
-    clear.taken = set(ground(town)[1])
+    clear = GroundOccupancy.__new__(GroundOccupancy)
+    clear.occupied_squares = set(ground(town)[1])
     return clear
 
 
@@ -90,9 +90,9 @@ def test_where_something_stands_a_sign_moves_or_is_left_out() -> None:
     way = graph.sign_xy.astype(np.float64)
     free = list(street_signs(graph, way, clear_ground("Oldmarket"), key=(0,), many=False, detail=0))
     x, y, _, _ = free[0].pose
-    clear.take(x, y, 0.0, 0.5, 0.5)
+    clear.occupy(x, y, 0.0, 0.5, 0.5)
     x, y, _, _ = free[1].pose
-    clear.take(x, y, 0.0, 8.0, 8.0)
+    clear.occupy(x, y, 0.0, 8.0, 8.0)
     fewer = [one.pose[:2] for one in street_signs(graph, way, clear, key=(0,), many=False, detail=0)]
     assert len(fewer) == len(free) - 1
     assert free[0].pose[:2] not in fewer

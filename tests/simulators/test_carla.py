@@ -31,10 +31,10 @@ from ssad.metrics import episode_metrics
 from ssad.rendering.lidar import Lidar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.simulators.carla import simulator as adapter
-from ssad.simulators.carla.sensors import Own, eyes_of
+from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
 from ssad.simulators.carla.server import WEATHERS, Server
 from ssad.simulators.carla.simulator import Carla
-from ssad.simulators.closed_loop import asked_sensors
+from ssad.simulators.closed_loop import requested_sensors
 from ssad.world.roads import load_town, town_signals
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -55,9 +55,9 @@ def carla(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "carla", module)
     spec.loader.exec_module(module)
-    adapter._KEPT.clear()
+    adapter._CONNECTIONS.clear()
     yield module
-    adapter._KEPT.clear()
+    adapter._CONNECTIONS.clear()
 
 
 def built(scenarios: Sequence[Scenario]) -> list[Episode]:
@@ -147,10 +147,10 @@ def test_what_only_carla_feels_ends_the_episode(carla: ModuleType) -> None:
     mask = np.zeros((1, simulator.agents), bool)
     mask[0, 0] = True
     simulator.take(mask, Controller.FOLLOW, target_speed=5.0)
-    simulator._events.hits.append((999, "static.road"))
+    simulator._events.collisions.append((999, "static.road"))
     simulator.step()
     assert simulator.ended()[0] == 0
-    simulator._events.hits.append((998, "static.wall"))
+    simulator._events.collisions.append((998, "static.wall"))
     simulator.step()
     assert simulator.ended()[0] == 1
     assert simulator.state().contact[0] == 8
@@ -206,13 +206,13 @@ def looked(system: object, names: Sequence[str], *, server: Server = SERVER, ste
     )
     scenario = Scenario("looks", "Custom", "ProvingGround", route, actors=actors, limits=Limits(max_steps=steps))
     (episode,) = built([scenario])
-    eyes = eyes_of(asked_sensors([system]), 0.1)
-    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server, eyes=eyes)
+    eyes = sensor_blueprints(requested_sensors([system]), 0.1)
+    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server, blueprints=eyes)
     seen = []
     mask = np.zeros((1, simulator.agents), bool)
     mask[0, 0] = True
     simulator.take(mask, Controller.FOLLOW, target_speed=8.0)
-    sensors = {name: Own(name) for name in eyes}
+    sensors = {name: CarlaSensor(name) for name in eyes}
     try:
         while simulator.ended()[0] == 0:
             got = {name: sensors[name](simulator, np.zeros((1, 2), np.int32))[0] for name in names}
@@ -308,13 +308,13 @@ def test_what_carla_s_sensors_cannot_be_is_refused(carla: ModuleType) -> None:
     camera = Camera.typical(64, 32)
     wide = Camera(64, 32, camera.intrinsic * [[1.2], [1.0], [1.0]])
     with pytest.raises(ConfigError, match="pixels are not square"):
-        eyes_of({"wide": wide}, 0.1)
+        sensor_blueprints({"wide": wide}, 0.1)
     with pytest.raises(ConfigError, match="not evenly spaced"):
-        eyes_of({"lidar": ("lidar", Lidar(np.array([-0.2, 0.0, 0.1]), 100))}, 0.1)
+        sensor_blueprints({"lidar": ("lidar", Lidar(np.array([-0.2, 0.0, 0.1]), 100))}, 0.1)
     (episode,) = built(load_scenarios("StraightObstacle/00"))
-    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=SERVER, eyes={})
+    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=SERVER, blueprints={})
     with pytest.raises(ConfigError, match="only the ego carries its sensors, not agent 1"):
-        Own("front")(simulator, np.array([[0, 1]]))
+        CarlaSensor("front")(simulator, np.array([[0, 1]]))
 
 
 def test_the_traffic_manager_drives_the_traffic(carla: ModuleType) -> None:
@@ -391,7 +391,7 @@ def test_a_server_that_fails_ends_in_a_line(carla: ModuleType, fault: str) -> No
         drive_twice()
     assert len(str(error.value)) < 400
     carla.FAULT = ""
-    adapter._KEPT.clear()
+    adapter._CONNECTIONS.clear()
     carla.SERVERS.clear()
     if fault in QUICK:
         assert drive_there([episode], "blind")[0].end == "collision"  # the next one runs
@@ -418,16 +418,16 @@ def test_sensors_and_managers_that_fail_end_in_a_line(carla: ModuleType, fault: 
     (episode,) = built(load_scenarios("natural")[:1])
     carla.FAULT = fault
     server = Server("here", 2000, timeout=0.5, sensors="carla", traffic="manager")
-    eyes = eyes_of({"front": Camera.typical(32, 18), "lidar": ("lidar", lidar_of({"id": "lidar"}))}, 0.1)
+    eyes = sensor_blueprints({"front": Camera.typical(32, 18), "lidar": ("lidar", lidar_of({"id": "lidar"}))}, 0.1)
 
     def drive() -> None:
-        simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server, eyes=eyes)
+        simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server, blueprints=eyes)
         mask = np.zeros((1, simulator.agents), bool)
         mask[0, 0] = True
         simulator.take(mask, Controller.FOLLOW, target_speed=10.0)
         simulator.step()
         for name in eyes:
-            Own(name)(simulator, np.zeros((1, 2), np.int32))
+            CarlaSensor(name)(simulator, np.zeros((1, 2), np.int32))
         for _ in range(60 if "Manager" in fault or "autopilot" in fault else 0):
             simulator.step()  # until traffic that sleeps wakes
         simulator.reset()

@@ -50,7 +50,7 @@ class Objects:
         return type(self)(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
 
     @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
+    def cat(cls, parts: Sequence[Self]) -> Self:
         """Concatenate tables in order; at least one is required."""
         return concatenate(parts)
 

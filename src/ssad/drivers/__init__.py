@@ -89,10 +89,10 @@ def make_system(name: str) -> Driver:
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(view); see README")
     if not isinstance(controller, Controller):
         raise ConfigError(f"system '{name}': controller must be a ssad.core.types.Controller, not {controller!r}")
-    return _Named(label_of(name), controller, cast(Driver, system))
+    return _NamedDriver(label_of(name), controller, cast(Driver, system))
 
 
-class _Named:
+class _NamedDriver:
     """Driver under its requested name; fills in the optional attributes that a short user class omits."""
 
     def __init__(self, name: str, controller: Controller, system: Driver) -> None:

@@ -104,16 +104,16 @@ class DegradedBelief(Autopilot):
         self._missing[scenes] = missing
         if self.noise > 0.0:
             position_noise = np.stack([self._draws[scene].normal(size=(_SLOTS, 2)) for scene in scenes.tolist()])
-            belief = moved(belief, (self.noise * position_noise[:, :count]).astype(np.float32))
+            belief = displace(belief, (self.noise * position_noise[:, :count]).astype(np.float32))
         self._past = [*self._past, belief.keep(~missing[:, :count])][-(self.delay + 1) :]
         return self._past[0]
 
 
-def moved(belief: Belief, by: F32) -> Belief:
+def displace(belief: Belief, displacement: F32) -> Belief:
     """The belief with its objects and their forecasts moved by [B, K, 2] m."""
     pose = belief.pose.copy()
-    pose[..., :2] += by
+    pose[..., :2] += displacement
     forecast = None if belief.forecast is None else belief.forecast.copy()
     if forecast is not None:
-        forecast[..., :2] += by[:, :, None]
+        forecast[..., :2] += displacement[:, :, None]
     return replace(belief, pose=pose, forecast=forecast)

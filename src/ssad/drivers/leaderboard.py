@@ -37,8 +37,8 @@ from ssad.drivers.leaderboard_sensors import (
     MAP,
     RADAR,
     camera_of,
-    checked,
-    cloud,
+    carla_points,
+    check_sensors,
     geolocation,
     lidar_of,
     radar_of,
@@ -129,30 +129,30 @@ class Leaderboard:
         except FormatError as error:
             raise ConfigError(f"system 'leaderboard:{path}': {error}") from None
         self.version = hashlib.sha256(source + self._config.encode()).hexdigest()
-        self._class = self._load(path)
-        self._asked = self._sensors()
+        self._agent_class = self._load_agent_class(path)
+        self._specifications = self._sensors()
         self.cameras: Mapping[str, Camera] = {
             specification["id"]: camera_of(specification)
-            for specification in self._asked
+            for specification in self._specifications
             if specification["type"] == CAMERA
         }
         self.lidars: Mapping[str, Lidar] = {
             specification["id"]: lidar_of(specification)
-            for specification in self._asked
+            for specification in self._specifications
             if specification["type"] == LIDAR
         }
         self.radars: Mapping[str, Lidar] = {
             specification["id"]: radar_of(specification)
-            for specification in self._asked
+            for specification in self._specifications
             if specification["type"] == RADAR
         }
         self.sensors = (*self.cameras, *self.lidars, *self.radars)
         self._agents: list[Any] = []
-        self._last: dict[int, tuple[float, float]] = {}
+        self._last_headings: dict[int, tuple[float, float]] = {}
         self._maps: list[str] = []
 
-    def _load(self, path: str) -> type:
-        _stand_in()
+    def _load_agent_class(self, path: str) -> type:
+        _install_stand_ins()
         spec = importlib.util.spec_from_file_location(f"leaderboard_agent_{self.version[:12]}", self.path)
         if spec is None or spec.loader is None:
             raise ConfigError(f"system 'leaderboard:{path}': expected the path of a Python file")
@@ -173,13 +173,13 @@ class Leaderboard:
             raise ConfigError(f"system 'leaderboard:{path}': its get_entry_point() names no class with run_step")
         return agent_class
 
-    def _agent(self) -> Any:
+    def _make_agent(self) -> Any:
         """Make and set up an agent. Leaderboard 2.0 constructs from host and port, 1.0 from the configuration."""
         try:
             try:
-                agent = self._class("localhost", 2000)
+                agent = self._agent_class("localhost", 2000)
             except TypeError:
-                return self._class(self._config)
+                return self._agent_class(self._config)
             agent.setup(self._config)
         except Exception as error:
             raise ConfigError(f"system 'leaderboard:{self.path}': setup failed: {describe(error)}") from error
@@ -187,26 +187,26 @@ class Leaderboard:
 
     def _sensors(self) -> list[dict[str, Any]]:
         """Return the validated sensor specifications of an agent."""
-        agent, location = self._agent(), f"system 'leaderboard:{self.path}'"
+        agent, location = self._make_agent(), f"system 'leaderboard:{self.path}'"
         try:
             specifications = agent.sensors()
         except Exception as error:
             raise ConfigError(f"{location}: sensors() failed: {describe(error)}") from error
-        return checked(specifications, location)
+        return check_sensors(specifications, location)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Make a new agent for each episode, with the plan of its route."""
         for agent in self._agents:
             getattr(agent, "destroy", lambda: None)()
-        self._agents, self._last = [], {}
-        wants_map = any(specification["type"] == MAP for specification in self._asked)
+        self._agents, self._last_headings = [], {}
+        wants_map = any(specification["type"] == MAP for specification in self._specifications)
         self._maps = [town_xodr(episode.town) if wants_map else "" for episode in episodes]
         for episode in episodes:
-            agent = self._agent()
+            agent = self._make_agent()
             agent.sensors()  # some agents initialise themselves in sensors()
             route = episode.agents[0].route
             assert route is not None
-            gps_plan, world_plan = _plan(route, load_town(episode.town))
+            gps_plan, world_plan = _global_plan_of(route, load_town(episode.town))
             agent.set_global_plan(gps_plan, world_plan)
             self._agents.append(agent)
 
@@ -226,7 +226,7 @@ class Leaderboard:
         time, yaw = float(view.time[row]), float(view.pose[row, 2])
         step = round(time / STEP)
         readings: dict[str, tuple[int, Any]] = {}
-        for specification in self._asked:
+        for specification in self._specifications:
             sensor_type = specification["type"]
             value: Any
             if sensor_type == CAMERA:
@@ -235,7 +235,7 @@ class Leaderboard:
                 # CARLA delivers BGRA.
                 value = np.concatenate([image[::-1], alpha]).transpose(1, 2, 0).copy()
             elif sensor_type == LIDAR:
-                value = cloud(view.readings[specification["id"]][row])
+                value = carla_points(view.readings[specification["id"]][row])
             elif sensor_type == RADAR:
                 returns = view.readings[specification["id"]][row]
                 value = returns[returns[:, 0] > 0.0]
@@ -248,12 +248,12 @@ class Leaderboard:
             else:
                 value = {"opendrive": self._maps[int(view.scene[row])]}
             readings[str(specification["id"])] = (step, value)
-        self._last[int(view.scene[row])] = (time, yaw)
+        self._last_headings[int(view.scene[row])] = (time, yaw)
         return readings
 
     def _imu(self, view: Observation, row: int, yaw: float) -> F64:
         """Return accelerations and rates [6], and the compass: clockwise from north, rad."""
-        last_time, last_yaw = self._last.get(int(view.scene[row]), (float(view.time[row]), yaw))
+        last_time, last_yaw = self._last_headings.get(int(view.scene[row]), (float(view.time[row]), yaw))
         elapsed = float(view.time[row]) - last_time
         yaw_rate = float(wrap_angle(yaw - last_yaw)) / elapsed if elapsed > 0.0 else 0.0
         compass = (0.5 * math.pi - yaw) % math.tau
@@ -261,7 +261,7 @@ class Leaderboard:
         return np.array([float(view.accel[row]), lateral, GRAVITY, 0.0, 0.0, -yaw_rate, compass])
 
 
-def _plan(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:
+def _global_plan_of(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:
     """Return the plan of a route, a point per metre: geographic and as CARLA's transforms, with `RoadOption`."""
     import carla
 
@@ -277,17 +277,17 @@ def _plan(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:
     gps_plan, world_plan = [], []
     for (x, y), yaw, option in zip(route.xy.tolist(), route.yaw.tolist(), options.tolist(), strict=True):
         latitude, longitude, z = geolocation(x, y)
-        gps_plan.append(({"lat": latitude, "lon": longitude, "z": z}, _option(option)))
+        gps_plan.append(({"lat": latitude, "lon": longitude, "z": z}, _road_option(option)))
         transform = carla.Transform(carla.Location(x=x, y=-y, z=z), carla.Rotation(yaw=-math.degrees(yaw)))
-        world_plan.append((transform, _option(option)))
+        world_plan.append((transform, _road_option(option)))
     return gps_plan, world_plan
 
 
-def _option(value: int) -> Any:
+def _road_option(value: int) -> Any:
     return sys.modules["agents.navigation.local_planner"].RoadOption(value)
 
 
-def _stand_in() -> None:
+def _install_stand_ins() -> None:
     """Put our few names where packages that agents import are not installed."""
 
     def offer(name: str, **content: Any) -> None:

@@ -40,20 +40,20 @@ _RIGHT: Final = np.array(
 )  # x right, y forward -> x forward, y left
 
 
-def checked(sensors: Any, where: str) -> list[dict[str, Any]]:
+def check_sensors(sensors: Any, location: str) -> list[dict[str, Any]]:
     """Validate the result of an agent's `sensors`. ConfigError for sensors that no leaderboard allows."""
     if not isinstance(sensors, Sequence):
-        raise ConfigError(f"{where}: its sensors() must give a list, not {type(sensors).__name__}")
+        raise ConfigError(f"{location}: its sensors() must give a list, not {type(sensors).__name__}")
     accepted: list[dict[str, Any]] = []
     for specification in sensors:
         kind: Any = specification.get("type") if isinstance(specification, dict) else specification
         if not isinstance(specification, dict) or "id" not in specification or kind not in LIMITS:
-            raise ConfigError(f"{where}: it asks for the sensor {str(kind)[:60]}; there are: {', '.join(LIMITS)}")
+            raise ConfigError(f"{location}: it asks for the sensor {str(kind)[:60]}; there are: {', '.join(LIMITS)}")
         if any(specification["id"] == earlier["id"] for earlier in accepted):
-            raise ConfigError(f"{where}: two of its sensors have the id '{str(specification['id'])[:60]}'")
+            raise ConfigError(f"{location}: two of its sensors have the id '{str(specification['id'])[:60]}'")
         accepted.append(specification)
         if sum(earlier["type"] == kind for earlier in accepted) > LIMITS[kind]:
-            raise ConfigError(f"{where}: it asks for more than {LIMITS[kind]} sensors {kind}")
+            raise ConfigError(f"{location}: it asks for more than {LIMITS[kind]} sensors {kind}")
     return accepted
 
 
@@ -63,20 +63,24 @@ def geolocation(x: float, y: float) -> tuple[float, float, float]:
     return latitude, math.degrees(x / RADIUS), 0.0
 
 
-def number(item: Mapping[str, Any], key: str, default: float, low: float, high: float) -> float:
+def number(specification: Mapping[str, Any], key: str, default: float, minimum: float, maximum: float) -> float:
     """A number of a sensor. ConfigError if it is none, or outside its range."""
     try:
-        value = float(item.get(key, default))
+        value = float(specification.get(key, default))
     except (TypeError, ValueError):
-        raise ConfigError(f"sensor '{item['id']}': {key} is not a number: {str(item[key])[:40]}") from None
-    if not low <= value <= high:
-        raise ConfigError(f"sensor '{item['id']}': {key} is {value:g}, outside {low:g} to {high:g}")
+        raise ConfigError(
+            f"sensor '{specification['id']}': {key} is not a number: {str(specification[key])[:40]}"
+        ) from None
+    if not minimum <= value <= maximum:
+        raise ConfigError(f"sensor '{specification['id']}': {key} is {value:g}, outside {minimum:g} to {maximum:g}")
     return value
 
 
-def place_of(item: Mapping[str, Any], axes: F64) -> F64:
+def sensor_pose(specification: Mapping[str, Any], axes: F64) -> F64:
     """Sensor to car [4, 4], from the middle of the car's base, of a sensor whose own frame has these axes [3, 3]."""
-    roll, pitch, yaw = (math.radians(number(item, key, 0.0, -720.0, 720.0)) for key in ("roll", "pitch", "yaw"))
+    roll, pitch, yaw = (
+        math.radians(number(specification, key, 0.0, -720.0, 720.0)) for key in ("roll", "pitch", "yaw")
+    )
 
     def rotation(axis: int, angle: float) -> F64:
         cosine, sine = math.cos(angle), math.sin(angle)
@@ -93,39 +97,39 @@ def place_of(item: Mapping[str, Any], axes: F64) -> F64:
     # CARLA: yaw clockwise seen from above, pitch upwards, roll clockwise seen from behind
     pose = np.eye(4)
     pose[:3, :3] = rotation(2, -yaw) @ rotation(1, pitch) @ rotation(0, roll) @ axes
-    x, y, z = (number(item, key, 0.0, -100.0, 100.0) for key in ("x", "y", "z"))
+    x, y, z = (number(specification, key, 0.0, -100.0, 100.0) for key in ("x", "y", "z"))
     # CARLA's y axis points to the right.
     pose[:3, 3] = x, 0.0 - y, z
     return pose
 
 
-def camera_of(item: Mapping[str, Any]) -> Camera:
+def camera_of(specification: Mapping[str, Any]) -> Camera:
     """A camera of an agent."""
-    width, height = (int(number(item, key, size, 1, 4096)) for key, size in (("width", 800), ("height", 600)))
-    focal = 0.5 * width / math.tan(0.5 * math.radians(number(item, "fov", 100.0, 1.0, 170.0)))
+    width, height = (int(number(specification, key, size, 1, 4096)) for key, size in (("width", 800), ("height", 600)))
+    focal = 0.5 * width / math.tan(0.5 * math.radians(number(specification, "fov", 100.0, 1.0, 170.0)))
     intrinsic = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
     axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    return Camera(width, height, intrinsic, place_of(item, axes), channel=str(item["id"]))
+    return Camera(width, height, intrinsic, sensor_pose(specification, axes), channel=str(specification["id"]))
 
 
-def lidar_of(item: Mapping[str, Any]) -> Lidar:
+def lidar_of(specification: Mapping[str, Any]) -> Lidar:
     """The LiDAR that a leaderboard gives its agents: a whole turn a step."""
     elevations = np.deg2rad(np.linspace(-30.0, 10.0, 64))
-    pose = place_of(item, _RIGHT)
+    pose = sensor_pose(specification, _RIGHT)
     return Lidar(elevations, 937, pose, _RANGE, noise=0.0, period=0.1, blind=0.1, lost=0.45, faint=0.0)
 
 
-def radar_of(item: Mapping[str, Any]) -> Lidar:
+def radar_of(specification: Mapping[str, Any]) -> Lidar:
     """The rays of a radar: 12 times 12, evenly over its field."""
     horizontal, vertical = (
-        math.radians(number(item, f"{key}_fov", 30.0, 0.1, 170.0)) for key in ("horizontal", "vertical")
+        math.radians(number(specification, f"{key}_fov", 30.0, 0.1, 170.0)) for key in ("horizontal", "vertical")
     )
     elevations: F64 = (np.arange(12, dtype=np.float64) + 0.5) * (vertical / 12) - 0.5 * vertical
-    pose = place_of(item, _RIGHT)
+    pose = sensor_pose(specification, _RIGHT)
     return Lidar(elevations, 12, pose, _REACH, noise=0.0, period=0.1, blind=0.1, lost=0.0, faint=0.0, width=horizontal)
 
 
-def cloud(points: F32) -> F32:
+def carla_points(points: F32) -> F32:
     """Convert points [., 5] of the world's LiDAR to CARLA's [P, 4]: x forward, y right, z up, m, and intensity."""
     returns = points[points[:, 4] >= 0.0]
     distance = np.linalg.norm(returns[:, :3], axis=1)

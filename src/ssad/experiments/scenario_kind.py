@@ -19,11 +19,11 @@ from ssad.engine.kind import Cell, Job, Kind, Names, Plan, Replay, Resources, Su
 from ssad.metrics import episode_metrics
 from ssad.simulators.closed_loop import (
     HIGHWAY,
+    cached_town,
     load_world,
     policies_of,
     scenario_json,
     system_version,
-    town,
     town_version,
     type_version,
 )
@@ -100,7 +100,7 @@ class ScenarioKind(Kind):
         for name in plan.inputs["towns"]:
             path = folder / "towns" / town_file(name)
             if not path.exists():
-                save_graph(town(name), path)
+                save_graph(cached_town(name), path)
         safeio.make_folder(folder / "traces")
         return {}
 
@@ -121,14 +121,14 @@ class ScenarioKind(Kind):
         quiet_warp()
         trace = self.drive_again(plan, cell, record)
         recorded = load_trace(folder / record["artefacts"]["trace"])
-        return Replay(cell, first_difference(recorded, trace), trace, town(trace.town))
+        return Replay(cell, first_difference(recorded, trace), trace, cached_town(trace.town))
 
 
 def drive_record(cell: Cell, episode: Episode, trace: EpisodeTrace, folder: Path) -> dict[str, Any]:
     """Return the result of a cell from its drive, and write the trace."""
     artefact = f"traces/{cell.key}.npz"
     save_trace(folder / artefact, trace)
-    has_stop_signs = bool((town(trace.town).sign_kind == SignKind.STOP).any())
+    has_stop_signs = bool((cached_town(trace.town).sign_kind == SignKind.STOP).any())
     metrics = plain(episode_metrics(trace, stop_signs=has_stop_signs).as_dict())
     episode_fields = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
     episode_fields |= {"end": trace.end, "trace_hash": trace_hash(trace), "trace": artefact, "metrics": metrics}
@@ -142,7 +142,7 @@ def described(suite: ScenarioSuite) -> tuple[list[Described], dict[str, str]]:
         ConfigError: There are no such scenarios, or two differ but share a name.
     """
     scenarios = suite_scenarios(suite)
-    towns = {name: town_version(town(name)) for name in sorted({scenario.town for scenario in scenarios})}
+    towns = {name: town_version(cached_town(name)) for name in sorted({scenario.town for scenario in scenarios})}
     entries = []
     for scenario in scenarios:
         policies = [system_version(name) for name in policies_of(scenario)]

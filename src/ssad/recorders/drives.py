@@ -10,7 +10,7 @@ from ssad.core.errors import ConfigError, MapError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario, SignalPlan
-from ssad.rendering.scene_objects import thinned
+from ssad.rendering.scene_objects import thin_shares
 from ssad.rendering.street import STYLES, Street, build_street, cached_street
 from ssad.scenarios.dynamic.episode import forced_signals
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits
@@ -65,11 +65,11 @@ def drive_street(graph: LaneGraph, streets: str, *, key: tuple[object, ...]) -> 
 
 
 def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, streets: str = "town") -> Episode:
-    """One drive: ego first, all on Autopilot, signals green. Deterministic in the key. streets: see `thinned`.
+    """One drive: ego first, all on Autopilot, signals green. Deterministic in the key. streets: see `thin_shares`.
 
     MapError: the town has no road to drive on.
     """
-    body_shares = thinned(MIX, streets)
+    body_shares = thin_shares(MIX, streets)
     rng = generator("drive", graph.name, *key)
     lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0) & (graph.length > 25.0))
     if not len(lanes):

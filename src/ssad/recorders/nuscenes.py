@@ -35,9 +35,9 @@ from ssad.recorders.parts import TIME_LIMIT, PartsFolder
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
 from ssad.rendering.camera.labels import visible_share
 from ssad.rendering.camera.lamps import own_lamps
-from ssad.rendering.camera.render import View, Weather, render
+from ssad.rendering.camera.render import SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
-from ssad.rendering.camera.scene import Scene
+from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.lidar import HDL32E, points_in_boxes, sweep
 from ssad.rendering.scene_objects import PlacedObject, SceneObjects, place_objects
@@ -124,7 +124,7 @@ class Recording:
         }
 
 
-def draw_weather(key: tuple[object, ...], kind: str = "") -> Weather:
+def draw_weather(key: tuple[object, ...], kind: str = "") -> SceneWeather:
     """Weather and hour of a scene: mostly day, some dusk and night, some fog and wet roads; or all of one kind."""
     rng = generator("record weather", *key)
     drawn_kind = rng.choice(WEATHERS, p=[0.36, 0.2, 0.16, 0.08, 0.1, 0.1])
@@ -132,17 +132,17 @@ def draw_weather(key: tuple[object, ...], kind: str = "") -> Weather:
     sun_height = float(rng.uniform(0.4, 1.2))
     # All kinds draw their numbers, so that fixing the kind does not change the draws.
     by_kind = {
-        "day": Weather(sun_height, heading, float(rng.uniform(0.05, 0.6)), turn=turn),
-        "overcast": Weather(sun_height, heading, float(rng.uniform(0.85, 1.0)), turn=turn),
-        "low": Weather(float(rng.uniform(0.1, 0.3)), heading, float(rng.uniform(0.0, 0.5)), turn=turn),
-        "fog": Weather(sun_height, heading, 0.9, fog=float(rng.uniform(0.006, 0.025)), turn=turn),
-        "wet": Weather(sun_height, heading, 0.95, wet=float(rng.uniform(0.4, 1.0)), turn=turn),
-        "night": Weather(float(rng.uniform(-0.3, -0.05)), heading, float(rng.uniform(0, 0.9)), turn=turn),
+        "day": SceneWeather(sun_height, heading, float(rng.uniform(0.05, 0.6)), turn=turn),
+        "overcast": SceneWeather(sun_height, heading, float(rng.uniform(0.85, 1.0)), turn=turn),
+        "low": SceneWeather(float(rng.uniform(0.1, 0.3)), heading, float(rng.uniform(0.0, 0.5)), turn=turn),
+        "fog": SceneWeather(sun_height, heading, 0.9, fog=float(rng.uniform(0.006, 0.025)), turn=turn),
+        "wet": SceneWeather(sun_height, heading, 0.95, wet=float(rng.uniform(0.4, 1.0)), turn=turn),
+        "night": SceneWeather(float(rng.uniform(-0.3, -0.05)), heading, float(rng.uniform(0, 0.9)), turn=turn),
     }
     return by_kind[kind or str(drawn_kind)]
 
 
-def weather_words(weather: Weather) -> str:
+def weather_words(weather: SceneWeather) -> str:
     """Describe a weather in words, such as "sun 40 degrees above the horizon, clouds 35 %"."""
     sun_degrees = round(np.degrees(weather.sun_height))
     phrases = [
@@ -233,7 +233,9 @@ def _scene(recording: Recording, town: str, number: int) -> None:
         if step % KEY == 0 or (step % sweep_spacing == 0 and step % KEY <= sweep_spacing * recording.sweeps)
     ]
     # Most bodies of a town are never in view; building only the visible ones saves time and memory.
-    scene = Scene(street, population.meshes.only(_meshes_near(population, trace, steps)), device=recording.device)
+    scene = RenderScene(
+        street, population.meshes.select(_meshes_near(population, trace, steps)), device=recording.device
+    )
     steps_per_call = GPU_STEPS if recording.device != "cpu" else 1
     for start in range(0, len(steps), steps_per_call):
         moments = [
@@ -244,7 +246,7 @@ def _scene(recording: Recording, town: str, number: int) -> None:
             ego = ego_at(trace, sweep_end)
             surrounding = population.at(sweep_end, ego[:2, 3], DRAWN)
             points, _ = sweep(
-                scene, HDL32E, ego, [placed.thing for placed in surrounding], key=("lidar", *key, moment.step)
+                scene, HDL32E, ego, [placed.scene_object for placed in surrounding], key=("lidar", *key, moment.step)
             )
             files.cloud(points, sweep=moment.step, moment=moment_of(number, sweep_end), on_key=moment.on_key, ego=ego)
             if moment.on_key:
@@ -268,7 +270,7 @@ def _meshes_near(cast: SceneObjects, trace: EpisodeTrace, steps: Sequence[int]) 
     for step in steps:
         sweep_end = FIRST + step * trace.dt
         for time in [sweep_end, *(sweep_end - lead for lead in AHEAD.values())]:
-            mesh_indices |= {placed.thing.mesh for placed in cast.at(time, ego_at(trace, time)[:2, 3], DRAWN)}
+            mesh_indices |= {placed.scene_object.mesh for placed in cast.at(time, ego_at(trace, time)[:2, 3], DRAWN)}
     return mesh_indices
 
 
@@ -301,7 +303,7 @@ class _Moment:
         cast: SceneObjects,
         trace: EpisodeTrace,
         cameras: list[Camera],
-        weather: Weather,
+        weather: SceneWeather,
         key: tuple[object, ...],
     ) -> _Moment:
         """Each camera at its own time; the first sweep ends when every camera has fired."""
@@ -311,7 +313,7 @@ class _Moment:
             exposure_time = sweep_end - AHEAD[camera.channel]
             # The ego moves between the exposures of two cameras, as in nuScenes.
             ego = ego_at(trace, exposure_time)
-            scene_objects = tuple(placed.thing for placed in cast.at(exposure_time, ego[:2, 3], DRAWN))
+            scene_objects = tuple(placed.scene_object for placed in cast.at(exposure_time, ego[:2, 3], DRAWN))
             noise_seed = int(digest("noise", *key, step, camera_index)[:7], 16)
             lamps = own_lamps(ego, weather)
             views.append(View(camera, ego @ camera.to_ego, scene_objects, weather, SENSOR, noise_seed, lamps))
@@ -321,7 +323,7 @@ class _Moment:
 
 
 def _look(
-    stage: Scene, moments: Sequence[_Moment], files: _Files, number: int, *, together: bool
+    stage: RenderScene, moments: Sequence[_Moment], files: _Files, number: int, *, together: bool
 ) -> Iterator[tuple[_Moment, dict[int, float]]]:
     """Render and write the pictures of some moments, all of them in one call or one by one.
 

@@ -53,11 +53,18 @@ from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, PLAIN_CLASSES, class_of
 from ssad.rendering.camera.labels import label_picture
 from ssad.rendering.camera.lamps import NOSE, own_lamps
-from ssad.rendering.camera.render import Picture, View, Weather, render
-from ssad.rendering.camera.scene import Decal, Layer, Scene, Thing
+from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
+from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR
 from ssad.rendering.meshes.mesh import Point
-from ssad.rendering.scene_objects import Clear, ObjectBody, PlacedObject, SceneObjects, place_objects, take_still
+from ssad.rendering.scene_objects import (
+    GroundOccupancy,
+    ObjectBody,
+    PlacedObject,
+    SceneObjects,
+    occupy_standing,
+    place_objects,
+)
 from ssad.rendering.street_signs import free_places, plate_and_post
 from ssad.rendering.target import STANDING, TargetCar, TargetSign, TargetWalker, class_of_target
 from ssad.world.roads import load_town
@@ -92,7 +99,7 @@ class _Set:
     key: tuple[object, ...]
     trace: EpisodeTrace
     cast: SceneObjects
-    stage: Scene
+    stage: RenderScene
     targets: tuple[ObjectBody, ...]
     places: tuple[Place, ...] = ()
 
@@ -106,8 +113,8 @@ def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
     if isinstance(clips.target, TargetSign):
         targets: tuple[ObjectBody, ...] = (_sign(population, clips.target),)
         route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
-        free_ground = Clear(street)
-        take_still(population, free_ground)
+        free_ground = GroundOccupancy(street)
+        occupy_standing(population, free_ground)
         free = free_places(graph, route_points, free_ground, key=("target", *key))
         places = tuple((*place, plate_height(targets[0])) for place in free)
     elif clips.target is not None:
@@ -115,7 +122,9 @@ def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
     else:
         target_count = TARGETS if clips.mode == "orbit" else 1
         targets = tuple(_drawn(population, generator("clips target", *key, index)) for index in range(target_count))
-    return _Set(clips, key, trace, population, Scene(street, population.meshes, device=clips.device), targets, places)
+    return _Set(
+        clips, key, trace, population, RenderScene(street, population.meshes, device=clips.device), targets, places
+    )
 
 
 def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
@@ -261,7 +270,7 @@ def _take(
             skipped["crowded"] += 1
             continue
         view = _view(made, slot, viewpoint, surrounding, camera)
-        surrounding.append(PlacedObject(target, viewpoint.target, 0.0, view.things[0]))
+        surrounding.append(PlacedObject(target, viewpoint.target, 0.0, view.objects[0]))
         candidates.append((slot, viewpoint, view, surrounding))
     size = batch_size(recording.device)
     for start in range(0, len(candidates), size):
@@ -309,12 +318,12 @@ def _camera(size: int) -> Camera:
 def _view(made: _Set, n: int, shot: Viewpoint, around: Sequence[PlacedObject], camera: Camera) -> View:
     """View `n` of a part: the target first, then who else is there."""
     target = made.targets[n % len(made.targets)]
-    target_object = Thing(target.meshes[0], shot.target, target.paint, TARGET)
+    target_object = SceneObject(target.meshes[0], shot.target, target.paint, TARGET)
     noise_seed = int(digest("clips noise", *made.key, n)[:7], 16)
     lamps = own_lamps(_follower(shot), shot.weather) if made.clips.mode == "drive" else ()
     focus = float(shot.target[0, 3]), float(shot.target[1, 3])
-    other_parts = (Thing(mesh, shot.target, target.paint) for mesh in target.meshes[1:])
-    scene_objects = (target_object, *other_parts, *(placed.thing for placed in around))
+    other_parts = (SceneObject(mesh, shot.target, target.paint) for mesh in target.meshes[1:])
+    scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in around))
     return View(camera, shot.camera, scene_objects, shot.weather, SENSOR, noise_seed, lamps, focus)
 
 
@@ -326,7 +335,7 @@ def _follower(shot: Viewpoint) -> F64:
 
 
 def _annotate(
-    stage: Scene, view: View, picture: Picture, index: int, around: Sequence[PlacedObject]
+    stage: RenderScene, view: View, picture: Rendering, index: int, around: Sequence[PlacedObject]
 ) -> tuple[list[dict[str, Any]], str]:
     """What is seen in a picture, the target among it; and why the picture is of no use (else '')."""
     labels = label_picture(stage, view, picture, index)
@@ -484,17 +493,19 @@ class ClipView:
 
     file: str
     row: Mapping[str, Any]
-    scene: Scene
+    scene: RenderScene
     view: View
     objects: tuple[Mapping[str, Any], ...]
 
-    def wearing(self, *shown: Layer | Decal) -> View:
+    def wearing(self, *shown: TextureLayer | TextureDecal) -> View:
         """The view with layers on the target, and with decals, given in the target's frame, around it."""
-        target, *other_objects = self.view.things
-        layers = tuple(layer for layer in shown if isinstance(layer, Layer))
-        decals = tuple(replace(layer, pose=target.pose @ layer.pose) for layer in shown if isinstance(layer, Decal))
+        target, *other_objects = self.view.objects
+        layers = tuple(layer for layer in shown if isinstance(layer, TextureLayer))
+        decals = tuple(
+            replace(layer, pose=target.pose @ layer.pose) for layer in shown if isinstance(layer, TextureDecal)
+        )
         textured_target = replace(target, layers=layers)
-        return replace(self.view, things=(textured_target, *other_objects), decals=(*self.view.decals, *decals))
+        return replace(self.view, objects=(textured_target, *other_objects), decals=(*self.view.decals, *decals))
 
 
 Row = Mapping[str, Any]
@@ -540,7 +551,7 @@ def clip_views(
     split: str = "all",
     device: str = "cpu",
     only: Collection[str] | None = None,
-    hour: Callable[[Weather, float], Weather] = lambda weather, heading: weather,
+    hour: Callable[[SceneWeather, float], SceneWeather] = lambda weather, heading: weather,
     stages: dict[Any, Any] | None = None,
 ) -> Iterator[ClipView]:
     """The pictures of a recording with their scenes, in order.
@@ -577,7 +588,7 @@ def clip_views(
                 prepared_drives[key] = _prepare(recording, row["town"], key)
             prepared = prepared_drives[key]
             target_pose = np.array(row["target_pose"])
-            weather = hour(Weather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
+            weather = hour(SceneWeather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
             surrounding = prepared.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
             view = _view(prepared, row["slot"], viewpoint, surrounding, _camera(recording.size))

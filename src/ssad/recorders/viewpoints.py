@@ -17,8 +17,8 @@ from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32, Bool, EpisodeTrace
 from ssad.recorders.nuscenes import ego_at
-from ssad.rendering.camera.render import PLAIN, View, Weather, render
-from ssad.rendering.camera.scene import Scene
+from ssad.rendering.camera.render import PLAIN, SceneWeather, View, render
+from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.scene_objects import ObjectBody, PlacedObject
 
 AIM: Final = 0.8  # m above the road: the middle of a car
@@ -47,7 +47,7 @@ class Viewpoint:
     time: float
     camera: F64
     target: F64
-    weather: Weather
+    weather: SceneWeather
     about: dict[str, Any]
 
 
@@ -76,7 +76,7 @@ def polar(eye: F64, target: F64) -> dict[str, float]:
     }
 
 
-def weather_name(weather: Weather) -> str:
+def weather_name(weather: SceneWeather) -> str:
     """Return the name of a drawn weather."""
     if weather.sun_height < 0.0:
         return "night"
@@ -88,7 +88,7 @@ def weather_name(weather: Weather) -> str:
 
 
 def follow(
-    trace: EpisodeTrace, weather: Weather, *, behind: float, height: float, count: int, draws: np.random.Generator
+    trace: EpisodeTrace, weather: SceneWeather, *, behind: float, height: float, count: int, draws: np.random.Generator
 ) -> list[Viewpoint]:
     """Every shot of a drive from `behind` m of way behind the driving target, where the target was then, at `height`.
 
@@ -114,7 +114,7 @@ def follow(
 
 
 def orbit(
-    trace: EpisodeTrace, weather: Weather, cell: tuple[float, float, float], draws: np.random.Generator
+    trace: EpisodeTrace, weather: SceneWeather, cell: tuple[float, float, float], draws: np.random.Generator
 ) -> Iterator[Viewpoint]:
     """Without end: shots of one cell (distance m, azimuth and elevation in degrees) at random moments of a drive.
 
@@ -137,7 +137,11 @@ def orbit(
 
 
 def orbit_sign(
-    places: Sequence[Place], seconds: float, weather: Weather, cell: tuple[float, float], draws: np.random.Generator
+    places: Sequence[Place],
+    seconds: float,
+    weather: SceneWeather,
+    cell: tuple[float, float],
+    draws: np.random.Generator,
 ) -> Iterator[Viewpoint]:
     """Without end: shots of a sign that stands at one place after another, as a car's camera sees it.
 
@@ -198,7 +202,7 @@ def has_room(target: ObjectBody, shot: Viewpoint, around: Sequence[PlacedObject]
     return bool((obb_distance(target_box, boxes) > 0.1).all() and (camera_distance[is_tall] > 0.6).all())
 
 
-def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int, height: float = 2 * AIM) -> Bool:
+def free_sight(stage: RenderScene, shots: Sequence[Viewpoint], *, at_once: int, height: float = 2 * AIM) -> Bool:
     """Whether nothing of the street lies between target (at a height, m) and camera, [N]: as the target sees it.
 
     A camera inside a house sees out of it, for walls have one side; who looks at it from outside sees the wall.
@@ -212,7 +216,7 @@ def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int, height
             distances.append(float(np.linalg.norm(camera_position - target_point)))
             # thick air: objects far beyond the camera need not be drawn
             views.append(
-                View(camera, look_at(target_point, camera_position), (), Weather(fog=6.0 / (distances[-1] + 20.0)))
+                View(camera, look_at(target_point, camera_position), (), SceneWeather(fog=6.0 / (distances[-1] + 20.0)))
             )
         depth_maps = render(stage, views, scale=1, quality=PLAIN, linear=False).depth
         is_free += [

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from ssad.core.errors import ConfigError
 from ssad.core.types import AgentKind
-from ssad.rendering.camera.scene import Thing
+from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.target import Target, TargetSign, TargetWalker
@@ -20,7 +20,7 @@ FIRST_SIGN: Final = 1 << 16  # tag of a town's sign 0: no scene has so many agen
 
 
 @dataclass(frozen=True)
-class LiveAttack:
+class AgentEdit:
     """Edit of an agent or of all stop signs, for `ssad.rendering.onboard.Onboard`.
 
     Attributes:
@@ -63,7 +63,7 @@ class LiveAttack:
             self._bodies[model] = mesh, self.edit(mesh)
         return self._bodies[model]
 
-    def attacked(self, models: tuple[str, ...], key: str) -> str:
+    def attacked_model(self, models: tuple[str, ...], key: str) -> str:
         """The model of the agent that is attacked in an episode, or `SIGN`. ConfigError: it has no such agent."""
         if isinstance(self.target, TargetSign):
             return SIGN
@@ -79,11 +79,13 @@ class LiveAttack:
             ("attacked card", self.target, model, index): card for index, card in enumerate(edit.meshes())
         }
 
-    def dressed(self, things: tuple[Thing, ...], mesh: int, signs: Iterable[int] = ()) -> tuple[Thing, ...]:
-        """The things of a view with the target's body in place of what is attacked.
+    def replace_attacked(
+        self, scene_objects: tuple[SceneObject, ...], mesh: int, signs: Iterable[int] = ()
+    ) -> tuple[SceneObject, ...]:
+        """Return the objects of a view with the target's body in place of the attacked ones.
 
         Args:
-            things: Of the view.
+            scene_objects: Objects of the view.
             mesh: Number of the target's body in the scene.
             signs: Meshes of the stop signs there.
         """
@@ -93,17 +95,17 @@ class LiveAttack:
                 replace(scene_object, mesh=mesh, paint=self.target.colour, tag=FIRST_SIGN + scene_object.mesh)
                 if scene_object.tag == 0 and scene_object.mesh in signs
                 else scene_object
-                for scene_object in things
+                for scene_object in scene_objects
             )
         return tuple(
             replace(scene_object, mesh=mesh, paint=self.target.colour)
             if scene_object.tag == self.agent + 1
             else scene_object
-            for scene_object in things
+            for scene_object in scene_objects
         )
 
-    def tags(self, things: Iterable[Thing]) -> list[int]:
-        """Tags of what is attacked among the things of a view."""
+    def tags(self, scene_objects: Iterable[SceneObject]) -> list[int]:
+        """Return the tags of the attacked objects of a view."""
         if isinstance(self.target, TargetSign):
-            return [scene_object.tag for scene_object in things if scene_object.tag >= FIRST_SIGN]
+            return [scene_object.tag for scene_object in scene_objects if scene_object.tag >= FIRST_SIGN]
         return [self.agent + 1]

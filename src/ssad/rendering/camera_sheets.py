@@ -16,9 +16,9 @@ from ssad.core.types import F64, U8, LaneType
 from ssad.rendering.bodies import BODIES, draw_paint, make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, class_of
 from ssad.rendering.camera.lamps import own_lamps
-from ssad.rendering.camera.render import View, Weather, render
+from ssad.rendering.camera.render import SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.meshes.mesh import Material, Mesh, build
 from ssad.rendering.street import cached_street
 from ssad.world.roads import load_town
@@ -26,12 +26,12 @@ from ssad.world.roads import load_town
 # styles of a kind of body that the sheet of classes shows, where they are not its first three
 SHOWN = {"trailer": ("box", "tank", "utility"), "barrier": ("jersey", "fence", "water")}
 WEATHERS = {
-    "clear, noon": Weather(1.0, 0.9, 0.2),
-    "overcast": Weather(0.7, 0.9, 1.0),
-    "low sun": Weather(0.14, 2.6, 0.25),
-    "fog": Weather(0.6, 0.9, 0.9, fog=0.02),
-    "wet road": Weather(0.5, 3.5, 0.95, wet=1.0),
-    "night": Weather(-0.2, 0.0, 0.4),
+    "clear, noon": SceneWeather(1.0, 0.9, 0.2),
+    "overcast": SceneWeather(0.7, 0.9, 1.0),
+    "low sun": SceneWeather(0.14, 2.6, 0.25),
+    "fog": SceneWeather(0.6, 0.9, 0.9, fog=0.02),
+    "wet road": SceneWeather(0.5, 3.5, 0.95, wet=1.0),
+    "night": SceneWeather(-0.2, 0.0, 0.4),
 }
 
 
@@ -51,7 +51,7 @@ def class_sheet(width: int = 240) -> U8:
         for style in SHOWN.get(kind, tuple(BODIES[kind].styles)[:3]):
             meshes.append(make_body(kind, style=style, generator=generator("gallery", kind, style)))
             captions.append((f"{class_of(kind)}: {style}".replace("_", " "), len(meshes) - 1))
-    scene = Scene(None, meshes)
+    scene = RenderScene(None, meshes)
     camera = Camera.typical(width * 2, width * 3 // 2)
     views = []
     for index, (_, mesh_index) in enumerate(captions):
@@ -67,7 +67,12 @@ def class_sheet(width: int = 240) -> U8:
         pose[:3, :3] = pose[:3, :3] @ FORWARD[:3, :3] @ tilt_rotation
         paint = draw_paint(generator("gallery paint", index))
         views.append(
-            View(camera, pose, (Thing(0, np.eye(4)), Thing(mesh_index, np.eye(4), paint, 1)), Weather(0.8, -1.9, 0.4))
+            View(
+                camera,
+                pose,
+                (SceneObject(0, np.eye(4)), SceneObject(mesh_index, np.eye(4), paint, 1)),
+                SceneWeather(0.8, -1.9, 0.4),
+            )
         )
     rendering = render(scene, views, scale=3)
     panels = [captioned(image, caption, width) for image, (caption, _) in zip(rendering.image, captions, strict=True)]
@@ -77,7 +82,7 @@ def class_sheet(width: int = 240) -> U8:
     return np.vstack([np.hstack(panels[start : start + 6]) for start in range(0, len(panels), 6)])
 
 
-def street_scene(town: str = "Twinford") -> tuple[Scene, F64, tuple[Thing, ...]]:
+def street_scene(town: str = "Twinford") -> tuple[RenderScene, F64, tuple[SceneObject, ...]]:
     """Build a street with traffic.
 
     Returns:
@@ -116,9 +121,9 @@ def street_scene(town: str = "Twinford") -> tuple[Scene, F64, tuple[Thing, ...]]
             on_sidewalk = plays_walker and place_index < len(lane_vertices)  # on the sidewalk
             placement = pose @ upright_pose(0.0, -4.2, 0.3) if on_sidewalk else pose
             scene_objects.append(
-                Thing(len(kinds) - 1 if on_sidewalk else mesh_index, placement, draw_paint(rng), place_index + 1)
+                SceneObject(len(kinds) - 1 if on_sidewalk else mesh_index, placement, draw_paint(rng), place_index + 1)
             )
-    return Scene(street, meshes), ego, tuple(scene_objects)
+    return RenderScene(street, meshes), ego, tuple(scene_objects)
 
 
 def weather_sheet(width: int = 480) -> U8:
@@ -139,7 +144,7 @@ def rig_sheet(width: int = 480) -> U8:
     scene, ego, scene_objects = street_scene("Crossgate")
     cameras = [rig_camera(channel, 960) for channel in RIG]
     images = [
-        render(scene, [View(camera, ego @ camera.to_ego, scene_objects, Weather(0.8, 2.2, 0.3))]).image[0]
+        render(scene, [View(camera, ego @ camera.to_ego, scene_objects, SceneWeather(0.8, 2.2, 0.3))]).image[0]
         for camera in cameras
     ]
     panels = [captioned(image, camera.channel, width) for image, camera in zip(images, cameras, strict=True)]

@@ -19,9 +19,9 @@ from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32, U8, Bool, Episode, EpisodeTrace, SignalState
 from ssad.rendering.bodies import draw_paint, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.meshes.mesh import Material, Mesh, merge, prism
-from ssad.rendering.scene_objects import PHASES, STRIDE, Clear
+from ssad.rendering.scene_objects import PHASES, STRIDE, GroundOccupancy
 from ssad.rendering.street import cached_street
 from ssad.rendering.street_signs import KINDS, REACH, street_signs
 from ssad.world.models import MODELS
@@ -75,7 +75,7 @@ def _lens(state: SignalState) -> Mesh:
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
+class Appearance:
     """Time-invariant appearance of an episode.
 
     Attributes:
@@ -106,7 +106,7 @@ class Looks:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class AgentPoses:
     """Poses of the agents of an episode at a step.
 
     Attributes:
@@ -124,19 +124,19 @@ class Moment:
     signal: U8
 
 
-def walked_to(walked: F64, before: F32, now: F32) -> F64:
-    """How far agents have moved, a step later.
+def walked_distance(distance: F64, previous_pose: F32, pose: F32) -> F64:
+    """Return the distances that agents have covered, a step later.
 
     Args:
-        walked: [A] m so far.
-        before: [A, 2 or 3] x, y before the step.
-        now: The same after it.
+        distance: [A] m so far.
+        previous_pose: [A, 2 or 3] x, y before the step.
+        pose: The same after it.
 
     Returns:
         [A] m.
     """
-    displacement = now[:, :2].astype(np.float64) - before[:, :2].astype(np.float64)
-    return walked + np.hypot(displacement[:, 0], displacement[:, 1])
+    displacement = pose[:, :2].astype(np.float64) - previous_pose[:, :2].astype(np.float64)
+    return distance + np.hypot(displacement[:, 0], displacement[:, 1])
 
 
 class EpisodeScene:
@@ -151,7 +151,9 @@ class EpisodeScene:
         self.graph, self.device = graph, device
         street = self.street = cached_street(graph)
         sign_positions = graph.sign_xy.astype(np.float64).reshape(-1, 2)
-        signs = list(street_signs(graph, sign_positions, Clear(street), key=(graph.name,), many=False, detail=1))
+        signs = list(
+            street_signs(graph, sign_positions, GroundOccupancy(street), key=(graph.name,), many=False, detail=1)
+        )
         self.stop_signs = frozenset(index for index, sign in enumerate(signs) if sign.kind == KINDS[SignKind.STOP])
         self._sign_poses = [upright_pose(*sign.pose) for sign in signs]
         # Signs and lenses come first: their numbers must not change when bodies are added.
@@ -161,21 +163,23 @@ class EpisodeScene:
         self._lenses = [
             {
                 # 1 cm in front of the head, so that the lens is not hidden in its surface.
-                state: Thing(len(signs) + index, upright_pose(x, y, yaw, z + offset) @ upright_pose(0.01, 0.0, 0.0))
+                state: SceneObject(
+                    len(signs) + index, upright_pose(x, y, yaw, z + offset) @ upright_pose(0.01, 0.0, 0.0)
+                )
                 for index, (state, offset) in enumerate(LENSES.items())
             }
             for x, y, z, yaw in heads.tolist()
         ]
         self._bodies: dict[object, int] = {}
-        self._own: dict[object, Mesh] = {}
-        self._scene: Scene | None = None
+        self._meshes: dict[object, Mesh] = {}
+        self._scene: RenderScene | None = None
 
-    def cast(self, bodies: Iterable[BodyKey]) -> None:
+    def add_bodies(self, bodies: Iterable[BodyKey]) -> None:
         """Add bodies; those that exist already stay."""
         missing_keys = sorted(set(bodies) - set(self._bodies))
         self._add({key: body_of(*key) for key in missing_keys})
 
-    def have(self, meshes: Mapping[object, Mesh]) -> None:
+    def add_meshes(self, meshes: Mapping[object, Mesh]) -> None:
         """Add other meshes under their own names; those that exist already stay."""
         self._add({key: mesh for key, mesh in meshes.items() if key not in self._bodies})
 
@@ -183,7 +187,7 @@ class EpisodeScene:
         if meshes:
             first_index = len(self._fixed) + len(self._bodies)
             self._bodies |= {key: first_index + index for index, key in enumerate(meshes)}
-            self._own |= meshes
+            self._meshes |= meshes
             self._scene = None
 
     def index(self, key: object) -> int:
@@ -191,25 +195,25 @@ class EpisodeScene:
         return self._bodies[key]
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> RenderScene:
         """Street and bodies on the device, built on first use."""
         if self._scene is None:
-            meshes = [*self._fixed, *self._own.values()]
-            self._scene = Scene(self.street, meshes, device=self.device)
+            meshes = [*self._fixed, *self._meshes.values()]
+            self._scene = RenderScene(self.street, meshes, device=self.device)
         return self._scene
 
-    def looks(self, episode: Episode) -> Looks:
+    def appearance(self, episode: Episode) -> Appearance:
         """Return the appearance of an episode of this town."""
         route = episode.agents[0].route
         assert route is not None  # checked when the world was built
         models = tuple(agent.model for agent in episode.agents)
-        return self._looks(episode.key, models, route_signals(self.graph, route), route.xy)
+        return self._make_appearance(episode.key, models, route_signals(self.graph, route), route.xy)
 
-    def looks_of_trace(self, trace: EpisodeTrace) -> Looks:
+    def appearance_of_trace(self, trace: EpisodeTrace) -> Appearance:
         """Return the appearance of the episode of a trace of this town."""
-        return self._looks(trace.key, trace.models, trace.signal_ids, trace.route)
+        return self._make_appearance(trace.key, trace.models, trace.signal_ids, trace.route)
 
-    def _looks(self, key: str, models: tuple[str, ...], signals: I32, way: F32) -> Looks:
+    def _make_appearance(self, key: str, models: tuple[str, ...], signals: I32, way: F32) -> Appearance:
         agents = range(len(models))
         strides = np.array([generator("stride", key, agent).uniform(0, STRIDE) for agent in agents])
         near_signs = [
@@ -217,7 +221,7 @@ class EpisodeScene:
             for sign_index, sign_pose in enumerate(self._sign_poses)
             if np.hypot(*(way - sign_pose[:2, 3]).T).min() < REACH
         ]
-        return Looks(
+        return Appearance(
             key,
             models,
             tuple(int(generator("variant", key, agent).integers(VARIANTS)) for agent in agents),
@@ -227,29 +231,31 @@ class EpisodeScene:
             tuple(near_signs),
         )
 
-    def things(self, looks: Looks, moment: Moment, *, without: int | None = None) -> tuple[Thing, ...]:
+    def objects(
+        self, appearance: Appearance, agent_poses: AgentPoses, *, without: int | None = None
+    ) -> tuple[SceneObject, ...]:
         """Bodies of agents at a moment, with the signs along the way; agent a has the tag a + 1.
 
         Args:
-            looks: Of the episode.
-            moment: Who is where.
+            appearance: Of the episode.
+            agent_poses: Who is where.
             without: Agent that is left out: who looks.
         """
-        visible = [Thing(sign_index, self._sign_poses[sign_index]) for sign_index in looks.signs]
-        poses = upright_poses(moment.pose.astype(np.float64))
-        for agent, model in enumerate(looks.models):
-            if moment.active[agent] and agent != without:
+        visible = [SceneObject(sign_index, self._sign_poses[sign_index]) for sign_index in appearance.signs]
+        poses = upright_poses(agent_poses.pose.astype(np.float64))
+        for agent, model in enumerate(appearance.models):
+            if agent_poses.active[agent] and agent != without:
                 phase = 0
                 if _cycles(model):
-                    phase = int((moment.walked[agent] + looks.strides[agent]) / STRIDE * PHASES) % PHASES
-                body_index = self._bodies[model, looks.variants[agent], phase]
-                visible.append(Thing(body_index, poses[agent], looks.paints[agent], agent + 1))
+                    phase = int((agent_poses.walked[agent] + appearance.strides[agent]) / STRIDE * PHASES) % PHASES
+                body_index = self._bodies[model, appearance.variants[agent], phase]
+                visible.append(SceneObject(body_index, poses[agent], appearance.paints[agent], agent + 1))
         return tuple(visible)
 
-    def lights(self, looks: Looks, moment: Moment, eye: F64) -> tuple[Thing, ...]:
+    def lights(self, appearance: Appearance, poses: AgentPoses, viewpoint: F64) -> tuple[SceneObject, ...]:
         """The lit lenses of the signals near a place [2]; they belong to the street."""
-        signal_states = dict(zip(looks.signals.tolist(), moment.signal.tolist(), strict=True))
-        head_offsets = self._head_places - eye
+        signal_states = dict(zip(appearance.signals.tolist(), poses.signal.tolist(), strict=True))
+        head_offsets = self._head_places - viewpoint
         near_heads = np.flatnonzero(np.hypot(head_offsets[:, 0], head_offsets[:, 1]) < SIGNALS_WITHIN).tolist()
         head_states = (
             (head_index, SignalState(signal_states.get(signal, SignalState.OFF)))
@@ -260,14 +266,14 @@ class EpisodeScene:
         )
 
 
-def moments_of(trace: EpisodeTrace) -> list[Moment]:
+def agent_poses(trace: EpisodeTrace) -> list[AgentPoses]:
     """Return the poses of all agents at each step of a trace."""
     pose = np.stack([trace.x, trace.y, trace.yaw], -1)
     walked = np.zeros(pose.shape[1])
     moments = []
     for step in range(len(pose)):
-        walked = walked_to(walked, pose[max(step - 1, 0)], pose[step])
-        moments.append(Moment(step, pose[step], trace.active[step], walked, trace.signal[step]))
+        walked = walked_distance(walked, pose[max(step - 1, 0)], pose[step])
+        moments.append(AgentPoses(step, pose[step], trace.active[step], walked, trace.signal[step]))
     return moments
 
 

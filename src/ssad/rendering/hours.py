@@ -7,14 +7,14 @@ from typing import Final
 import numpy as np
 
 from ssad.core.errors import unknown_name
-from ssad.rendering.camera.render import Weather
+from ssad.rendering.camera.render import SceneWeather
 
 HOURS: Final = ("recorded", "noon", "low_sun", "sun_behind", "night")
 SUN: Final = {"noon": 1.0, "low_sun": 0.25, "sun_behind": 0.5, "night": -0.3}  # height of the sun, rad
 ASIDE: Final = 0.3  # rad from straight behind the target to a sun that is behind it
 
 
-def at_hour(weather: Weather, hour: str, heading: float | None = None) -> Weather:
+def at_hour(weather: SceneWeather, hour: str, heading: float | None = None) -> SceneWeather:
     """Return a weather at an hour: clear and dry, with the sun in its recorded direction; recorded: unchanged.
 
     Args:
@@ -33,4 +33,4 @@ def at_hour(weather: Weather, hour: str, heading: float | None = None) -> Weathe
     if hour == "sun_behind" and heading is not None:
         # A little to the side, not straight behind the target.
         sun_heading = heading + np.pi + ASIDE
-    return Weather(SUN[hour], float(sun_heading), min(weather.clouds, 0.3), turn=weather.turn)
+    return SceneWeather(SUN[hour], float(sun_heading), min(weather.clouds, 0.3), turn=weather.turn)

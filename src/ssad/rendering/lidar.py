@@ -20,7 +20,7 @@ from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32
 from ssad.rendering.camera.kernels import lidar as kernels
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 
 GLASS = 0.3  # share of beams that a pane of glass returns
 FALL = 50.0  # range at which the intensity is halved, m
@@ -72,13 +72,13 @@ HDL32E = Lidar(np.deg2rad(np.linspace(-30.67, 10.67, 32)), 1084)
 """The LiDAR of nuScenes: Velodyne HDL-32E at 20 Hz, on the roof."""
 
 
-class _Scene:
+class _RayScene:
     """Ray index of a scene: the street at full detail, once, and each mesh at its first use.
 
     The faces of all are numbered consecutively; `material` holds the material of each.
     """
 
-    def __init__(self, stage: Scene) -> None:
+    def __init__(self, stage: RenderScene) -> None:
         self.device = stage.device
         self.street: Any = None
         self.meshes: dict[int, tuple[Any, int, F64, float]] = {}
@@ -103,7 +103,7 @@ class _Scene:
             street_faces = np.asarray(street.order[street.offset[0, 0] : street.offset[0, -1]], np.int32)
             self.street = self._mesh(stage, street_faces)[0]
 
-    def _mesh(self, stage: Scene, listed: I32) -> tuple[Any, int, F64]:
+    def _mesh(self, stage: RenderScene, listed: I32) -> tuple[Any, int, F64]:
         """A mesh of these faces, the number of its first face, and its vertices; None without faces."""
         faces = stage.faces.numpy()[listed]
         vertex_indices, indices = np.unique(faces, return_inverse=True)
@@ -118,7 +118,7 @@ class _Scene:
         indices = wp.array(indices.reshape(-1).astype(np.int32), dtype=int, device=stage.device)
         return wp.Mesh(points=points, indices=indices), first_face, points.numpy()
 
-    def body(self, stage: Scene, mesh: int) -> tuple[Any, int, F64, float]:
+    def body(self, stage: RenderScene, mesh: int) -> tuple[Any, int, F64, float]:
         """Return mesh, number of its first face, middle [3] and radius of its bounding sphere in its own frame."""
         if mesh not in self.meshes:
             first_entry = stage.first[mesh]
@@ -139,18 +139,18 @@ class _Scene:
         return self._on_device
 
 
-_scenes: WeakKeyDictionary[Scene, _Scene] = WeakKeyDictionary()
+_scenes: WeakKeyDictionary[RenderScene, _RayScene] = WeakKeyDictionary()
 
 
 def sweep(
-    stage: Scene,
+    scene: RenderScene,
     lidar: Lidar,
     ego_to_world: F64,
-    things: Sequence[Thing],
+    objects: Sequence[SceneObject],
     *,
     key: tuple[object, ...],
     motion: bool = False,
-    before: tuple[F64, Sequence[Thing]] | None = None,
+    previous: tuple[F64, Sequence[SceneObject]] | None = None,
 ) -> tuple[F32, I32]:
     """One turn of a LiDAR.
 
@@ -158,13 +158,13 @@ def sweep(
     frame at the end: the motion of the ego is compensated, that of others is not.
 
     Args:
-        stage: The scene.
+        scene: The scene.
         lidar: The LiDAR.
         ego_to_world: [4, 4].
-        things: What stands there.
+        objects: Objects in the scene.
         key: Key of the noise, e.g. (seed, scene, sample).
         motion: Whether the sensor and the things move during the turn.
-        before: Pose of the ego [4, 4], and things (identified by their tags; their rotation is ignored), one period
+        previous: Pose of the ego [4, 4], and things (identified by their tags; their rotation is ignored), one period
             earlier.
 
     Returns:
@@ -173,33 +173,33 @@ def sweep(
     Raises:
         ConfigError: The LiDAR, poses or things do not fit.
     """
-    _check(stage, lidar, ego_to_world, things)
-    things = [scene_object for scene_object in things if stage.count[scene_object.mesh]]
-    if motion and before is None:
+    _check(scene, lidar, ego_to_world, objects)
+    objects = [scene_object for scene_object in objects if scene.count[scene_object.mesh]]
+    if motion and previous is None:
         raise ConfigError("sweep: motion needs `before`, the ego's pose and the things one period earlier")
-    ray_scene = _scenes.get(stage)
+    ray_scene = _scenes.get(scene)
     if ray_scene is None:
-        ray_scene = _scenes[stage] = _Scene(stage)
+        ray_scene = _scenes[scene] = _RayScene(scene)
     rays = lidar.directions()
     column_count, beams = rays.shape[:2]
     to_world = np.asarray(ego_to_world, np.float64) @ lidar.to_ego
     sensor_position, to_world_rotation = to_world[:3, 3], to_world[:3, :3]
     fire_times, offsets = np.zeros(column_count), np.zeros((column_count, 3))
-    rotations, velocities = to_world_rotation[None], np.zeros((len(things), 3))
-    if motion and before is not None:
-        _check(stage, lidar, before[0], before[1])
+    rotations, velocities = to_world_rotation[None], np.zeros((len(objects), 3))
+    if motion and previous is not None:
+        _check(scene, lidar, previous[0], previous[1])
         fire_times = ((np.arange(column_count) + 0.5) / column_count - 1.0) * lidar.period
-        rotations, offsets = _path(before[0] @ lidar.to_ego, to_world, fire_times / lidar.period)
-        velocities = _velocities(things, before[1], lidar.period)
+        rotations, offsets = _path(previous[0] @ lidar.to_ego, to_world, fire_times / lidar.period)
+        velocities = _velocities(objects, previous[1], lidar.period)
     directions = np.matmul(rays, np.swapaxes(rotations, -1, -2)).astype(np.float32)
-    target_rows, spheres = _targets(stage, ray_scene, things, sensor_position, velocities)
+    target_rows, spheres = _targets(scene, ray_scene, objects, sensor_position, velocities)
     target_list, column_starts = _columns(directions, spheres, lidar, (offsets, fire_times, velocities))
     random_source = generator(*key, "lidar")
     # All numbers are drawn for every beam, so that objects do not change the noise of others.
     noise = random_source.standard_normal((column_count, beams), np.float32)
     loss_draws = random_source.random((column_count, beams), np.float32)
     pane_draws = random_source.random((column_count, beams, 3), np.float32)
-    device, shape = stage.device, (column_count, beams)
+    device, shape = scene.device, (column_count, beams)
 
     def to_device(values: Any, dtype: Any) -> Any:
         return wp.array(values, dtype=dtype, device=device)
@@ -244,8 +244,8 @@ def sweep(
     return cloud, tags[is_returned].astype(np.int32)
 
 
-def _check(stage: Scene, lidar: Lidar, ego_to_world: F64, things: Sequence[Thing]) -> None:
-    """ConfigError for what no sweep can be made of."""
+def _check(scene: RenderScene, lidar: Lidar, ego_to_world: F64, objects: Sequence[SceneObject]) -> None:
+    """Raise ConfigError if the arguments allow no sweep."""
     beams = np.asarray(lidar.beams)
     if beams.ndim != 1 or not beams.size or not np.isfinite(beams).all() or lidar.azimuths < 1:
         raise ConfigError("lidar: needs at least one beam (finite elevations, rad) and one azimuth")
@@ -253,10 +253,10 @@ def _check(stage: Scene, lidar: Lidar, ego_to_world: F64, things: Sequence[Thing
         raise ConfigError("lidar: reach and period must be positive, noise not negative, lost in 0..1")
     if np.shape(ego_to_world) != (4, 4) or not np.isfinite(ego_to_world).all():
         raise ConfigError("sweep: the pose of the ego is not a finite 4 x 4 matrix")
-    for scene_object in things:
-        if not 0 <= scene_object.mesh < len(stage.first):
+    for scene_object in objects:
+        if not 0 <= scene_object.mesh < len(scene.first):
             raise ConfigError(
-                f"sweep: thing {scene_object.tag} has mesh {scene_object.mesh}, the stage has {len(stage.first)}"
+                f"sweep: thing {scene_object.tag} has mesh {scene_object.mesh}, the stage has {len(scene.first)}"
             )
         if np.shape(scene_object.pose) != (4, 4) or not np.isfinite(scene_object.pose).all():
             raise ConfigError(f"sweep: the pose of thing {scene_object.tag} is not a finite 4 x 4 matrix")
@@ -292,25 +292,25 @@ def _path(first: F64, last: F64, share: F64) -> tuple[F64, F64]:
     return partial_rotations @ last[:3, :3], share[:, None] * (last[:3, 3] - first[:3, 3])
 
 
-def _velocities(things: Sequence[Thing], before: Sequence[Thing], period: float) -> F64:
-    """Velocities of things [T, 3], m/s; of a tag the first was the first before. Tags below 1 and new ones rest."""
+def _velocities(objects: Sequence[SceneObject], previous_objects: Sequence[SceneObject], period: float) -> F64:
+    """Return the velocities of objects [T, 3], m/s, matched by tag; tags below 1 and new ones rest."""
     past_positions: dict[int, list[F64]] = {}
-    for scene_object in before:
+    for scene_object in previous_objects:
         past_positions.setdefault(scene_object.tag, []).append(scene_object.pose[:3, 3])
-    displacements = np.zeros((len(things), 3))
-    for index, scene_object in enumerate(things):
+    displacements = np.zeros((len(objects), 3))
+    for index, scene_object in enumerate(objects):
         if scene_object.tag > 0 and past_positions.get(scene_object.tag):
             displacements[index] = scene_object.pose[:3, 3] - past_positions[scene_object.tag].pop(0)
     return displacements / period
 
 
 def _targets(
-    stage: Scene, scene: _Scene, things: Sequence[Thing], eye: F64, velocities: F64
+    stage: RenderScene, scene: _RayScene, objects: Sequence[SceneObject], eye: F64, velocities: F64
 ) -> tuple[Any, tuple[F64, F64]]:
     """Rows of `Target` for things, and their bounding spheres: middle relative to the eye [T, 3], radius [T]."""
-    rows: Any = np.zeros(len(things), kernels.Target.numpy_dtype())  # type: ignore[attr-defined]
-    centres, radii = np.zeros((len(things), 3)), np.zeros(len(things))
-    for index, scene_object in enumerate(things):
+    rows: Any = np.zeros(len(objects), kernels.Target.numpy_dtype())  # type: ignore[attr-defined]
+    centres, radii = np.zeros((len(objects), 3)), np.zeros(len(objects))
+    for index, scene_object in enumerate(objects):
         mesh, first_face, middle, radius = scene.body(stage, scene_object.mesh)
         pose = np.asarray(scene_object.pose, np.float64)
         inverse = np.linalg.inv(pose)

@@ -23,19 +23,19 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest
 from ssad.core.types import F32, F64, I32, U8, AgentKind, End, EpisodeTrace
-from ssad.rendering.agent_edit import LiveAttack
+from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.lamps import NOSE, own_lamps
-from ssad.rendering.camera.render import Picture, View, Weather, render
+from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
-from ssad.rendering.camera.scene import Thing
+from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit, render_with
 from ssad.rendering.camera.sensor import SENSOR
-from ssad.rendering.camera.sensor import Sensor as Response
-from ssad.rendering.episode_scene import EpisodeScene, Looks, Moment, moments_of, walked_to
+from ssad.rendering.camera.sensor import SensorModel as Response
+from ssad.rendering.episode_scene import AgentPoses, Appearance, EpisodeScene, agent_poses, walked_distance
 from ssad.rendering.lidar import HDL32E, Lidar, sweep
 from ssad.world.models import MODELS
 
-DAY: Final = Weather(0.9, 2.2, 0.3)
+DAY: Final = SceneWeather(0.9, 2.2, 0.3)
 AT_ONCE, AT_ONCE_GPU, AT_LEAST_GPU = 1, 192, 16  # views rendered in one call; on a CPU more do not pay
 VIEW_MEMORY: Final = 100 << 20  # bytes that a view of 640 x 360 needs on a GPU, with shadows and textures
 WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE)
@@ -46,7 +46,7 @@ class _Track:
     """Poses of the agents of a scene since its episode began, one entry per step."""
 
     episode: int
-    looks: Looks
+    appearance: Appearance
     pose: list[F32] = field(default_factory=list)
     walked: list[F64] = field(default_factory=list)
 
@@ -61,7 +61,7 @@ class _Track:
         # steps before the first reading are unknown; they only affect the phase of walking cycles
         missing_steps = step + 1 - len(self.pose)
         self.pose += [pose.copy()] * missing_steps
-        self.walked += [walked_to(walked, previous_pose, pose)] * missing_steps
+        self.walked += [walked_distance(walked, previous_pose, pose)] * missing_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,15 +71,15 @@ class Sight:
     Attributes:
         row: Row of the reading that it belongs to.
         town: Scene of its town.
-        looks: Appearance of the episode.
+        appearance: Appearance of the episode.
         moment: Poses of the agents.
         agent: Number of the viewing agent.
     """
 
     row: int
     town: EpisodeScene
-    looks: Looks
-    moment: Moment
+    appearance: Appearance
+    moment: AgentPoses
     agent: int
 
     @property
@@ -106,10 +106,10 @@ class Onboard:
     def __init__(
         self,
         *,
-        weather: Weather | Callable[[str], Weather] = DAY,
+        weather: SceneWeather | Callable[[str], SceneWeather] = DAY,
         response: Response = SENSOR,
         device: str = "cpu",
-        attack: LiveAttack | None = None,
+        attack: AgentEdit | None = None,
         resident: bool = False,
     ) -> None:
         self.resident = resident and device != "cpu"
@@ -170,16 +170,16 @@ class Onboard:
         """Record the current poses of all agents and return the state of the simulator."""
         if simulator is not self._simulator:
             self._simulator, self._tracks = simulator, {}
-            self._cast(simulator)
+            self._add_bodies(simulator)
         state = simulator.state()
         for scene, episode in enumerate(simulator.assigned.tolist()):
             step = _step_of(simulator, state, scene)
             history = self._tracks.get(scene)
             if history is None or history.episode != episode:
                 episode_spec = simulator.episodes[episode]
-                appearance = self.town(simulator.graphs[episode_spec.town]).looks(episode_spec)
+                appearance = self.town(simulator.graphs[episode_spec.town]).appearance(episode_spec)
                 history = self._tracks[scene] = _Track(episode, appearance)
-            history.follow(step, state.pose[scene, : len(history.looks.models)])
+            history.follow(step, state.pose[scene, : len(history.appearance.models)])
         return state
 
     def town(self, graph: LaneGraph) -> EpisodeScene:
@@ -189,30 +189,30 @@ class Onboard:
             cached = self._towns[graph.name] = (graph, EpisodeScene(graph, device=self.device))
         return cached[1]
 
-    def _cast(self, simulator: Simulator) -> None:
+    def _add_bodies(self, simulator: Simulator) -> None:
         """Add the bodies of all episodes that a simulator can run."""
         # All at once: a body that is added later would rebuild the scene in the middle of a run.
         for episode in simulator.episodes:
             town = self.town(simulator.graphs[episode.town])
-            self._prepare(town, town.looks(episode))
+            self._add_episode(town, town.appearance(episode))
 
-    def _prepare(self, town: EpisodeScene, looks: Looks) -> None:
-        """Have the bodies of an episode."""
-        town.cast(looks.bodies())
+    def _add_episode(self, town: EpisodeScene, appearance: Appearance) -> None:
+        """Add the bodies of an episode to its town."""
+        town.add_bodies(appearance.bodies())
         if self.attack is not None:
-            town.have(self.attack.meshes(self.attack.attacked(looks.models, looks.key)))
+            town.add_meshes(self.attack.meshes(self.attack.attacked_model(appearance.models, appearance.key)))
 
-    def things(self, sight: Sight) -> tuple[Thing, ...]:
+    def visible_objects(self, sight: Sight) -> tuple[SceneObject, ...]:
         """The bodies that an agent could see."""
-        scene_objects = sight.town.things(sight.looks, sight.moment, without=sight.agent)
+        scene_objects = sight.town.objects(sight.appearance, sight.moment, without=sight.agent)
         if self.attack is None:
             return scene_objects
         (target_key, *_) = self.attack.meshes(self._attacked(sight))
-        return self.attack.dressed(scene_objects, sight.town.index(target_key), sight.town.stop_signs)
+        return self.attack.replace_attacked(scene_objects, sight.town.index(target_key), sight.town.stop_signs)
 
-    def render(self, sights: Sequence[Sight], cameras: Sequence[Camera]) -> Picture:
-        """What sights in one town show, all of one edit (see `edit`), camera by camera, with its arrays left there."""
-        object_cache: dict[int, tuple[Thing, ...]] = {}
+    def render(self, sights: Sequence[Sight], cameras: Sequence[Camera]) -> Rendering:
+        """Render sights in one town, all of one edit (see `edit`), camera by camera; arrays stay on the device."""
+        object_cache: dict[int, tuple[SceneObject, ...]] = {}
         views = [self.view(agent_view, camera, object_cache) for camera in cameras for agent_view in sights]
         edit, scene = self.edit(sights[0]), sights[0].town.scene
         if edit is None:
@@ -224,12 +224,12 @@ class Onboard:
         return replace(rendering, image=image, tag=tag, depth=depth)
 
     def edit(self, sight: Sight) -> SceneEdit | None:
-        """What the attack changes in an episode, the same for all episodes whose attacked agent is of one model."""
+        """Return the edit of an episode, the same for all episodes whose attacked agent is of one model."""
         return None if self.attack is None else self.attack.body(self._attacked(sight))[1]
 
     def _attacked(self, sight: Sight) -> str:
         assert self.attack is not None
-        return self.attack.attacked(sight.looks.models, sight.looks.key)
+        return self.attack.attacked_model(sight.appearance.models, sight.appearance.key)
 
     def sights(self, simulator: Simulator, agents: I32) -> list[Sight]:
         """Return the current views of agents [N, 2] (scene, agent), without those whose episode has ended."""
@@ -240,13 +240,13 @@ class Onboard:
                 continue
             history = self._tracks[scene]
             if scene not in moments:
-                step, agent_count = _step_of(simulator, state, scene), len(history.looks.models)
-                signal = state.signal[scene][history.looks.signals]
-                moments[scene] = Moment(
+                step, agent_count = _step_of(simulator, state, scene), len(history.appearance.models)
+                signal = state.signal[scene][history.appearance.signals]
+                moments[scene] = AgentPoses(
                     step, history.pose[step], state.active[scene, :agent_count], history.walked[step], signal
                 )
             town = self.town(simulator.graphs[simulator.episodes[history.episode].town])
-            agent_views.append(Sight(row, town, history.looks, moments[scene], agent))
+            agent_views.append(Sight(row, town, history.appearance, moments[scene], agent))
         return agent_views
 
     def sights_of_trace(
@@ -263,7 +263,7 @@ class Onboard:
         Raises:
             ConfigError: The trace has no such agent or step.
         """
-        moments = moments_of(trace)
+        moments = agent_poses(trace)
         selected_steps = range(len(moments)) if steps is None else steps
         if not 0 <= agent < len(trace.models) or any(not 0 <= step < len(moments) for step in selected_steps):
             raise ConfigError(
@@ -271,20 +271,22 @@ class Onboard:
                 f"not agent {agent} at steps {list(selected_steps)}"
             )
         town = self.town(graph)
-        appearance = town.looks_of_trace(trace)
-        self._prepare(town, appearance)
+        appearance = town.appearance_of_trace(trace)
+        self._add_episode(town, appearance)
         return [Sight(row, town, appearance, moments[step], agent) for row, step in enumerate(selected_steps)]
 
-    def view(self, sight: Sight, camera: Camera, seen: dict[int, tuple[Thing, ...]] | None = None) -> View:
-        """A view through a camera that the agent carries; `seen`: things of sights (by `id`) that were gathered."""
-        appearance, moment, agent = sight.looks, sight.moment, sight.agent
-        weather = self.weather if isinstance(self.weather, Weather) else self.weather(appearance.key)
+    def view(
+        self, sight: Sight, camera: Camera, object_cache: dict[int, tuple[SceneObject, ...]] | None = None
+    ) -> View:
+        """Return the view through a camera of the agent; `object_cache` holds gathered objects by `id` of a sight."""
+        appearance, moment, agent = sight.appearance, sight.moment, sight.agent
+        weather = self.weather if isinstance(self.weather, SceneWeather) else self.weather(appearance.key)
         camera_pose = sight.pose @ camera.to_ego
-        scene_objects = None if seen is None else seen.get(id(sight))
+        scene_objects = None if object_cache is None else object_cache.get(id(sight))
         if scene_objects is None:
-            scene_objects = self.things(sight)
-            if seen is not None:
-                seen[id(sight)] = scene_objects
+            scene_objects = self.visible_objects(sight)
+            if object_cache is not None:
+                object_cache[id(sight)] = scene_objects
         lit_lenses = sight.town.lights(appearance, moment, camera_pose[:2, 3])
         model_entry = MODELS[appearance.models[agent]]
         nose_pose = sight.pose @ upright_pose(0.5 * model_entry.length - NOSE, 0.0, 0.0)
@@ -380,7 +382,7 @@ class OnboardCamera:
 
     def shots(
         self, sights: Sequence[Sight], cameras: Sequence[Camera] | None = None
-    ) -> Iterator[tuple[list[Sight], Picture]]:
+    ) -> Iterator[tuple[list[Sight], Rendering]]:
         """Render in as few calls as possible.
 
         Args:
@@ -430,8 +432,8 @@ class OnboardLidar:
         readings = np.zeros((count, len(self.lidar.beams) * self.lidar.azimuths, 5), np.float32)
         readings[..., 4] = -1.0
         for agent_view in sights:
-            appearance, moment, agent = agent_view.looks, agent_view.moment, agent_view.agent
-            scene_objects = self.onboard.things(agent_view)
+            appearance, moment, agent = agent_view.appearance, agent_view.moment, agent_view.agent
+            scene_objects = self.onboard.visible_objects(agent_view)
             key = ("onboard lidar", appearance.key, moment.step, agent)
             points, _ = sweep(agent_view.town.scene, self.lidar, agent_view.pose, scene_objects, key=key)
             readings[agent_view.row, : len(points)] = points

@@ -38,9 +38,9 @@ class OnboardRadar:
         state = simulator.state()
         for agent_view in self.onboard.sights(simulator, agents):
             scene = int(agents[agent_view.row, 0])
-            key = ("onboard radar", agent_view.looks.key, agent_view.moment.step, agent_view.agent)
+            key = ("onboard radar", agent_view.appearance.key, agent_view.moment.step, agent_view.agent)
             points, tags = sweep(
-                agent_view.town.scene, self.rays, agent_view.pose, self.onboard.things(agent_view), key=key
+                agent_view.town.scene, self.rays, agent_view.pose, self.onboard.visible_objects(agent_view), key=key
             )
             speeds = state.speed[scene].astype(np.float64)
             yaw = state.pose[scene, :, 2].astype(np.float64)

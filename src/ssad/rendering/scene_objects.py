@@ -18,7 +18,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, plain_body
-from ssad.rendering.camera.scene import Thing
+from ssad.rendering.camera.scene import SceneObject
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.street.model import Street
 from ssad.rendering.street_signs import street_signs
@@ -77,7 +77,7 @@ CARS = ("car", "suv", "coupe", "compact", "van")
 FEWER = 0.4  # times as many cars, against all else, where streets are "any": a detector sees enough of them
 
 
-def thinned(shares: Mapping[str, float], streets: str) -> dict[str, float]:
+def thin_shares(shares: Mapping[str, float], streets: str) -> dict[str, float]:
     """Shares of bodies, of the sum 1; fewer cars for "any" (see `FEWER`)."""
     found = {body: share * (FEWER if streets == "any" and body in CARS else 1.0) for body, share in shares.items()}
     return {body: share / sum(found.values()) for body, share in found.items()}
@@ -119,14 +119,14 @@ class PlacedObject:
     body: ObjectBody
     pose: F64
     speed: float
-    thing: Thing
+    scene_object: SceneObject
 
 
 class LazyMeshes(Sequence[Mesh]):
     """Meshes by number, each built on first access: most bodies of a town are never in view."""
 
     def __init__(self) -> None:
-        self._made: list[Mesh | Callable[[], Mesh]] = []
+        self._meshes: list[Mesh | Callable[[], Mesh]] = []
 
     def add(self, mesh: Mesh | Callable[[], Mesh]) -> int:
         """Add a mesh, or a function that builds it.
@@ -134,15 +134,15 @@ class LazyMeshes(Sequence[Mesh]):
         Returns:
             Its number.
         """
-        self._made.append(mesh)
-        return len(self._made) - 1
+        self._meshes.append(mesh)
+        return len(self._meshes) - 1
 
-    def only(self, wanted: Collection[int]) -> list[Mesh]:
+    def select(self, numbers: Collection[int]) -> list[Mesh]:
         """All meshes under their numbers, with one without faces in place of those that are not wanted."""
-        return [self[number] if number in wanted else NOTHING for number in range(len(self))]
+        return [self[number] if number in numbers else NOTHING for number in range(len(self))]
 
     def __len__(self) -> int:
-        return len(self._made)
+        return len(self._meshes)
 
     @overload
     def __getitem__(self, number: int) -> Mesh: ...
@@ -153,10 +153,10 @@ class LazyMeshes(Sequence[Mesh]):
     def __getitem__(self, number: int | slice) -> Mesh | list[Mesh]:
         if isinstance(number, slice):
             return [self[k] for k in range(len(self))[number]]
-        made = self._made[number]
-        if not isinstance(made, Mesh):
-            made = self._made[number] = made()
-        return made
+        mesh = self._meshes[number]
+        if not isinstance(mesh, Mesh):
+            mesh = self._meshes[number] = mesh()
+        return mesh
 
 
 @dataclass(slots=True)
@@ -178,7 +178,7 @@ class SceneObjects:
     bodies: list[ObjectBody] = field(default_factory=list)
 
     def at(self, time: float, around: F64, reach: float) -> list[PlacedObject]:
-        """Who is within reach (m) of a place [2] at a time (s), between steps in between."""
+        """Return the bodies within `reach` (m) of a place [2] at a time (s), interpolated between steps."""
         placed = []
         for body in self.bodies:
             last_step = len(body.track) - 1
@@ -209,18 +209,20 @@ class SceneObjects:
             walked = float(body.driven[lower_step] + fraction * (body.driven[upper_step] - body.driven[lower_step]))
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
-            placed.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag, lit=not body.parked)))
+            placed.append(
+                PlacedObject(body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, lit=not body.parked))
+            )
         return placed
 
     def add(
         self,
-        who: tuple[str, str, Size, tuple[int, ...]],
+        body_parts: tuple[str, str, Size, tuple[int, ...]],
         track: F64,
         *,
         active: Bool | None = None,
         parked: bool = False,
     ) -> None:
-        """Another body: kind, style, size, meshes, and where it is. Its paint is drawn."""
+        """Add a body (kind, style, size, meshes) with its track; its paint is drawn."""
         tag = len(self.bodies) + 1
         step_lengths = np.hypot(*np.diff(track[:, :2], axis=0).T) if len(track) > 1 else np.zeros(0)
         # A random offset: walkers that start together must not step in unison.
@@ -229,13 +231,13 @@ class SceneObjects:
         )
         activity = np.ones(len(track), bool) if active is None else active
         paint = draw_paint(generator("paint", *self.key, tag))
-        kind, style, size, meshes = who
+        kind, style, size, meshes = body_parts
         self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, activity, driven, parked))
 
     def make(
         self, kind: str, style: str, size: Size, *, name: tuple[object, ...] = (), phases: int = 1
     ) -> tuple[str, str, Size, tuple[int, ...]]:
-        """New meshes of one body in `phases` places of its cycle; what `add` wants to know of it."""
+        """Add the meshes of one body in `phases` phases of its cycle; return its description for `add`."""
         key = (*self.key, *(name or (len(self.meshes),)))
 
         def build(phase: float | None) -> Mesh:
@@ -246,14 +248,14 @@ class SceneObjects:
         return kind, style, size, tuple(self.meshes.add(partial(build, phase)) for phase in cycle_phases)
 
 
-class Clear:
+class GroundOccupancy:
     """Occupancy of a street's ground: squares of half a metre with a vertex between knee and head height."""
 
     def __init__(self, street: Street) -> None:
         vertices = street.vertices
         upright = vertices[(vertices[:, 2] > 0.35) & (vertices[:, 2] < 2.4)]
         squares: list[list[int]] = np.unique(np.floor(upright[:, :2] * 2).astype(int), axis=0).tolist()
-        self.taken = {(x, y) for x, y in squares}
+        self.occupied_squares = {(x, y) for x, y in squares}
 
     def footprint(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
         """Return True if a rectangle is free."""
@@ -264,10 +266,11 @@ class Clear:
         columns = np.floor(2 * (x + along * np.cos(yaw) - across * np.sin(yaw))).astype(int)
         rows = np.floor(2 * (y + along * np.sin(yaw) + across * np.cos(yaw))).astype(int)
         return not any(
-            square in self.taken for square in zip(columns.ravel().tolist(), rows.ravel().tolist(), strict=True)
+            square in self.occupied_squares
+            for square in zip(columns.ravel().tolist(), rows.ravel().tolist(), strict=True)
         )
 
-    def take(self, x: float, y: float, yaw: float, length: float, width: float) -> None:
+    def occupy(self, x: float, y: float, yaw: float, length: float, width: float) -> None:
         """Mark a rectangle as occupied."""
         for along in np.arange(-length / 2, length / 2 + 0.4, 0.45):
             for across in np.arange(-width / 2, width / 2 + 0.4, 0.45):
@@ -275,7 +278,7 @@ class Clear:
                     x + along * np.cos(yaw) - across * np.sin(yaw),
                     y + along * np.sin(yaw) + across * np.cos(yaw),
                 )
-                self.taken.add((int(np.floor(2 * point_x)), int(np.floor(2 * point_y))))
+                self.occupied_squares.add((int(np.floor(2 * point_x)), int(np.floor(2 * point_y))))
 
 
 def place_objects(
@@ -302,14 +305,14 @@ def place_objects(
     population = SceneObjects(trace.dt, key, detail)
     _agents(population, trace)
     route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
-    free_ground = Clear(street)
+    free_ground = GroundOccupancy(street)
     _kerb(
         population,
         graph,
         street,
         route_points,
         free_ground,
-        thinned({body_kind: PARKED[body_kind][0] for body_kind in PARKED}, streets),
+        thin_shares({body_kind: PARKED[body_kind][0] for body_kind in PARKED}, streets),
     )
     _sidewalks(population, graph, route_points, free_ground, len(trace.x))
     # Signs come last: they evade whatever stands at their place, and nothing evades them.
@@ -317,10 +320,10 @@ def place_objects(
     return population
 
 
-def _agents(cast: SceneObjects, trace: EpisodeTrace) -> None:
+def _agents(population: SceneObjects, trace: EpisodeTrace) -> None:
     """The agents of the world as their traces say; some buses are drawn as a tractor with its trailer."""
     for agent in range(1, len(trace.models)):
-        rng = generator("record body", *cast.key, agent)
+        rng = generator("record body", *population.key, agent)
         model = MODELS[trace.models[agent]]
         track = np.stack([trace.x[:, agent], trace.y[:, agent], trace.yaw[:, agent], 0 * trace.x[:, agent]], -1).astype(
             np.float64
@@ -328,12 +331,12 @@ def _agents(cast: SceneObjects, trace: EpisodeTrace) -> None:
         active = trace.active[:, agent]
         model_size = model.length, model.width, model.height
         if trace.models[agent] not in ACTOR_BODIES:
-            cast.add(("", "", model_size, (cast.meshes.add(plain_body(model_size)),)), track, active=active)
+            population.add(("", "", model_size, (population.meshes.add(plain_body(model_size)),)), track, active=active)
             continue
         kind, styles = ACTOR_BODIES[trace.models[agent]]
         style = styles[int(rng.integers(len(styles)))]
         if kind == "bus" and rng.random() < 0.45:
-            _tractor(cast, track, active, rng)
+            _tractor(population, track, active, rng)
             continue
         if kind == "truck" and rng.random() < 0.3:
             kind, style = "construction", draw_style("construction", generator=rng)
@@ -341,13 +344,13 @@ def _agents(cast: SceneObjects, trace: EpisodeTrace) -> None:
         # A body must not exceed the footprint that the world uses for contacts.
         size = (min(drawn_size[0], model_size[0]), min(drawn_size[1], model_size[1]), drawn_size[2])
         phases = PHASES if kind in ("pedestrian", "bicycle") else 1
-        cast.add(cast.make(kind, style, size, phases=phases), track, active=active)
+        population.add(population.make(kind, style, size, phases=phases), track, active=active)
 
 
-def _tractor(cast: SceneObjects, track: F64, active: Bool, own: np.random.Generator) -> None:
+def _tractor(population: SceneObjects, track: F64, active: Bool, random_draws: np.random.Generator) -> None:
     """A tractor on the front half of the agent, a trailer that follows its hitch."""
-    height = float(own.uniform(3.2, 3.8))
-    sizes: tuple[Size, Size] = ((5.6, 2.5, height), (7.4, 2.5, float(own.uniform(3.3, 3.9))))
+    height = float(random_draws.uniform(3.2, 3.8))
+    sizes: tuple[Size, Size] = ((5.6, 2.5, height), (7.4, 2.5, float(random_draws.uniform(3.3, 3.9))))
     tractor_track = track.copy()
     tractor_track[:, 0] += 2.3 * np.cos(track[:, 2])
     tractor_track[:, 1] += 2.3 * np.sin(track[:, 2])
@@ -363,20 +366,25 @@ def _tractor(cast: SceneObjects, track: F64, active: Bool, own: np.random.Genera
             hitch_track[step, 1] - 3.1 * np.sin(trailer_yaw),
             trailer_yaw,
         )
-    style = ("box", "tank", "flatbed")[int(own.integers(3))]
-    cast.add(cast.make("truck", "tractor", sizes[0]), tractor_track, active=active)
-    cast.add(cast.make("trailer", style, sizes[1]), trailer_track, active=active)
+    style = ("box", "tank", "flatbed")[int(random_draws.integers(3))]
+    population.add(population.make("truck", "tractor", sizes[0]), tractor_track, active=active)
+    population.add(population.make("trailer", style, sizes[1]), trailer_track, active=active)
 
 
-def _still(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
+def _fixed_track(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
     return np.array([[x, y, yaw, z]])
 
 
 def _kerb(  # noqa: PLR0917
-    cast: SceneObjects, graph: LaneGraph, street: Street, way: F64, clear: Clear, shares: Mapping[str, float]
+    population: SceneObjects,
+    graph: LaneGraph,
+    street: Street,
+    route_points: F64,
+    clear: GroundOccupancy,
+    shares: Mapping[str, float],
 ) -> None:
     """Vehicles parked at the kerb and on parking places; building sites of cones and barriers round machines."""
-    rng = generator("record kerb", *cast.key)
+    rng = generator("record kerb", *population.key)
     occupancy = float(rng.uniform(0.25, 0.75))
     kinds, weights = list(shares), np.array(list(shares.values()))
     parking_lots = [(float(x), float(y), float(yaw), 0.0) for x, y, yaw in np.asarray(street.parking, float)]
@@ -396,7 +404,10 @@ def _kerb(  # noqa: PLR0917
             distance += 6.5
     parking_spots = []
     for spot_index, place in enumerate([*parking_lots, *kerb_places]):
-        if np.hypot(way[:, 0] - place[0], way[:, 1] - place[1]).min() > 55.0 or rng.random() > occupancy:
+        if (
+            np.hypot(route_points[:, 0] - place[0], route_points[:, 1] - place[1]).min() > 55.0
+            or rng.random() > occupancy
+        ):
             continue
         body_kind = str(rng.choice(kinds, p=weights))
         is_long = PARKED[body_kind][1] > LONG
@@ -405,8 +416,8 @@ def _kerb(  # noqa: PLR0917
         )
     # Long vehicles come first: between others they would hardly find room.
     for _, spot_index, body_kind, (edge_x, edge_y, yaw, z) in sorted(parking_spots):
-        mesh_number = len(cast.meshes)
-        prop_rng = generator("record prop", *cast.key, mesh_number)
+        mesh_number = len(population.meshes)
+        prop_rng = generator("record prop", *population.key, mesh_number)
         style = "parked" if body_kind in ("motorcycle", "bicycle") else draw_style(body_kind, generator=prop_rng)
         size = draw_size(body_kind, style, generator=prop_rng)
         size = (min(size[0], PARKED[body_kind][1] - 0.9), min(size[1], 2.55), size[2])
@@ -414,74 +425,85 @@ def _kerb(  # noqa: PLR0917
         x, y = edge_x + lateral_offset * np.sin(yaw), edge_y - lateral_offset * np.cos(yaw)
         if not clear.footprint(x, y, yaw, PARKED[body_kind][1], size[1]):
             continue
-        clear.take(x, y, yaw, PARKED[body_kind][1], size[1])
+        clear.occupy(x, y, yaw, PARKED[body_kind][1], size[1])
         wrong_way_share = 0.5 if spot_index < len(parking_lots) else AGAINST.get(body_kind, 0.0)
         facing = yaw + (np.pi if prop_rng.random() < wrong_way_share else 0.0)
-        cast.add(cast.make(body_kind, style, size), _still(x, y, facing, z), parked=True)
+        population.add(population.make(body_kind, style, size), _fixed_track(x, y, facing, z), parked=True)
         if body_kind == "construction" or (body_kind == "truck" and prop_rng.random() < 0.3):
-            _site(cast, (x, y, yaw, z), size, prop_rng, clear)
+            _site(population, (x, y, yaw, z), size, prop_rng, clear)
 
 
 def _site(
-    cast: SceneObjects, at: tuple[float, float, float, float], size: Size, own: np.random.Generator, clear: Clear
+    population: SceneObjects,
+    centre: tuple[float, float, float, float],
+    size: Size,
+    random_draws: np.random.Generator,
+    occupancy: GroundOccupancy,
 ) -> None:
     """Cones or barriers along the road side of a machine, barriers across both ends, and up to two workers."""
-    x, y, yaw, z = at
+    x, y, yaw, z = centre
     cos, sin = np.cos(yaw), np.sin(yaw)
 
-    def put(kind: str, forward: float, left: float, turn: float) -> None:
-        style = draw_style(kind, generator=own)
-        drawn_size = draw_size(kind, style, generator=own)
-        world_x, world_y = x + forward * cos - left * sin, y + forward * sin + left * cos
-        cast.add(
-            cast.make(kind, style, drawn_size), _still(world_x, world_y, yaw + turn + float(own.normal(0.0, ASKEW)), z)
+    def put(kind: str, forward: float, lateral: float, turn: float) -> None:
+        style = draw_style(kind, generator=random_draws)
+        drawn_size = draw_size(kind, style, generator=random_draws)
+        world_x, world_y = x + forward * cos - lateral * sin, y + forward * sin + lateral * cos
+        population.add(
+            population.make(kind, style, drawn_size),
+            _fixed_track(world_x, world_y, yaw + turn + float(random_draws.normal(0.0, ASKEW)), z),
         )
 
-    if own.random() < 0.5:
-        for index in range(int(own.integers(3, 7))):
+    if random_draws.random() < 0.5:
+        for index in range(int(random_draws.integers(3, 7))):
             put("traffic_cone", -size[0] / 2 - 1.0 + index * (size[0] + 2.0) / 5.0, size[1] / 2 + 0.35, 0.0)
     else:
         for index in range(int((size[0] + 2.0) / 2.8) + 1):
             put("barrier", -size[0] / 2 + 0.4 + 2.8 * index, size[1] / 2 + 0.45, np.pi / 2)
     for direction in (-1, 1):
-        for index in range(int(own.integers(1, 3))):
+        for index in range(int(random_draws.integers(1, 3))):
             put("barrier", direction * (size[0] / 2 + 1.2 + 1.3 * index), 0.0, 0.0)
     for direction in (-1, 1):  # between the machine and the barriers
-        if own.random() < 0.6:
-            worker_size = draw_size("pedestrian", "worker", generator=own)
-            forward, worker_lateral = direction * (size[0] / 2 + 0.5), float(own.uniform(-0.3, 0.3)) * size[1]
+        if random_draws.random() < 0.6:
+            worker_size = draw_size("pedestrian", "worker", generator=random_draws)
+            forward, worker_lateral = direction * (size[0] / 2 + 0.5), float(random_draws.uniform(-0.3, 0.3)) * size[1]
             worker_x, worker_y = x + forward * cos - worker_lateral * sin, y + forward * sin + worker_lateral * cos
-            worker_yaw = float(own.uniform(-np.pi, np.pi))
-            cast.add(cast.make("pedestrian", "worker", worker_size), _still(worker_x, worker_y, worker_yaw, z))
-    clear.take(x, y, yaw, size[0] + 6.0, size[1])
+            worker_yaw = float(random_draws.uniform(-np.pi, np.pi))
+            population.add(
+                population.make("pedestrian", "worker", worker_size), _fixed_track(worker_x, worker_y, worker_yaw, z)
+            )
+    occupancy.occupy(x, y, yaw, size[0] + 6.0, size[1])
 
 
-def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, steps: int) -> None:
-    """What is on sidewalks.
+def _sidewalks(
+    population: SceneObjects, graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, steps: int
+) -> None:
+    """Add the bodies on sidewalks.
 
     People who walk alone or in pairs, or stand, also at corners; parked two-wheelers side by side, groups of cones,
     rows of barriers.
     """
-    rng = generator("record sidewalks", *cast.key)
+    rng = generator("record sidewalks", *population.key)
     walkers, bystanders = [], []
     # A few shared bodies: each walker needs the meshes of a whole cycle.
     for index, style in enumerate(WALKING):
         size = draw_size("pedestrian", style, generator=rng)
-        walkers.append(cast.make("pedestrian", style, size, name=("walker", index), phases=PHASES))
+        walkers.append(population.make("pedestrian", style, size, name=("walker", index), phases=PHASES))
     for style in WAITING:
-        bystanders.append(cast.make("pedestrian", style, draw_size("pedestrian", style, generator=rng)))
-    pushed = {index: _stroller(cast, walker[2], rng) for index, walker in enumerate(walkers) if walker[1] == "stroller"}
+        bystanders.append(population.make("pedestrian", style, draw_size("pedestrian", style, generator=rng)))
+    pushed = {
+        index: _stroller(population, walker[2], rng) for index, walker in enumerate(walkers) if walker[1] == "stroller"
+    }
     crowd_share = float(rng.uniform(0.15, 0.55))
 
     def stand(x: float, y: float, yaw: float) -> None:
         bystander = bystanders[int(rng.integers(len(bystanders)))]
-        if clear.footprint(x, y, 0.0, 0.6, 0.6):
-            cast.add(bystander, _still(x, y, yaw, KERB))
+        if occupancy.footprint(x, y, 0.0, 0.6, 0.6):
+            population.add(bystander, _fixed_track(x, y, yaw, KERB))
 
     for lane in np.flatnonzero(graph.kind == LaneType.SIDEWALK):
         length = float(graph.length[lane])
         x, y, yaw, width = graph.at(int(lane), max(length - 1.5, 0.0))
-        if rng.random() < crowd_share and np.hypot(way[:, 0] - x, way[:, 1] - y).min() < 45.0:
+        if rng.random() < crowd_share and np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() < 45.0:
             for index in range(int(rng.integers(1, 4))):  # at the corner, looking along the walk or across the road
                 lateral = float(rng.uniform(-0.3, 0.3)) * width
                 spot_x, spot_y = (
@@ -491,7 +513,7 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
                 stand(spot_x, spot_y, yaw + float(rng.choice([0.0, 0.5 * np.pi])) + float(rng.normal(0.0, 0.3)))
         for distance in np.arange(3.0, length - 3.0, 8.0):
             x, y, yaw, width = graph.at(int(lane), float(distance))
-            if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > 45.0:
+            if np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() > 45.0:
                 continue
             choice = rng.random()
             lateral = float(rng.uniform(-0.3, 0.3)) * width
@@ -503,14 +525,16 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
                     group.append(int(rng.integers(len(walkers))))
                 if any(WALKING[index] == "elderly" for index in group):
                     speed *= SLOW
-                make_track = partial(_walk, graph, int(lane), s0=float(distance), speed=speed, steps=steps, dt=cast.dt)
+                make_track = partial(
+                    _walk, graph, int(lane), s0=float(distance), speed=speed, steps=steps, dt=population.dt
+                )
                 for index, walker_lateral in zip(group, (lateral, lateral - 0.8 * np.sign(lateral)), strict=False):
                     track = make_track(aside=walker_lateral)
-                    cast.add(walkers[index], track)
+                    population.add(walkers[index], track)
                     if index in pushed:
-                        cast.add(
+                        population.add(
                             pushed[index],
-                            _ahead(track, GRIP[0] * walkers[index][2][0] + pushed[index][2][0] / 2 - 0.02),
+                            _track_ahead(track, GRIP[0] * walkers[index][2][0] + pushed[index][2][0] / 2 - 0.02),
                         )
             elif choice < crowd_share + 0.08:
                 stand(spot_x, spot_y, yaw + float(rng.uniform(-3, 3)))
@@ -520,8 +544,12 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
                 for index in range(int(rng.integers(2, 6))):
                     size = draw_size(kind, "parked", generator=rng)
                     row_x, row_y, _, _ = graph.at(int(lane), min(float(distance) + RACK[kind] * index, length))
-                    if size[0] < width + 0.4 and clear.footprint(row_x, row_y, parked_yaw, size[0], size[1]):
-                        cast.add(cast.make(kind, "parked", size), _still(row_x, row_y, parked_yaw, KERB), parked=True)
+                    if size[0] < width + 0.4 and occupancy.footprint(row_x, row_y, parked_yaw, size[0], size[1]):
+                        population.add(
+                            population.make(kind, "parked", size),
+                            _fixed_track(row_x, row_y, parked_yaw, KERB),
+                            parked=True,
+                        )
             elif choice < crowd_share + 0.2:
                 kind = "traffic_cone" if rng.random() < 0.5 else "barrier"
                 in_one_row = rng.random() < 0.6  # else barriers stand one behind the other, across the walk
@@ -530,24 +558,26 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
                     size = draw_size(kind, style, generator=rng)
                     row_offset = (1.6 if kind == "traffic_cone" else 2.8) * index
                     row_x, row_y, object_yaw, _ = graph.at(int(lane), min(float(distance) + row_offset, length))
-                    if clear.footprint(row_x, row_y, 0.0, 0.5, 0.5):
+                    if occupancy.footprint(row_x, row_y, 0.0, 0.5, 0.5):
                         object_yaw += (np.pi / 2 if kind == "barrier" and in_one_row else 0.0) + float(
                             rng.normal(0.0, ASKEW)
                         )
-                        cast.add(cast.make(kind, style, size), _still(row_x, row_y, object_yaw, KERB))
+                        population.add(population.make(kind, style, size), _fixed_track(row_x, row_y, object_yaw, KERB))
 
 
-def _stroller(cast: SceneObjects, walker: Size, draws: np.random.Generator) -> tuple[str, str, Size, tuple[int, ...]]:
+def _stroller(
+    population: SceneObjects, walker: Size, draws: np.random.Generator
+) -> tuple[str, str, Size, tuple[int, ...]]:
     """A stroller whose handle is where the hands of a walker of a size (m) are.
 
     nuScenes does not count it to the walker, and the detection task leaves it out.
     """
     style = draw_style("stroller", generator=draws)
     length, width, _ = draw_size("stroller", style, generator=draws)
-    return cast.make("stroller", style, (length, width, GRIP[1] * walker[2] + 0.03))
+    return population.make("stroller", style, (length, width, GRIP[1] * walker[2] + 0.03))
 
 
-def _ahead(track: F64, distance: float) -> F64:
+def _track_ahead(track: F64, distance: float) -> F64:
     """Return the track [T, 4] of a point at a distance (m) ahead of a track."""
     shifted_track = track.copy()
     shifted_track[:, 0] += distance * np.cos(track[:, 2])
@@ -555,20 +585,22 @@ def _ahead(track: F64, distance: float) -> F64:
     return shifted_track
 
 
-def take_still(cast: SceneObjects, clear: Clear) -> None:
-    """Takes the ground of all that stands still."""
-    for body in cast.bodies:
+def occupy_standing(population: SceneObjects, occupancy: GroundOccupancy) -> None:
+    """Mark the ground under all standing bodies as occupied."""
+    for body in population.bodies:
         if len(body.track) == 1:
             x, y, yaw, _ = body.track[0].tolist()
-            clear.take(x, y, yaw, *body.size[:2])
+            occupancy.occupy(x, y, yaw, *body.size[:2])
 
 
-def _signs(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, *, many: bool) -> None:
+def _signs(
+    population: SceneObjects, graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, *, many: bool
+) -> None:
     """Stop and yield signs: the plate is the body with a kind, the post one without."""
-    take_still(cast, clear)
-    for sign in street_signs(graph, way, clear, key=cast.key, many=many, detail=cast.detail):
+    occupy_standing(population, occupancy)
+    for sign in street_signs(graph, route_points, occupancy, key=population.key, many=many, detail=population.detail):
         for kind, mesh in ((sign.kind, sign.plate), ("", sign.post)):
-            cast.add((kind, sign.style, sign.size, (cast.meshes.add(mesh),)), _still(*sign.pose))
+            population.add((kind, sign.style, sign.size, (population.meshes.add(mesh),)), _fixed_track(*sign.pose))
 
 
 def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float) -> F64:

@@ -9,8 +9,8 @@ from typing import Any, Self
 from ssad.core.driving import CommandChange, LoopChanges, ReadingChange, Sensor, StateChange
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.rendering.agent_edit import LiveAttack
-from ssad.rendering.camera.render import Weather
+from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.lidar import Lidar
 from ssad.rendering.onboard import DAY, Onboard
 from ssad.rendering.radar import OnboardRadar
@@ -43,8 +43,8 @@ class SensorSuite:
     lidars: Mapping[str, Lidar] = field(default_factory=dict)
     radars: Mapping[str, Lidar] = field(default_factory=dict)
     device: str = "cpu"
-    weather: Weather = DAY
-    agent_edit: LiveAttack | None = None
+    weather: SceneWeather = DAY
+    agent_edit: AgentEdit | None = None
     camera_sensors: Mapping[str, CameraSensor] = field(default_factory=dict)
     changes: LoopChanges = field(default_factory=LoopChanges)
     other_images: Callable[[Camera, int], Any] | None = None
@@ -55,7 +55,7 @@ class SensorSuite:
         by_modality = {"camera": self.cameras, "lidar": self.lidars, "radar": self.radars}
         return {name: modality for modality, sensors in by_modality.items() for name in sensors}
 
-    def with_agent_edit(self, edit: LiveAttack) -> Self:
+    def with_agent_edit(self, edit: AgentEdit) -> Self:
         """Return the suite with an edit of an agent or of the stop signs.
 
         Raises:

@@ -15,7 +15,7 @@ from ssad.rendering.bodies import draw_size, draw_style, make_body
 from ssad.rendering.meshes.mesh import Mesh, Point, part_of
 
 if TYPE_CHECKING:
-    from ssad.rendering.scene_objects import Clear
+    from ssad.rendering.scene_objects import GroundOccupancy
 
 KINDS: Final = {SignKind.STOP: "stop_sign", SignKind.YIELD: "yield_sign"}
 KERB: Final = 0.12  # m, height of sidewalks
@@ -49,14 +49,14 @@ class StreetSign:
 
 
 def street_signs(
-    graph: LaneGraph, way: F64, clear: Clear, *, key: tuple[object, ...], many: bool, detail: int
+    graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, *, key: tuple[object, ...], many: bool, detail: int
 ) -> Iterator[StreetSign]:
     """The signs near a way.
 
     Args:
         graph: The town. Its signs stand where the map has them, or beside that where something else stands there.
-        way: Places [N, 2] that the ego comes by.
-        clear: What stands already; each sign takes its ground.
+        route_points: Places [N, 2] that the ego comes by.
+        occupancy: What stands already; each sign takes its ground.
         key: Of what is drawn.
         many: Whether further signs stand along the kerbs, as at crosswalks and driveways.
         detail: Of the meshes, see `make_body`.
@@ -64,12 +64,12 @@ def street_signs(
     Yields:
         One sign after another.
     """
-    map_signs = list(_of_the_map(graph))
-    candidates = [*map_signs, *(_along_kerbs(graph, way, key) if many else ())]
+    map_signs = list(_map_signs(graph))
+    candidates = [*map_signs, *(_along_kerbs(graph, route_points, key) if many else ())]
     for index, (kind, x, y, yaw, z) in enumerate(candidates):
-        if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > REACH:
+        if np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() > REACH:
             continue
-        spot = _free(x, y, yaw, clear)
+        spot = _free_place(x, y, yaw, occupancy)
         if spot is None:
             continue
         # A generator per place: a sign that has no room changes none of the others.
@@ -84,11 +84,11 @@ def street_signs(
 
 
 def free_places(
-    graph: LaneGraph, way: F64, clear: Clear, *, key: tuple[object, ...]
+    graph: LaneGraph, route_points: F64, occupancy: GroundOccupancy, *, key: tuple[object, ...]
 ) -> Iterator[tuple[float, float, float, float]]:
     """x, y, yaw (of the way it faces) and z of places along the kerbs near a way where one more sign could stand."""
-    for _, x, y, yaw, z in _along_kerbs(graph, way, key):
-        spot = _free(x, y, yaw, clear)
+    for _, x, y, yaw, z in _along_kerbs(graph, route_points, key):
+        spot = _free_place(x, y, yaw, occupancy)
         if spot is not None:
             yield (*spot, yaw + np.pi, z)
 
@@ -99,7 +99,7 @@ def plate_and_post(mesh: Mesh) -> tuple[Mesh, Mesh]:
     return part_of(mesh, plate), part_of(mesh, ~plate)
 
 
-def _of_the_map(graph: LaneGraph) -> Iterator[tuple[str, float, float, float, float]]:
+def _map_signs(graph: LaneGraph) -> Iterator[tuple[str, float, float, float, float]]:
     """Yield kind, x, y, yaw of the traffic and height of the ground of each sign of the map."""
     # Reversed, so that the first lane of a sign with several rules wins.
     lane_of = dict(zip(graph.rule_sign.tolist()[::-1], graph.rule_lane.tolist()[::-1], strict=True))
@@ -116,9 +116,9 @@ def _sidewalk(graph: LaneGraph, lane: int) -> bool:
 
 
 def _along_kerbs(
-    graph: LaneGraph, way: F64, key: tuple[object, ...]
+    graph: LaneGraph, route_points: F64, key: tuple[object, ...]
 ) -> Iterator[tuple[str, float, float, float, float]]:
-    """As `_of_the_map`, of signs along the streets near the way, on the right of the traffic."""
+    """As `_map_signs`, of signs along the streets near the way, on the right of the traffic."""
     rng = generator("record signs", *key)
     for lane in np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)).tolist():
         right_lane = int(graph.right[lane])
@@ -129,7 +129,7 @@ def _along_kerbs(
             has_sign, kind = rng.random() < SHARE, "yield_sign" if rng.random() < YIELDS else "stop_sign"
             kerb_offset = float(rng.uniform(0.55, 1.1))
             x, y, yaw, width = graph.at(lane, distance)
-            if not has_sign or np.hypot(way[:, 0] - x, way[:, 1] - y).min() > REACH:
+            if not has_sign or np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() > REACH:
                 continue
             shoulder_width = (
                 graph.at(right_lane, distance)[3]
@@ -141,13 +141,13 @@ def _along_kerbs(
             yield kind, x + lateral_offset * float(np.sin(yaw)), y - lateral_offset * float(np.cos(yaw)), yaw, z
 
 
-def _free(x: float, y: float, yaw: float, clear: Clear) -> tuple[float, float] | None:
+def _free_place(x: float, y: float, yaw: float, occupancy: GroundOccupancy) -> tuple[float, float] | None:
     """The place, or the first one near it, before it and further from the road, where nothing stands; taken now."""
     for outward in (0.0, 0.3, 0.6):
         for backward in (0.0, 0.6, 1.2):
             spot_x = x + outward * float(np.sin(yaw)) - backward * float(np.cos(yaw))
             spot_y = y - outward * float(np.cos(yaw)) - backward * float(np.sin(yaw))
-            if clear.footprint(spot_x, spot_y, yaw, ROOM, ROOM):
-                clear.take(spot_x, spot_y, yaw, ROOM, ROOM)
+            if occupancy.footprint(spot_x, spot_y, yaw, ROOM, ROOM):
+                occupancy.occupy(spot_x, spot_y, yaw, ROOM, ROOM)
                 return spot_x, spot_y
     return None

@@ -50,7 +50,7 @@ class TargetCar:
 
 
 @dataclass(frozen=True, slots=True)
-class _Standing:
+class _StandingTarget:
     """Target other than a car, with the same mesh in every recording.
 
     Attributes:
@@ -88,7 +88,7 @@ class _Standing:
 
 
 @dataclass(frozen=True, slots=True)
-class TargetSign(_Standing):
+class TargetSign(_StandingTarget):
     """Stop sign with the same mesh in every recording."""
 
     style: str = "standard"
@@ -96,7 +96,7 @@ class TargetSign(_Standing):
 
 
 @dataclass(frozen=True, slots=True)
-class TargetWalker(_Standing):
+class TargetWalker(_StandingTarget):
     """Person on foot with the same mesh in every recording; the shirt is the panels torso_front and torso_back."""
 
     style: str = "standing"

@@ -12,14 +12,14 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.rendering.camera.render import View, render
-from ssad.rendering.episode_scene import moments_of
+from ssad.rendering.episode_scene import agent_poses
 from ssad.rendering.onboard import DAY, Onboard
 
 
-def above(pose: F64, height: float, width: int, tall: int) -> tuple[Camera, F64]:
+def above(pose: F64, height: float, width: int, image_height: int) -> tuple[Camera, F64]:
     """A camera over a place, looking straight down, the driving direction up."""
-    focal = 1.2 * tall
-    camera = Camera(width, tall, np.array([[focal, 0, width / 2], [0, focal, tall / 2], [0, 0, 1]]))
+    focal = 1.2 * image_height
+    camera = Camera(width, image_height, np.array([[focal, 0, width / 2], [0, focal, image_height / 2], [0, 0, 1]]))
     downward = np.eye(4)
     downward[:3, :3] = np.array([[0, -1, 0], [-1, 0, 0], [0, 0, -1]], float)
     # 8 m ahead of the ego: the road in front matters more than the road behind.
@@ -46,14 +46,14 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
     onboard = Onboard()
     steps = moments(trace)
     front_images = onboard.camera(camera_model).of_trace(trace, graph, steps=steps)
-    town, all_moments = onboard.town(graph), moments_of(trace)
-    appearance = town.looks_of_trace(trace)
+    town, all_moments = onboard.town(graph), agent_poses(trace)
+    appearance = town.appearance_of_trace(trace)
     rows = []
     for step, front_image in zip(steps, front_images, strict=True):
         pose = upright_pose(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
         overhead_camera, overhead_pose = above(pose, 42.0, camera_model.width, camera_model.height)
         scene_objects = (
-            *town.things(appearance, all_moments[step]),
+            *town.objects(appearance, all_moments[step]),
             *town.lights(appearance, all_moments[step], pose[:2, 3]),
         )
         top_image = render(town.scene, [View(overhead_camera, overhead_pose, scene_objects, DAY)]).image[0]

@@ -31,7 +31,7 @@ HIGHWAY = "highway-env"  # as a set of scenarios
 HIGHWAY_TYPE = "ssad.simulators.highway_env:SCENARIO"
 
 
-class Order(Protocol):
+class EpisodeRequest(Protocol):
     """Request to drive one episode, as plain data."""
 
     @property
@@ -62,7 +62,7 @@ def load_world(device: str) -> None:
 
 
 @lru_cache(maxsize=8)
-def town(name: str) -> LaneGraph:
+def cached_town(name: str) -> LaneGraph:
     """Return a town, read once per process."""
     from ssad.simulators.highway_env import PLACES, highway_town
     from ssad.world.roads import load_town
@@ -117,24 +117,24 @@ def type_version(name: str) -> str:
     return f"{source_hash} {version('highway-env')}" if name == HIGHWAY_TYPE else source_hash
 
 
-def in_highway(order: Order) -> bool:
-    """Whether highway-env runs an episode, and not the embedded world."""
+def runs_in_highway_env(order: EpisodeRequest) -> bool:
+    """Return True if highway-env runs an episode, and not the embedded world."""
     return bool(order.spec["scenario"]["type"] == HIGHWAY_TYPE)
 
 
-def embedded(order: Order) -> bool:
-    """Whether SSAD's own world runs an episode."""
-    return not in_highway(order) and "simulator" not in order.spec
+def runs_embedded(order: EpisodeRequest) -> bool:
+    """Return True if SSAD's own world runs an episode."""
+    return not runs_in_highway_env(order) and "simulator" not in order.spec
 
 
 def town_version(graph: LaneGraph) -> str:
     """12 hex digits over every array of a lane graph."""
-    total = hashlib.sha256()
+    array_hash = hashlib.sha256()
     for name, value in sorted(vars(graph).items()):
         if hasattr(value, "tobytes"):
             # Type and shape are hashed too: equal bytes can hold different arrays.
-            total.update(f"{name}{value.dtype.str}{value.shape}".encode() + value.tobytes())
-    return total.hexdigest()[:12]
+            array_hash.update(f"{name}{value.dtype.str}{value.shape}".encode() + value.tobytes())
+    return array_hash.hexdigest()[:12]
 
 
 def scenario_json(scenario: Scenario) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def scenario_json(scenario: Scenario) -> dict[str, Any]:
     return plain
 
 
-def episode_of(order: Order) -> Episode:
+def episode_of(order: EpisodeRequest) -> Episode:
     """The concrete episode of an order.
 
     Raises:
@@ -155,22 +155,22 @@ def episode_of(order: Order) -> Episode:
     from ssad.simulators.highway_env import highway_episode
 
     scenario = scenario_from(order.spec["scenario"])
-    if in_highway(order):
+    if runs_in_highway_env(order):
         seed = order.seed if order.spec["repetition"] else scenario.seed
         return replace(highway_episode(scenario, seed), key=order.key)
     return replace(
-        build_episode(scenario, town(scenario.town), seed=order.seed, spread=order.spec["spread"]), key=order.key
+        build_episode(scenario, cached_town(scenario.town), seed=order.seed, spread=order.spec["spread"]), key=order.key
     )
 
 
 def drive(
-    orders: Sequence[Order],
+    orders: Sequence[EpisodeRequest],
     *,
     device: str,
     driver: Driver | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     perturbation: LoopChanges | Mapping[str, ReadingChange] | None = None,
-    key: Callable[[Order], str] = attrgetter("key"),
+    key: Callable[[EpisodeRequest], str] = attrgetter("key"),
 ) -> tuple[list[Episode], list[EpisodeTrace], Mapping[str, Any]]:
     """Episodes and traces of orders that share a system and a simulator, run as one batch.
 
@@ -192,7 +192,7 @@ def drive(
 
     # Runs that are to be compared can share the noise of their sensors through this key.
     episodes = [replace(episode_of(request), key=key(request)) for request in orders]
-    graphs = {episode.town: town(episode.town) for episode in episodes}
+    graphs = {episode.town: cached_town(episode.town) for episode in episodes}
     system = driver or system_of(orders[0].system)
     policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
     for agent_driver in (system, *policies.values()):
@@ -201,17 +201,25 @@ def drive(
     server_spec = orders[0].spec.get("simulator")
     simulator: Simulator
     if server_spec:
-        from ssad.simulators.carla.sensors import Own, eyes_of
+        from ssad.simulators.carla.sensors import CarlaSensor, sensor_blueprints
         from ssad.simulators.carla.server import Server
         from ssad.simulators.carla.simulator import Carla
 
         server = Server.of(server_spec)
-        carla_cameras = eyes_of(asked_sensors([system]), STEP) if server.sensors == "carla" and sensors is None else {}
-        simulator = Carla(episodes, graphs, server=server, eyes=carla_cameras)
+        carla_cameras = (
+            sensor_blueprints(requested_sensors([system]), STEP)
+            if server.sensors == "carla" and sensors is None
+            else {}
+        )
+        simulator = Carla(episodes, graphs, server=server, blueprints=carla_cameras)
         if carla_cameras:
-            sensors = onboard_sensors(list(policies.values()), device) | {name: Own(name) for name in carla_cameras}
+            sensors = onboard_sensors(list(policies.values()), device) | {
+                name: CarlaSensor(name) for name in carla_cameras
+            }
     else:
-        simulator = HighwayEnv(episodes, graphs) if in_highway(orders[0]) else World(episodes, graphs, device=device)
+        simulator = (
+            HighwayEnv(episodes, graphs) if runs_in_highway_env(orders[0]) else World(episodes, graphs, device=device)
+        )
     if sensors is None:
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
@@ -227,7 +235,7 @@ def drive(
     )
 
 
-def asked_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
+def requested_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
     """Return the sensors that drivers name in `sensors`, by name.
 
     Returns:
@@ -258,7 +266,7 @@ def asked_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Li
 
 def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
     """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own sensors."""
-    required = asked_sensors(drivers)
+    required = requested_sensors(drivers)
     if not required:
         return {}
     from ssad.rendering.onboard import Onboard
@@ -291,5 +299,5 @@ def grades_of(drives: Sequence[tuple[Episode, EpisodeTrace]], device: str) -> li
         for name in dict.fromkeys(policy_name for episode, _ in drives for policy_name in policies_of(episode.scenario))
     ]
     sensors = onboard_sensors(policies, device)
-    graded_drives = [(episode, town(episode.town), trace) for episode, trace in drives]
+    graded_drives = [(episode, cached_town(episode.town), trace) for episode, trace in drives]
     return grade_collisions(graded_drives, device=device, policies=make_system, sensors=sensors)

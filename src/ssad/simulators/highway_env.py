@@ -50,7 +50,7 @@ CAR = Model("car", AgentKind.CAR, 5.0, 2.0, 1.5, 5.0, MAX_STEER, MAX_ACCELERATIO
 
 
 @dataclass(frozen=True)
-class Place:
+class HighwayEnvironment:
     """One of highway-env's environments.
 
     Attributes:
@@ -68,9 +68,9 @@ class Place:
     spawn_every: int = 0
 
 
-PLACES: dict[str, Place] = {
-    "HighwayIntersection": Place("intersection-v2", ("o0", "ir0", "il1", "o1"), 9.0, 20.0, spawn_every=10),
-    "HighwayStraight": Place("highway-fast-v0", (), 25.0, 20.0),
+PLACES: dict[str, HighwayEnvironment] = {
+    "HighwayIntersection": HighwayEnvironment("intersection-v2", ("o0", "ir0", "il1", "o1"), 9.0, 20.0, spawn_every=10),
+    "HighwayStraight": HighwayEnvironment("highway-fast-v0", (), 25.0, 20.0),
 }
 """Town of a scenario -> what runs there."""
 
@@ -91,7 +91,7 @@ def highway_scenarios(count: int = 4) -> tuple[Scenario, ...]:
     return tuple(scenarios)
 
 
-def _gymnasium(place: Place, seed: int) -> Any:
+def _make_environment(place: HighwayEnvironment, seed: int) -> Any:
     """Return a running environment of highway-env. ConfigError if it is not installed."""
     try:
         import gymnasium
@@ -122,17 +122,17 @@ def _lane_points(lane: Any) -> tuple[F32, F32, F32]:
     """Return points [n, 2], headings and arc lengths of a lane of highway-env."""
     length = min(float(lane.length), LONGEST_LANE)
     step = 5.0 if type(lane).__name__ == "StraightLane" else 0.5
-    s = np.linspace(0.0, length, max(int(np.ceil(length / step)) + 1, 2))
-    xy = np.array([lane.position(distance, 0.0) for distance in s]) * [1.0, -1.0]
-    yaw = -np.array([lane.heading_at(distance) for distance in s])
+    arc_lengths = np.linspace(0.0, length, max(int(np.ceil(length / step)) + 1, 2))
+    points = np.array([lane.position(distance, 0.0) for distance in arc_lengths]) * [1.0, -1.0]
+    yaw = -np.array([lane.heading_at(distance) for distance in arc_lengths])
     yaw = np.angle(np.exp(1j * yaw))
-    return xy.astype(np.float32), yaw.astype(np.float32), s.astype(np.float32)
+    return points.astype(np.float32), yaw.astype(np.float32), arc_lengths.astype(np.float32)
 
 
 @lru_cache(maxsize=4)
 def highway_town(name: str) -> LaneGraph:
     """Return the lane graph of one of highway-env's places."""
-    graph = _gymnasium(PLACES[name], 0).road.network.graph
+    graph = _make_environment(PLACES[name], 0).road.network.graph
     edges = [(start_node, end_node) for start_node in graph for end_node in graph[start_node]]
     lane_keys = {
         (start_node, end_node, lane_index): None
@@ -192,9 +192,9 @@ def highway_town(name: str) -> LaneGraph:
     )
 
 
-def _ego_route(env: Any, place: Place) -> Route:
+def _ego_route(environment: Any, place: HighwayEnvironment) -> Route:
     """A point a metre, from the ego along its lanes: to the end, or as far as it comes at its target speed."""
-    network, ego = env.road.network, env.vehicle
+    network, ego = environment.road.network, environment.vehicle
     node_pairs = list(zip(place.route, place.route[1:], strict=False)) or [ego.lane_index[:2]]
     lane_keys = [(*key, ego.lane_index[2] if not place.route else 0) for key in node_pairs]
     numbers = {key: key_index for key_index, key in enumerate(network.lanes_dict())}
@@ -212,12 +212,12 @@ def _ego_route(env: Any, place: Place) -> Route:
     arc_lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(table[:, :2], axis=0).T))])
     point_distances = np.arange(0.0, arc_lengths[-1])
     nearest = np.searchsorted(arc_lengths, point_distances)
-    xy = np.stack(
+    points = np.stack(
         [np.interp(point_distances, arc_lengths, table[:, 0]), -np.interp(point_distances, arc_lengths, table[:, 1])], 1
     )
     yaw = np.angle(np.exp(-1j * table[nearest, 2]))
     return Route(
-        xy=xy.astype(np.float32),
+        xy=points.astype(np.float32),
         yaw=yaw.astype(np.float32),
         lane=table[nearest, 3].astype(np.int32),
         speed_limit=table[nearest, 4].astype(np.float32),
@@ -234,7 +234,7 @@ def highway_episode(scenario: Scenario, seed: int | None = None) -> Episode:
     """
     place = PLACES[scenario.town]
     seed = scenario.seed if seed is None else seed
-    environment = _gymnasium(place, seed)
+    environment = _make_environment(place, seed)
     x, y, yaw = _pose(environment.vehicle)
     ego = EpisodeAgent(
         "ego",
@@ -245,10 +245,10 @@ def highway_episode(scenario: Scenario, seed: int | None = None) -> Episode:
         place.target_speed,
         route=_ego_route(environment, place),
     )
-    others = [vehicle for vehicle in environment.road.vehicles if vehicle is not environment.vehicle]
+    traffic_vehicles = [vehicle for vehicle in environment.road.vehicles if vehicle is not environment.vehicle]
     agents = [
         EpisodeAgent(f"vehicle {number}", "car", Controller.PLACED, Pose(*_pose(vehicle)), float(vehicle.speed))
-        for number, vehicle in enumerate(others, 1)
+        for number, vehicle in enumerate(traffic_vehicles, 1)
     ]
     spare_count = SPARE if place.spawn_every else 0
     spare_agents = [
@@ -259,7 +259,9 @@ def highway_episode(scenario: Scenario, seed: int | None = None) -> Episode:
     )
 
 
-def _traffic(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
+def _traffic(
+    scenario: Scenario, graph: LaneGraph, route: Route, random_generator: np.random.Generator
+) -> list[EpisodeAgent]:
     """Return the agents after the ego; highway-env draws them by the scenario's seed."""
     return list(highway_episode(scenario).agents[1:])
 
@@ -280,7 +282,7 @@ class HighwayEnv(Mirrored):
         self.episodes, self.graphs = self.mirror.episodes, self.mirror.graphs
         self._environments: list[Any] = [None] * self.batch
         self._slots: list[list[Any]] = [[] for _ in range(self.batch)]
-        self._habits: list[dict[str, float]] = [{} for _ in range(self.batch)]
+        self._class_defaults: list[dict[str, float]] = [{} for _ in range(self.batch)]
         self._controls = np.zeros((self.batch, self.agents, 4), np.float32)
         self.reset()
 
@@ -297,11 +299,15 @@ class HighwayEnv(Mirrored):
         absent = np.zeros((self.batch, self.agents), bool)
         for scene_index in range(self.batch) if scenes is None else np.asarray(scenes).tolist():
             episode = self.episodes[self.assigned[scene_index]]
-            environment = _gymnasium(PLACES[episode.town], episode.seed)
-            others = [vehicle for vehicle in environment.road.vehicles if vehicle is not environment.vehicle]
+            environment = _make_environment(PLACES[episode.town], episode.seed)
+            traffic_vehicles = [vehicle for vehicle in environment.road.vehicles if vehicle is not environment.vehicle]
             self._environments[scene_index] = environment
-            self._slots[scene_index] = [environment.vehicle, *others, *[None] * (self.agents - 1 - len(others))]
-            self._habits[scene_index] = {name: getattr(IDMVehicle, name) for name in _DEFAULTS}
+            self._slots[scene_index] = [
+                environment.vehicle,
+                *traffic_vehicles,
+                *[None] * (self.agents - 1 - len(traffic_vehicles)),
+            ]
+            self._class_defaults[scene_index] = {name: getattr(IDMVehicle, name) for name in _DEFAULTS}
             absent[scene_index] = [vehicle is None for vehicle in self._slots[scene_index]]
             self._controls[scene_index] = 0.0
         self.mirror.remove(absent)
@@ -318,7 +324,7 @@ class HighwayEnv(Mirrored):
         placements = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
         active = world.array("active").copy()
         for scene_index in np.flatnonzero(world.ended() == 0).tolist():
-            self._advance(scene_index, controllers[scene_index], control[scene_index])
+            self._advance_scene(scene_index, controllers[scene_index], control[scene_index])
             for agent_index, vehicle in enumerate(self._slots[scene_index]):
                 active[scene_index, agent_index] = Presence.ABSENT if vehicle is None else Presence.AWAKE
                 if vehicle is not None:
@@ -331,13 +337,13 @@ class HighwayEnv(Mirrored):
         world.advance()
         world.put("controller", controllers)
 
-    def _advance(self, b: int, controller: I32, control: F32) -> None:
+    def _advance_scene(self, scene_index: int, controller: I32, control: F32) -> None:
         """Let highway-env move a scene by a step."""
         from highway_env.vehicle.behavior import IDMVehicle
 
-        environment, slots = self._environments[b], self._slots[b]
+        environment, slots = self._environments[scene_index], self._slots[scene_index]
         # These are class attributes, shared by all environments of the process: set this scene's before it moves.
-        for name, value in self._habits[b].items():
+        for name, value in self._class_defaults[scene_index].items():
             setattr(IDMVehicle, name, value)
         controlled = [
             agent_index
@@ -353,8 +359,8 @@ class HighwayEnv(Mirrored):
                 if slots[agent_index].speed < 0.0 and control[agent_index, 3] <= 0.5:
                     slots[agent_index].speed = 0.0
         environment.time += self.dt
-        place = PLACES[self.episodes[self.assigned[b]].town]
-        step = int(self.mirror.array("step")[b]) + 1
+        place = PLACES[self.episodes[self.assigned[scene_index]].town]
+        step = int(self.mirror.array("step")[scene_index]) + 1
         if place.spawn_every and step % place.spawn_every == 0:
             environment._clear_vehicles()
             environment._spawn_vehicle(spawn_probability=environment.config["spawn_probability"])

@@ -8,11 +8,11 @@ import numpy.typing as npt
 from ssad.core.driving import WorldState
 from ssad.core.geometry import obb_distance, to_local
 from ssad.core.types import F64, I32, Bool
-from ssad.drivers.careful.driver import EASY, PULL, bend_speed, bends, comes, in_the_way
+from ssad.drivers.careful.driver import EASY, PULL, bend_speed, is_coming, is_in_the_way, squared_bend_speeds
 from ssad.drivers.careful.encounter import Encounter
-from ssad.drivers.careful.grade import AFTER, EARLIEST, HORIZON, conflict_begins
-from ssad.drivers.careful.models import CarefulModel, calm, careful_model, react
-from ssad.drivers.careful.sight import BEHIND, Path, meet
+from ssad.drivers.careful.grade import AFTER, EARLIEST, HORIZON, conflict_start
+from ssad.drivers.careful.models import CarefulModel, careful_model, initial_reaction, react
+from ssad.drivers.careful.sight import BEHIND, Path, encounters_on_paths
 from ssad.metrics.criticality import time_to_collision
 from ssad.scenarios.dynamic.frozen import braked
 
@@ -83,17 +83,17 @@ class Hindsight:
         other_size = np.broadcast_to(state.size[scene, agent][:, None].astype(np.float64), (*yaw.shape, 2))
         ego_size = state.size[scene, 0].astype(np.float64)
         speed = np.maximum(start[:, 3], 0.0)
-        encounter = meet(
+        encounter = encounters_on_paths(
             path,
-            half=0.5 * ego_size,
-            place=place,
+            half_extent=0.5 * ego_size,
+            places=place,
             yaw=yaw,
             speed=other[..., 3],
             size=other_size,
             own_speed=speed,
             own_accel=speed * 0.0,
         )
-        driven = self._drive(path, bends(route), encounter, 0.5 * ego_size[:, 0])
+        driven = self._drive(path, squared_bend_speeds(route), encounter, 0.5 * ego_size[:, 0])
         ego = np.concatenate([driven, np.broadcast_to(ego_size[:, None], (*yaw.shape, 2))], -1)
         distance = obb_distance(ego, np.concatenate([place, yaw[..., None], other_size], -1))
         return np.asarray(((distance > 0.0) | (rows > last_row + round(AFTER / self.dt))).all(1))
@@ -106,7 +106,7 @@ class Hindsight:
         boxes = np.concatenate([motion[..., :3], size], -1)
         velocity = motion[..., 3:] * np.stack([np.cos(motion[..., 2]), np.sin(motion[..., 2])], -1)
         on_course = time_to_collision(boxes[:, 0], boxes[:, 1], velocity[:, 0] - velocity[:, 1]) <= HORIZON
-        return first_row + conflict_begins(on_course)
+        return first_row + conflict_start(on_course)
 
     def _drive(self, path: Path, allowed: F64, met: Encounter, half: F64) -> F64:
         """Poses of the careful driver [N, T, 3]: it starts at the origin and keeps to its path.
@@ -120,7 +120,7 @@ class Hindsight:
         v, bend = met.speed[:, 0], np.arange(allowed.shape[1]) - 1.0  # a driver sees its route from a metre ahead on
         keeps = np.maximum(v, 1.0)
         here, left, _ = (part[:, 0] for part in path.project(np.zeros((len(v), 1, 2))))
-        x, accel, memory, poses = np.zeros(len(v)), np.zeros(len(v)), calm(v.shape), []
+        x, accel, memory, poses = np.zeros(len(v)), np.zeros(len(v)), initial_reaction(v.shape), []
         for t in range(met.gap.shape[1]):
             aside = left * np.maximum(1.0 - x / 10.0, 0.0)
             poses.append(np.concatenate([path.at(here + x, aside), path.heading(here + x)[:, None]], 1))
@@ -129,8 +129,8 @@ class Hindsight:
             asked, memory = react(self.model, e, memory, self.dt)
             slow = bend_speed(allowed, bend - (here - BEHIND + x)[:, None])
             push = np.clip(2.0 * (np.minimum(keeps, slow) - v), -2.0 * EASY, PULL)
-            push = np.where(comes(e), np.minimum(push, 0.0), push)
-            asked = np.where(in_the_way(e, half) & (v < 1.5), np.maximum(asked, 2.0 * EASY), asked)
+            push = np.where(is_coming(e), np.minimum(push, 0.0), push)
+            asked = np.where(is_in_the_way(e, half) & (v < 1.5), np.maximum(asked, 2.0 * EASY), asked)
             after = np.maximum(v + np.where(asked > 0.0, np.minimum(push, -asked), push) * self.dt, 0.0)
             x, accel, v = x + 0.5 * (v + after) * self.dt, (after - v) / self.dt, after
         return np.stack(poses, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.drivers.careful.cut_in import CHUNK, CutIns, crashes, grid, slower
+from ssad.drivers.careful.cut_in import CHUNK, CutIns, crashes, cut_in_grid, speed_pairs
 from ssad.drivers.careful.models import FSM, MODELS, RSS, CarefulHuman, Reg157
 
 
@@ -14,12 +14,12 @@ def one(speed: float, lead: float, gap: float, approach: float) -> CutIns:
 
 
 def test_the_low_grid_has_the_published_number_of_cases() -> None:
-    assert len(grid(slower(range(10, 61, 10)), range(2, 61))) == 15_930
+    assert len(cut_in_grid(speed_pairs(range(10, 61, 10)), range(2, 61))) == 15_930
 
 
 def test_the_published_order_comes_out_at_low_and_at_high_speed() -> None:
     for speeds, gaps in ((range(10, 61, 10), range(2, 61, 4)), (range(70, 131, 20), range(2, 121, 9))):
-        cases = grid(slower(speeds), gaps)
+        cases = cut_in_grid(speed_pairs(speeds), gaps)
         shares = [crashes(m, cases).mean() for m in (CarefulHuman(wait_for_overlap=True), Reg157(), FSM(), RSS())]
         assert shares == sorted(shares, reverse=True)
         assert min(-np.diff(shares)) > 0.001
@@ -45,7 +45,7 @@ def test_to_be_hit_from_the_side_counts_and_to_be_past_does_not() -> None:
 
 
 def test_cases_do_not_depend_on_each_other() -> None:
-    cases = grid(slower(range(20, 61, 20)), range(2, 60, 3))
+    cases = cut_in_grid(speed_pairs(range(20, 61, 20)), range(2, 60, 3))
     order = np.random.default_rng(0).permutation(len(cases))
     mixed = CutIns(cases.speed[order], cases.lead[order], cases.gap[order], cases.approach[order])
     assert (crashes(FSM(), mixed) == crashes(FSM(), cases)[order]).all()

@@ -9,7 +9,7 @@ import pytest
 
 from ssad.core.errors import UnknownNameError
 from ssad.drivers.careful import MODELS, Encounter, careful_model, react
-from ssad.drivers.careful.models import FSM, RSS, CarefulHuman, CarefulModel, Reg157, calm
+from ssad.drivers.careful.models import FSM, RSS, CarefulHuman, CarefulModel, Reg157, initial_reaction
 
 
 def meet(**given: float) -> Encounter:
@@ -33,7 +33,7 @@ def demand(model: CarefulModel, **given: float) -> float:
 
 
 def braking(model: CarefulModel, e: Encounter, steps: int, dt: float = 0.1) -> np.ndarray:
-    memory, out = calm((1,)), []
+    memory, out = initial_reaction((1,)), []
     for _ in range(steps):
         brake, memory = react(model, e, memory, dt)
         out.append(float(brake[0]))
@@ -124,7 +124,7 @@ def test_a_step_takes_others_one_by_one(name: str) -> None:
     model = careful_model(name)
     gaps = np.linspace(1.0, 60.0, 24)
     many = replace(meet(), gap=gaps)
-    memory = calm(gaps.shape)
+    memory = initial_reaction(gaps.shape)
     for _ in range(12):
         together, memory = react(model, many, memory, 0.1)
     alone = [braking(model, meet(gap=gap), 12)[-1] for gap in gaps]

@@ -18,10 +18,10 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.traces import trace_hash
 from ssad.core.types import AgentKind, Episode, Limits
-from ssad.drivers.perceiving.driver import Perceiving, Sighting
+from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
-from ssad.drivers.perceiving.tracker import Tracking, tracking_of
+from ssad.drivers.perceiving.tracker import Tracking, tracking_settings
 from ssad.simulators.closed_loop import system_version
 from ssad.world.rollout import Loop
 
@@ -171,8 +171,8 @@ def test_missed_and_phantom_objects_are_missed_and_there() -> None:
     for name, change in (("none", {}), ("missed", {"missed": 0.5, "burst": 2.0}), ("phantoms", {"phantoms": 1.0})):
         told: list[Any] = []
         run(Perceiving(PerfectEyes(**change), watch=told.append), made, town)  # type: ignore[arg-type]
-        seen = [one for one in told if isinstance(one, Sighting)]
-        counts[name] = float(np.mean([len(one.found) for one in seen[:20] if one.found is not None]))
+        seen = [one for one in told if isinstance(one, PerceptionEvent)]
+        counts[name] = float(np.mean([len(one.objects) for one in seen[:20] if one.objects is not None]))
     assert counts["missed"] < counts["none"] < counts["phantoms"]
 
 
@@ -234,10 +234,13 @@ def test_results_depend_on_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 @pytest.mark.parametrize("system", [Fcos3d, PgdDet, Yolov5n])
 def test_what_the_tracker_may_use_is_what_the_detector_is_asked_for(system: type[OneCamera]) -> None:
-    for made, low in ((system(), tracking_of(system.weights).low), (system(tracking=Tracking(high=0.5, low=0.2)), 0.2)):
+    for made, low in (
+        (system(), tracking_settings(system.weights).low),
+        (system(tracking=Tracking(high=0.5, low=0.2)), 0.2),
+    ):
         assert isinstance(made.perceiver, CameraEyes)
         assert made.perceiver.threshold == made.tracking.low == low
-    scores = [tracking_of(system.weights).high for system in (PgdDet, Fcos3d, Yolov5n)]
+    scores = [tracking_settings(system.weights).high for system in (PgdDet, Fcos3d, Yolov5n)]
     assert scores == sorted(set(scores))
 
 
@@ -254,7 +257,7 @@ def test_what_the_tracker_may_use_is_what_the_detector_is_asked_for(system: type
 def test_a_suite_takes_the_scores_that_suit_the_detector(
     detector: str, said: dict[str, float], expected: tuple[float, float]
 ) -> None:
-    settings = tracking_of(detector, confirm=3, **said)
+    settings = tracking_settings(detector, confirm=3, **said)
     assert (settings.high, settings.low, settings.confirm) == (*expected, 3)
     with pytest.raises(ConfigError, match="low <= high"):
-        tracking_of(detector, high=0.1, low=0.2)
+        tracking_settings(detector, high=0.1, low=0.2)

@@ -16,8 +16,8 @@ from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, AgentKind
-from ssad.drivers.perceiving.eyes import boxes_of, projected
-from ssad.drivers.perceiving.lift import Lifting, lift, merged
+from ssad.drivers.perceiving.eyes import object_boxes, project_boxes
+from ssad.drivers.perceiving.lift import Lifting, lift, merge_duplicates
 from ssad.drivers.perceiving.objects import KINDS, SIZES
 from ssad.rendering.camera.rig import RIG, rig_camera
 
@@ -42,7 +42,7 @@ def lifted(found: Detections, camera: Camera, pose: F64, **settings: float) -> O
 def seen(belief: Belief, channel: str = "CAM_FRONT") -> tuple[Detections, Objects]:
     camera = rig_camera(channel, 640)
     pose = upright_pose(*EGO) @ camera.to_ego
-    found = projected(boxes_of(belief, 0, np.ones(belief.kind.shape[1], bool)), np.linalg.inv(pose), camera)
+    found = project_boxes(object_boxes(belief, 0, np.ones(belief.kind.shape[1], bool)), np.linalg.inv(pose), camera)
     return found, lifted(found, camera, pose)
 
 
@@ -122,9 +122,9 @@ def test_of_two_boxes_on_one_car_the_better_stays_and_people_beside_it_too() -> 
         (12.0, 0.0, 0.0, AgentKind.CAR), (13.0, 0.4, 0.0, AgentKind.TRUCK), (12.0, 1.4, 0.0, AgentKind.WALKER)
     )
     _, found = seen(belief)
-    kept = merged(replace(found, score=np.array([0.4, 0.8, 0.3])), 0.5)
+    kept = merge_duplicates(replace(found, score=np.array([0.4, 0.8, 0.3])), 0.5)
     assert sorted(kept.kind.tolist()) == [AgentKind.TRUCK, AgentKind.WALKER]
-    assert len(merged(no_objects(), 0.5)) == 0
+    assert len(merge_duplicates(no_objects(), 0.5)) == 0
 
 
 def test_all_classes_that_matter_have_a_kind() -> None:
@@ -146,12 +146,12 @@ def test_many_pictures_at_once_give_to_the_bit_what_each_gives_alone(flat: bool)
     together = lift(pictures, camera, np.array(poses), scenes, MMDET3D_CLASSES, settings=Lifting())
     assert len(together) > 5
     for name in (field.name for field in fields(Objects)):
-        expected = getattr(Objects.joined(alone), name)
+        expected = getattr(Objects.cat(alone), name)
         np.testing.assert_array_equal(getattr(together, name), expected, err_msg=name)
-    parts = [merged(one, 0.5) for one in sorted(alone, key=lambda one: one.scene[:1].tolist())]
-    fewer = merged(together, 0.5)
+    parts = [merge_duplicates(one, 0.5) for one in sorted(alone, key=lambda one: one.scene[:1].tolist())]
+    fewer = merge_duplicates(together, 0.5)
     for name in (field.name for field in fields(Objects)):
-        np.testing.assert_array_equal(getattr(fewer, name), getattr(Objects.joined(parts), name), err_msg=name)
+        np.testing.assert_array_equal(getattr(fewer, name), getattr(Objects.cat(parts), name), err_msg=name)
 
 
 def random_detections(draws: np.random.Generator, count: int) -> Detections:

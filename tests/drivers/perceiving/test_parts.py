@@ -15,7 +15,7 @@ from ssad.core.driving import Believer, Observation
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.types import AgentKind, Controller, Episode, Limits
 from ssad.drivers.perceiving.check import PartCheckError, check_perceiver, check_planner, check_tracker
-from ssad.drivers.perceiving.driver import Perceiving, Sighting
+from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.parts import (
     make_perceiver,
@@ -103,7 +103,7 @@ def test_the_covariance_and_the_velocity_of_boxes_turn_with_the_ego() -> None:
     given = replace(boxes((10.0, 0.0)), spread=np.array([[[4.0, 0.0], [0.0, 1.0]]]), velocity=np.array([[3.0, 0.0]]))
     driver = driver_of(lambda view, rows: [given], watch=told.append)
     driver.believe(view_at(0.0, (0.0, 0.0, np.pi / 2)))
-    found = next(event.found for event in told if isinstance(event, Sighting))
+    found = next(event.objects for event in told if isinstance(event, PerceptionEvent))
     np.testing.assert_allclose(found.spread[0], [[1.0, 0.0], [0.0, 4.0]], atol=1e-6)
     np.testing.assert_allclose(found.velocity[0], [0.0, 3.0], atol=1e-6)
     nearer, farther = (
@@ -112,7 +112,7 @@ def test_the_covariance_and_the_velocity_of_boxes_turn_with_the_ego() -> None:
     )
     nearer.believe(view_at(0.0, (0.0, 0.0, 0.0)))
     farther.believe(view_at(0.0, (0.0, 0.0, 0.0)))
-    near, far = (event.found.spread[0] for event in told[-4:] if isinstance(event, Sighting))
+    near, far = (event.objects.spread[0] for event in told[-4:] if isinstance(event, PerceptionEvent))
     assert far[0, 0] > 4.0 * near[0, 0] > 0.0
 
 
@@ -439,7 +439,7 @@ class Keeping(KalmanTracker):
     """Does not forget."""
 
     def reset(self, episodes: Any) -> None:
-        if len(self._born) != len(episodes):
+        if len(self._track_counts) != len(episodes):
             super().reset(episodes)
 
 

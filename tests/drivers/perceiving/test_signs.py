@@ -43,7 +43,7 @@ def test_a_sign_is_believed_when_confirmed_and_as_long_as_it_is_remembered(memor
     scenes, pose = np.arange(2, dtype=np.int32), np.zeros((2, 3), np.float32)
 
     def known(time: float) -> list[int]:
-        return signs.known(scenes, np.full(2, time), pose).tolist()
+        return signs.is_sign_ahead(scenes, np.full(2, time), pose).tolist()
 
     signs.update(1, 0.0, np.zeros(2), np.array([[20.0, -4.0]]))
     assert known(0.0) == [0, 0]

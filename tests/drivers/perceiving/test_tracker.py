@@ -11,7 +11,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.perception import Objects, no_objects
 from ssad.core.types import AgentKind
 from ssad.drivers.perceiving.tracker import KalmanTracker, KalmanTracks, Tracking
-from ssad.drivers.perceiving.tracks import believed
+from ssad.drivers.perceiving.tracks import belief_from_tracks
 
 STEP = 0.2
 
@@ -99,7 +99,7 @@ def test_a_low_score_keeps_a_track_but_begins_none() -> None:
 def test_a_high_score_is_matched_before_a_nearer_low_one() -> None:
     tracker = KalmanTracker(Tracking(confirm=1))
     look(tracker, 0, objects((10.0, 0.0)))
-    both = Objects.joined([objects((10.05, 0.0), score=0.2), objects((10.4, 0.0), score=0.9)])
+    both = Objects.cat([objects((10.05, 0.0), score=0.2), objects((10.4, 0.0), score=0.9)])
     look(tracker, 1, both)
     assert tracker.tracks.score.tolist() == [0.9]
 
@@ -119,7 +119,7 @@ def test_speed_and_heading_come_from_motion_and_from_the_body_at_rest() -> None:
         look(moving, k, objects((2.0, 6.0 * k * STEP), yaw=-np.pi / 2))
         look(resting, k, objects((2.0, 6.0), yaw=2.5))
     for tracker, yaw, speed in ((moving, np.pi / 2, 6.0), (resting, 2.5, 0.0)):
-        belief = believed(tracker.confirmed(np.array([0]), np.array([11 * STEP])), np.array([0]))
+        belief = belief_from_tracks(tracker.confirmed(np.array([0]), np.array([11 * STEP])), np.array([0]))
         assert np.cos(belief.pose[0, 0, 2] - yaw) > 0.99
         assert belief.speed[0, 0] == pytest.approx(speed, abs=0.3)
 
@@ -142,7 +142,7 @@ def drive(tracker: KalmanTracker, scenes: list[int], looks: range) -> None:
             count = int(rng.integers(0, 4))
             spots = np.array([[10.0 * i, 2.0 * k * STEP] for i in range(count)]).reshape(-1, 2)
             parts.append(objects(*map(tuple, spots + 0.2 * rng.normal(size=spots.shape)), scene=row))
-        tracker.update(np.arange(len(scenes)), np.full(len(scenes), k * STEP), Objects.joined(parts))
+        tracker.update(np.arange(len(scenes)), np.full(len(scenes), k * STEP), Objects.cat(parts))
 
 
 def same(one: KalmanTracks, other: KalmanTracks) -> bool:
@@ -180,9 +180,9 @@ def test_a_snapshot_goes_on_to_the_bit() -> None:
 
 def test_a_belief_has_a_row_for_each_scene_asked_for() -> None:
     tracker = KalmanTracker(Tracking(confirm=1), scenes=3)
-    found = Objects.joined([objects((1.0, 0.0), scene=0), objects((2.0, 0.0), (30.0, 0.0), scene=2)])
+    found = Objects.cat([objects((1.0, 0.0), scene=0), objects((2.0, 0.0), (30.0, 0.0), scene=2)])
     tracker.update(np.arange(3), np.zeros(3), found)
-    belief = believed(tracker.confirmed(np.array([2, 0, 1]), np.zeros(3)), np.array([2, 0, 1]))
+    belief = belief_from_tracks(tracker.confirmed(np.array([2, 0, 1]), np.zeros(3)), np.array([2, 0, 1]))
     assert (belief.kind != AgentKind.NONE).sum(1).tolist() == [2, 1, 0]
     assert belief.pose[:2, 0, 0].tolist() == [2.0, 1.0]
 

@@ -12,7 +12,7 @@ import torch
 from ssad.core.errors import FormatError, SSADError
 from ssad.core.types import AgentKind, Controller, EpisodeTrace, Limits
 from ssad.experiments.driving.attacked_film import attacked_frames, first_ahead
-from ssad.rendering.agent_edit import LiveAttack
+from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.hours import at_hour
 from ssad.rendering.meshes.mesh import Mesh
@@ -68,7 +68,7 @@ def test_the_car_before_the_ego_is_attacked(trace: EpisodeTrace) -> None:
 
 
 def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:
-    attack = LiveAttack(white, TargetCar(paint="black"), agent=1)
+    attack = AgentEdit(white, TargetCar(paint="black"), agent=1)
     frames = list(attacked_frames(trace, load_town("ProvingGround"), attack, width=160, every=2))
     assert len(frames) == 2
     for frame in frames:

@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.rotations import yaw_to_quaternion
 from ssad.core.types import EpisodeTrace, LaneType
 from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import PerfectEyes, front
+from ssad.drivers.perceiving.eyes import PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.recorder import PerceptionRecorder
 from ssad.experiments.gap.drive_sheet import Seen
 from ssad.experiments.gap.mcap import need_mcap, write_mcap
@@ -25,7 +25,7 @@ from ssad.world.rollout import rollout
 def driven() -> tuple[EpisodeTrace, Seen, Any]:
     scenario = next(one for one in load_scenarios("precrash") if one.name == "StraightObstacle/00")
     town = load_town(scenario.town)
-    cameras = front(96)
+    cameras = nuscenes_cameras(96)
     watcher = PerceptionRecorder(cameras, 1)
     episode = build_episode(scenario, town, seed=0)
     (trace,) = rollout(World([episode], {town.name: town}), Perceiving(PerfectEyes(cameras), watch=watcher))

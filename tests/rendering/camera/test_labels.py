@@ -17,8 +17,8 @@ from ssad.core.nuscenes_names import visibility_token
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
 from ssad.rendering.camera.labels import Labels, extents, label_picture, visible_share
-from ssad.rendering.camera.render import PLAIN, Picture, View, render
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.render import PLAIN, Rendering, View, render
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.meshes.mesh import Material, box
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 500.0
@@ -29,26 +29,26 @@ GREY = Material("grey", (0.5, 0.5, 0.5))
 
 
 @functools.cache
-def stage() -> Scene:
+def stage() -> RenderScene:
     """Mesh 0: a box 0.5 x 2 x 2 m about (0.25, 0, 1.5), its front at x = 0; then bodies."""
     slab = box((0.5, 2.0, 2.0), centre=(0.25, 0.0, 1.5), material=GREY)
-    return Scene(None, [slab, *(make_body(kind, generator=generator("labels", kind)) for kind in BODIES)])
+    return RenderScene(None, [slab, *(make_body(kind, generator=generator("labels", kind)) for kind in BODIES)])
 
 
-def at(x: float, y: float = 0.0, *, mesh: int = 0, tag: int = 1, yaw: float = 0.0) -> Thing:
+def at(x: float, y: float = 0.0, *, mesh: int = 0, tag: int = 1, yaw: float = 0.0) -> SceneObject:
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pose[:2, 3] = x, y
-    return Thing(mesh, pose, tag=tag)
+    return SceneObject(mesh, pose, tag=tag)
 
 
-def seen(*things: Thing, scale: int = 2) -> tuple[Labels, Picture]:
+def seen(*things: SceneObject, scale: int = 2) -> tuple[Labels, Rendering]:
     view = View(CAMERA, EYE, things)
     picture = render(stage(), [view], scale=scale, quality=PLAIN)
     return label_picture(stage(), view, picture, scale=scale), picture
 
 
-def empty_picture() -> Picture:
+def empty_picture() -> Rendering:
     picture = render(stage(), [View(CAMERA, EYE, (at(10.0),))], quality=PLAIN)
     return replace(picture, tag=np.full_like(picture.tag, -1))
 
@@ -209,7 +209,7 @@ def test_a_picture_of_another_view_is_refused() -> None:
     with pytest.raises(ConfigError, match="no picture 1"):
         label_picture(stage(), view, picture, 1)
     with pytest.raises(ConfigError, match="640 x 360"):
-        label_picture(stage(), View(Camera.typical(320, 180), EYE, view.things), picture)
+        label_picture(stage(), View(Camera.typical(320, 180), EYE, view.objects), picture)
 
 
 def test_levels_of_visibility() -> None:

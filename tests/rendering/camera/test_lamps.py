@@ -15,16 +15,16 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.lamps import Lamp, lamp_strength, lit_circle, near_of, own_lamps
-from ssad.rendering.camera.render import PLAIN, Quality, View, Weather, light_of, render
-from ssad.rendering.camera.scene import Scene, Thing, collect
-from ssad.rendering.camera.texture import retexture, taps_of
+from ssad.rendering.camera.lamps import SceneLamp, lamp_strength, lit_circle, nearby_lights, own_lamps
+from ssad.rendering.camera.render import PLAIN, RenderQuality, SceneWeather, View, render, scene_light
+from ssad.rendering.camera.scene import RenderScene, SceneObject, collect
+from ssad.rendering.camera.texture import retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 CAMERA = Camera(96, 96, np.array([[96.0, 0, 48.0], [0, 96.0, 48.0], [0, 0, 1]]))
-NIGHT = Weather(sun_height=-0.5, clouds=0.0)
+NIGHT = SceneWeather(sun_height=-0.5, clouds=0.0)
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -40,17 +40,17 @@ def ground() -> Any:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> RenderScene:
     block = meshes.box((4.0, 2.0, 1.5), material=GREY, centre=(0.0, 0.0, 0.95))  # 0.2 m above the ground
-    return Scene(None, [ground(), block, make_body("car", style="suv", generator=generator("lamps"))])
+    return RenderScene(None, [ground(), block, make_body("car", style="suv", generator=generator("lamps"))])
 
 
-def above(height: float, *things: Thing, **other: Any) -> View:
+def above(height: float, *things: SceneObject, **other: Any) -> View:
     """A look straight down on the ground."""
-    return View(CAMERA, at(0, 0, height, DOWN), (Thing(0, np.eye(4)), *things), NIGHT, **other)
+    return View(CAMERA, at(0, 0, height, DOWN), (SceneObject(0, np.eye(4)), *things), NIGHT, **other)
 
 
-def lamp_light(scene: Scene, view: View, **options: Any) -> Any:
+def lamp_light(scene: RenderScene, view: View, **options: Any) -> Any:
     """Irradiance / pi [H, W, 3] of the lamps of a view alone."""
     lit, dark = (render(scene, [v], surface=True, **options).surface for v in (view, replace(view, lamps=())))
     assert lit is not None
@@ -68,12 +68,14 @@ def lamp_light(scene: Scene, view: View, **options: Any) -> Any:
     tilt=st.floats(-0.2, 0.2),
 )
 def test_the_power_of_a_lamp_is_what_arrives(
-    scene: Scene, height: float, across: float, down: float, soft: float, square: bool, tilt: float
+    scene: RenderScene, height: float, across: float, down: float, soft: float, square: bool, tilt: float
 ) -> None:
     """Over the ground that catches all of it, whatever its height, spread, edge and tilt."""
     cos, sin = np.cos(tilt), np.sin(tilt)
     turned = DOWN @ np.array([[1, 0, 0, 0], [0, cos, -sin, 0], [0, sin, cos, 0], [0, 0, 0, 1.0]])
-    lamp = Lamp(at(1.0, 0.5, height, turned), 7.0, (across, down), (1.0, 0.5, 0.25), soft, square, 1e3, shadows=False)
+    lamp = SceneLamp(
+        at(1.0, 0.5, height, turned), 7.0, (across, down), (1.0, 0.5, 0.25), soft, square, 1e3, shadows=False
+    )
     camera = Camera(480, 480, np.array([[480.0, 0, 240.0], [0, 480.0, 240.0], [0, 0, 1]]))
     light = lamp_light(scene, replace(above(40.0, lamps=(lamp,)), camera=camera), quality=PLAIN)
     pixel = (40.0 / 480.0) ** 2
@@ -91,7 +93,7 @@ def test_a_lamp_fades_with_its_reach_and_needs_sense() -> None:
         {"pose": np.eye(3)},
     ):
         with pytest.raises(ConfigError, match="a lamp"):
-            Lamp(**({"pose": pose, "power": 1.0} | wrong))  # type: ignore[arg-type]
+            SceneLamp(**({"pose": pose, "power": 1.0} | wrong))  # type: ignore[arg-type]
 
 
 @given(st.integers(0, 10_000), st.booleans(), st.booleans())
@@ -104,7 +106,7 @@ def test_what_a_lamp_lights_lies_in_its_circle(seed: int, square: bool, level: b
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     pose[:3, :3] = turn if level else np.linalg.qr(draw.normal(size=(3, 3)))[0]
     pose[:3, 3] = draw.uniform(-50, 50, 3)
-    lamp = Lamp(pose, 1.0, (across, down), square=square, reach=draw.uniform(1, 80))
+    lamp = SceneLamp(pose, 1.0, (across, down), square=square, reach=draw.uniform(1, 80))
     angle = np.linspace(0, 2 * np.pi, 721)
     rim = np.column_stack([np.cos(angle), np.sin(angle)])
     if square:
@@ -121,13 +123,13 @@ def test_what_a_lamp_lights_lies_in_its_circle(seed: int, square: bool, level: b
         assert away.max() == pytest.approx(radius)
 
 
-def test_what_stands_in_its_way_keeps_light_off(scene: Scene) -> None:
-    lamp = Lamp(at(0, 0, 8.0, DOWN), 40.0, (1.0, 1.0), reach=100.0)
+def test_what_stands_in_its_way_keeps_light_off(scene: RenderScene) -> None:
+    lamp = SceneLamp(at(0, 0, 8.0, DOWN), 40.0, (1.0, 1.0), reach=100.0)
     view = above(30.0, lamps=(lamp,))
     free = lamp_light(scene, view, quality=PLAIN)
-    block = Thing(1, np.eye(4), tag=1)
-    seen = replace(view, things=(*view.things, block))
-    hidden = replace(view, things=(*view.things, replace(block, hidden=True)))
+    block = SceneObject(1, np.eye(4), tag=1)
+    seen = replace(view, objects=(*view.objects, block))
+    hidden = replace(view, objects=(*view.objects, replace(block, hidden=True)))
     ghost = lamp_light(scene, hidden, quality=PLAIN)
     assert ghost[47, 47].max() == 0.0, "a hidden thing casts, and the ground below it is seen"
     # the edge of the shadow: the lamp is 8 m up, the top of the block 1.7 m, its half length 2 m
@@ -140,14 +142,14 @@ def test_what_stands_in_its_way_keeps_light_off(scene: Scene) -> None:
     assert lamp_light(scene, through, quality=PLAIN) == pytest.approx(free, abs=1e-6)
 
 
-def test_a_projected_texture_is_that_of_a_lamp_where_it_is_white(scene: Scene) -> None:
+def test_a_projected_texture_is_that_of_a_lamp_where_it_is_white(scene: RenderScene) -> None:
     """The picture of a projector is that of a lamp where the texture is white; and the transpose is the gradient."""
-    lamp = Lamp(at(0, 0, 8.0, DOWN), 40.0, (0.6, 0.6), square=True, reach=100.0)
-    things = (Thing(0, np.eye(4)), Thing(1, at(1.0, 0.3, 0.0), tag=1))
+    lamp = SceneLamp(at(0, 0, 8.0, DOWN), 40.0, (0.6, 0.6), square=True, reach=100.0)
+    things = (SceneObject(0, np.eye(4)), SceneObject(1, at(1.0, 0.3, 0.0), tag=1))
     view = View(CAMERA, at(0, 0, 20.0, DOWN), things, NIGHT)
     white = render(scene, [replace(view, lamps=(lamp,))]).radiance.astype(float)
     picture = render(scene, [replace(view, lamps=(replace(lamp, texture=3),))])
-    taps = taps_of(picture, 32, texture=3, dtype=torch.float64)
+    taps = texture_taps(picture, 32, texture=3, dtype=torch.float64)
     assert len(taps.pixel) > 1000
     radiance = torch.tensor(picture.radiance, dtype=torch.float64)
     lit = retexture(taps, torch.ones(3, 32, 32, dtype=torch.float64), radiance)
@@ -158,13 +160,13 @@ def test_a_projected_texture_is_that_of_a_lamp_where_it_is_white(scene: Scene) -
     assert gained[0, :, :40].sum() > 20 * gained[0, :, 56:].sum()
 
 
-def test_bodies_keep_the_sky_from_the_ground(scene: Scene) -> None:
+def test_bodies_keep_the_sky_from_the_ground(scene: RenderScene) -> None:
     """The share that a rectangle hides from a point below its middle, after the configuration factor."""
-    weather = Weather(sun_height=0.0, clouds=1.0)  # no sun
+    weather = SceneWeather(sun_height=0.0, clouds=1.0)  # no sun
     base = replace(above(20.0), weather=weather)
-    hidden = replace(base, things=(*base.things, Thing(1, np.eye(4), tag=1, hidden=True)))
+    hidden = replace(base, objects=(*base.objects, SceneObject(1, np.eye(4), tag=1, hidden=True)))
     free, under = (render(scene, [v], surface=True).surface for v in (base, hidden))
-    off = render(scene, [hidden], quality=Quality(contact=False), surface=True).surface
+    off = render(scene, [hidden], quality=RenderQuality(contact=False), surface=True).surface
     assert free is not None
     assert under is not None
     assert off is not None
@@ -178,9 +180,9 @@ def test_bodies_keep_the_sky_from_the_ground(scene: Scene) -> None:
     assert ratio[4, 4] == pytest.approx(1.0, abs=1e-3), "far away nothing changes"
 
 
-def test_the_surface_explains_the_picture(scene: Scene) -> None:
+def test_the_surface_explains_the_picture(scene: RenderScene) -> None:
     """Radiance is gain times albedo where nothing mirrors; positions lie on the ground; normals point up."""
-    view = View(CAMERA, FORWARD, (Thing(0, np.eye(4)),), Weather())
+    view = View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)),), SceneWeather())
     picture = render(scene, [view], surface=True)
     surface = picture.surface
     assert surface is not None
@@ -196,29 +198,29 @@ def test_the_surface_explains_the_picture(scene: Scene) -> None:
     assert render(scene, [view]).surface is None
 
 
-def lit_lamps(scene: Scene, view: View) -> Any:
+def lit_lamps(scene: RenderScene, view: View) -> Any:
     """The lamps of a view as the kernels get them."""
-    near = near_of(scene, [view], collect([view.things]))
+    near = nearby_lights(scene, [view], collect([view.objects]))
     return near.lamps.numpy()[: len(set(near.lamp_list.numpy()))] if near.lamp_start.numpy()[-1] else []
 
 
-def test_by_night_lamps_are_on(scene: Scene) -> None:
-    car = Thing(2, at(10.0, 0.0, 0.0), tag=1)
-    view = View(CAMERA, FORWARD, (Thing(0, np.eye(4)), car), NIGHT)
+def test_by_night_lamps_are_on(scene: RenderScene) -> None:
+    car = SceneObject(2, at(10.0, 0.0, 0.0), tag=1)
+    view = View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)), car), NIGHT)
     assert lamp_strength(1.0) == 0.0
     assert lamp_strength(-1.0) == 1.0
-    assert not len(lit_lamps(scene, replace(view, weather=Weather())))
+    assert not len(lit_lamps(scene, replace(view, weather=SceneWeather())))
     head, tail = lit_lamps(scene, view)
     assert head["ahead"][0] > 0.9, "forward"
     assert tail["ahead"][0] < -0.9
     assert head["place"][0] > 11.5
     assert tail["place"][0] < 8.5
-    dusk = lit_lamps(scene, replace(view, weather=Weather(sun_height=0.02)))
+    dusk = lit_lamps(scene, replace(view, weather=SceneWeather(sun_height=0.02)))
     assert dusk["light"] == pytest.approx(lit_lamps(scene, view)["light"] * lamp_strength(0.02), rel=1e-5)
-    assert not len(lit_lamps(scene, replace(view, things=(replace(car, lit=False),))))
-    lit, off = (render(scene, [replace(view, things=(view.things[0], c))]) for c in (car, replace(car, lit=False)))
+    assert not len(lit_lamps(scene, replace(view, objects=(replace(car, lit=False),))))
+    lit, off = (render(scene, [replace(view, objects=(view.objects[0], c))]) for c in (car, replace(car, lit=False)))
     assert lit.radiance[0, 50:].sum() > 1.05 * off.radiance[0, 50:].sum()
-    assert not own_lamps(np.eye(4), Weather())
+    assert not own_lamps(np.eye(4), SceneWeather())
     beam = own_lamps(np.eye(4), NIGHT)
     with_beam = render(scene, [replace(view, lamps=beam)]).radiance[0].sum(-1)
     without = render(scene, [view]).radiance[0].sum(-1)
@@ -226,17 +228,17 @@ def test_by_night_lamps_are_on(scene: Scene) -> None:
     assert gained[60:].sum() > 5.0 * gained[:36].sum(), "the road, not the sky"
 
 
-def test_fine_shadows_are_finer(scene: Scene) -> None:
+def test_fine_shadows_are_finer(scene: RenderScene) -> None:
     """The edge of the shadow of a block, against the geometry: within a few centimetres."""
-    weather = Weather(sun_height=0.8, sun_heading=0.0, clouds=0.0)
+    weather = SceneWeather(sun_height=0.8, sun_heading=0.0, clouds=0.0)
     camera = Camera(256, 256, np.array([[512.0, 0, 128.0], [0, 512.0, 128.0], [0, 0, 1]]))
-    things = (Thing(0, np.eye(4)), Thing(1, np.eye(4), tag=1, hidden=True))
+    things = (SceneObject(0, np.eye(4)), SceneObject(1, np.eye(4), tag=1, hidden=True))
     view = View(camera, at(-3.0, 0.0, 10.0, DOWN), things, weather, focus=(-2.0, 0.0))
-    sun = np.array(light_of(weather)[0][0])
+    sun = np.array(scene_light(weather)[0][0])
     edge = -2.0 - 1.7 * sun[0] / sun[2]  # of the shadow of the upper edge, on the far side of the sun
     errors = []
     for fine in (True, False):
-        picture = render(scene, [view], quality=Quality(fine=fine, contact=False))
+        picture = render(scene, [view], quality=RenderQuality(fine=fine, contact=False))
         row = picture.radiance[0][127].sum(-1)
         where = -3.0 + (np.arange(256) + 0.5 - 128.0) * 10.0 / 512.0
         half = 0.5 * (row.max() + row.min())

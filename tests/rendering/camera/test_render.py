@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.rendering.camera.kernels import raster
-from ssad.rendering.camera.render import PLAIN, View, Weather, light_of, render, response
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.render import PLAIN, SceneWeather, View, render, response, scene_light
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)
 CAMERA = Camera(64, 48, np.array([[50.0, 0, 32.0], [0, 50.0, 24.0], [0, 0, 1]]))
-NOON = Weather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
+NOON = SceneWeather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
 
 
 def visible(
@@ -125,16 +125,16 @@ def place(x: float, y: float, z: float = 0.0) -> Any:
 
 
 @pytest.fixture(scope="module")
-def stage() -> Scene:
-    return Scene(None, [ground(), cube()])
+def stage() -> RenderScene:
+    return RenderScene(None, [ground(), cube()])
 
 
-def scene(*things: Thing, weather: Weather = NOON) -> View:
-    return View(CAMERA, FORWARD, (Thing(0, np.eye(4)), *things), weather)
+def scene(*things: SceneObject, weather: SceneWeather = NOON) -> View:
+    return View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)), *things), weather)
 
 
-def test_depth_tags_and_the_nuscenes_camera_model(stage: Scene) -> None:
-    picture = render(stage, [scene(Thing(1, place(12.0, 0.5), tag=7))], quality=PLAIN)
+def test_depth_tags_and_the_nuscenes_camera_model(stage: RenderScene) -> None:
+    picture = render(stage, [scene(SceneObject(1, place(12.0, 0.5), tag=7))], quality=PLAIN)
     tag, depth = picture.tag[0], picture.depth[0]
     assert (tag[:10] == -1).all()
     assert np.isinf(depth[:10]).all()
@@ -151,10 +151,10 @@ def test_depth_tags_and_the_nuscenes_camera_model(stage: Scene) -> None:
     assert np.median(depth[tag == 7]) == pytest.approx(z, rel=1e-4)
 
 
-def test_a_view_does_not_depend_on_its_batch(stage: Scene) -> None:
+def test_a_view_does_not_depend_on_its_batch(stage: RenderScene) -> None:
     views = [
         scene(
-            Thing(1, place(9.0 + k, k - 1.0), (0.1 * k, 0.3, 0.2), tag=k + 1),
+            SceneObject(1, place(9.0 + k, k - 1.0), (0.1 * k, 0.3, 0.2), tag=k + 1),
             weather=replace(NOON, sun_heading=float(k)),
         )
         for k in range(3)
@@ -166,9 +166,11 @@ def test_a_view_does_not_depend_on_its_batch(stage: Scene) -> None:
         assert (alone.tag[0] == together.tag[k]).all()
 
 
-def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: Scene) -> None:
-    weather = Weather(sun_height=0.6, sun_heading=np.pi / 2, clouds=0.0)  # from the left: the shadow falls to the right
-    with_box = render(stage, [scene(Thing(1, place(12.0, 0.0), tag=1), weather=weather)])
+def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: RenderScene) -> None:
+    weather = SceneWeather(
+        sun_height=0.6, sun_heading=np.pi / 2, clouds=0.0
+    )  # from the left: the shadow falls to the right
+    with_box = render(stage, [scene(SceneObject(1, place(12.0, 0.0), tag=1), weather=weather)])
     without = render(stage, [scene(weather=weather)])
     same = with_box.tag[0] == without.tag[0]
     ratio = with_box.radiance[0].mean(-1) / np.maximum(without.radiance[0].mean(-1), 1e-6)
@@ -176,21 +178,21 @@ def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: Scene) -> 
     assert dark.sum() > 10
     _, columns = np.nonzero(dark)
     assert columns.mean() > 33, "to the right of the box"
-    light, _ = light_of(weather)
+    light, _ = scene_light(weather)
     assert ratio[dark].min() > 0.1, "the sky still lights it"
     assert light[0][1] > 0.8
 
 
-def test_coverage_is_averaged_over_samples(stage: Scene) -> None:
+def test_coverage_is_averaged_over_samples(stage: RenderScene) -> None:
     """The mean radiance hardly changes with the number of samples; edges get between values."""
-    view = scene(Thing(1, place(9.0, 0.3), (0.9, 0.1, 0.1), tag=1))
+    view = scene(SceneObject(1, place(9.0, 0.3), (0.9, 0.1, 0.1), tag=1))
     one, two, four = (render(stage, [view], scale=s, quality=PLAIN).radiance[0] for s in (1, 2, 4))
     assert two.mean() == pytest.approx(four.mean(), rel=0.01)
     assert np.abs(two - four).mean() < np.abs(one - four).mean()
 
 
-def test_weather_and_hour_change_the_picture_as_they_should(stage: Scene) -> None:
-    view = scene(Thing(1, place(12.0, 0.0), (0.6, 0.1, 0.1), tag=1))
+def test_weather_and_hour_change_the_picture_as_they_should(stage: RenderScene) -> None:
+    view = scene(SceneObject(1, place(12.0, 0.0), (0.6, 0.1, 0.1), tag=1))
     clear = render(stage, [view])
     foggy = render(stage, [replace(view, weather=replace(NOON, fog=0.05))])
     night = render(stage, [replace(view, weather=replace(NOON, sun_height=-0.3))])
@@ -204,7 +206,7 @@ def test_weather_and_hour_change_the_picture_as_they_should(stage: Scene) -> Non
 # ---------------------------------------------------------------- bad input
 
 
-def test_wrong_use_is_refused_in_one_line(stage: Scene) -> None:
+def test_wrong_use_is_refused_in_one_line(stage: RenderScene) -> None:
     view = scene()
     nan = FORWARD.copy()
     nan[0, 3] = np.nan
@@ -219,10 +221,10 @@ def test_wrong_use_is_refused_in_one_line(stage: Scene) -> None:
             render(stage, views)
         assert "\n" not in str(error.value)
     with pytest.raises(ConfigError):
-        Scene(None, [])
+        RenderScene(None, [])
 
 
-def test_an_empty_scene_is_sky(stage: Scene) -> None:
+def test_an_empty_scene_is_sky(stage: RenderScene) -> None:
     picture = render(stage, [View(CAMERA, FORWARD)])
     assert (picture.tag == -1).all()
     assert np.isinf(picture.depth).all()

@@ -21,13 +21,13 @@ from ssad.core.images import decode_image, encode_jpeg
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
 from ssad.rendering.camera import torch_jpeg
-from ssad.rendering.camera.render import View, Weather, develop_radiance, render, response
-from ssad.rendering.camera.scene import Layer, Scene, Thing
-from ssad.rendering.camera.sensor import DAY_EXPOSURE, PINHOLE, Sensor, noise_levels
-from ssad.rendering.camera.texture import Taps, retexture, taps_of
+from ssad.rendering.camera.render import SceneWeather, View, develop_radiance, render, response
+from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureLayer
+from ssad.rendering.camera.sensor import DAY_EXPOSURE, PINHOLE, SensorModel, noise_levels
+from ssad.rendering.camera.texture import Taps, retexture, texture_taps
 from ssad.rendering.camera.torch_jpeg import jpeg, quantisation, to_8_bits
 from ssad.rendering.camera.torch_sensor import (
-    Window,
+    ChangedWindow,
     curve,
     demosaic,
     develop,
@@ -39,12 +39,12 @@ from ssad.rendering.camera.torch_sensor import (
 from ssad.rendering.meshes.mesh import Material, build
 
 SENSORS = {
-    "default": Sensor(),
+    "default": SensorModel(),
     "pinhole": PINHOLE,
-    "mosaic alone": Sensor(blur=0.0),
-    "lens alone": Sensor(mosaic=False),
-    "soon full": Sensor(blur=0.7, full=0.4),
-    "three colours, soon full": Sensor(blur=0.3, mosaic=False, full=0.4),
+    "mosaic alone": SensorModel(blur=0.0),
+    "lens alone": SensorModel(mosaic=False),
+    "soon full": SensorModel(blur=0.7, full=0.4),
+    "three colours, soon full": SensorModel(blur=0.3, mosaic=False, full=0.4),
 }
 
 
@@ -56,7 +56,7 @@ def uniform(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(shape, dtype=torch.float64, generator=draws(seed))
 
 
-def developed(radiance: Any, sensors: list[Sensor], exposure: float = DAY_EXPOSURE, *, first_seed: int = 0) -> Any:
+def developed(radiance: Any, sensors: list[SensorModel], exposure: float = DAY_EXPOSURE, *, first_seed: int = 0) -> Any:
     """What the renderer makes of radiance [B, H, W, 3]; the seeds of noise count up from the first."""
     views = [View(Camera.typical(96, 64), FORWARD, sensor=s, seed=first_seed + k) for k, s in enumerate(sensors)]
     held = wp.array(np.asarray(radiance, np.float32), dtype=wp.vec3, device="cpu")
@@ -64,27 +64,30 @@ def developed(radiance: Any, sensors: list[Sensor], exposure: float = DAY_EXPOSU
 
 
 @pytest.fixture(scope="module")
-def stage() -> Scene:
+def stage() -> RenderScene:
     vertices = np.array([[-9, -9, 0], [40, -9, 0], [40, 9, 0], [-9, 9, 0]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     floor = build(
         vertices, faces, materials=(Material("ground", (0.2, 0.2, 0.2), gloss=0.1),), uv=vertices[faces][..., :2]
     )
-    return Scene(None, [floor, make_body("car", style="sedan", generator=generator("sensor"))])
+    return RenderScene(None, [floor, make_body("car", style="sedan", generator=generator("sensor"))])
 
 
 def look(*, worn: bool = False, away: float = 9.0) -> View:
     pose = np.eye(4)
     pose[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
     pose[0, 3] = away
-    things = (Thing(0, np.eye(4), tag=1), Thing(1, pose, (0.6, 0.1, 0.2), 2, (Layer(0),) if worn else ()))
-    return View(Camera.typical(97, 63), FORWARD, things, Weather(0.8, 2.0, 0.2))
+    things = (
+        SceneObject(0, np.eye(4), tag=1),
+        SceneObject(1, pose, (0.6, 0.1, 0.2), 2, (TextureLayer(0),) if worn else ()),
+    )
+    return View(Camera.typical(97, 63), FORWARD, things, SceneWeather(0.8, 2.0, 0.2))
 
 
 # ---------------------------------------------------------------- the renderer's chain and torch's
 
 
-def test_torch_develops_what_the_renderer_does(stage: Scene) -> None:
+def test_torch_develops_what_the_renderer_does(stage: RenderScene) -> None:
     """Also of views that differ in their sensor, at an odd size."""
     views = [replace(look(), sensor=sensor) for sensor in SENSORS.values()]
     picture = render(stage, views)
@@ -111,8 +114,8 @@ def test_a_pinhole_is_the_curve_of_the_light() -> None:
     assert (developed(radiance, [PINHOLE]) == response()[place]).all()
 
 
-@pytest.mark.parametrize("sensor", [Sensor(), Sensor(mosaic=False, blur=0.7)])
-def test_a_flat_field_stays_flat(sensor: Sensor) -> None:
+@pytest.mark.parametrize("sensor", [SensorModel(), SensorModel(mosaic=False, blur=0.7)])
+def test_a_flat_field_stays_flat(sensor: SensorModel) -> None:
     for level in (0.02, 0.3, 1.2):
         grey = torch.full((1, 8, 9, 3), level, dtype=torch.float64)
         shown = develop(grey, 1.0, sensor)
@@ -125,7 +128,7 @@ def test_the_lens_spreads_as_far_as_stated_and_loses_nothing() -> None:
     for blur in (0.3, 0.5, 0.7):
         point = torch.zeros(1, 9, 9, 3, dtype=torch.float64)
         point[0, 4, 4] = 1.0
-        spread = photosites(point, Sensor(blur=blur, mosaic=False))[0, :, :, 1]
+        spread = photosites(point, SensorModel(blur=blur, mosaic=False))[0, :, :, 1]
         away = torch.arange(9) - 4.0
         assert float(spread.sum()) == pytest.approx(1.0)
         assert float((spread.sum(0) * away**2).sum()) == pytest.approx(blur**2)
@@ -134,7 +137,7 @@ def test_the_lens_spreads_as_far_as_stated_and_loses_nothing() -> None:
 
 def test_each_photosite_has_its_colour() -> None:
     colours = torch.tensor([0.1, 0.2, 0.3]).expand(1, 5, 6, 3)
-    raw = photosites(colours, Sensor(blur=0.0))[0]
+    raw = photosites(colours, SensorModel(blur=0.0))[0]
     assert torch.equal(raw[::2, ::2], torch.full((3, 3), 0.1))
     assert torch.equal(raw[1::2, 1::2], torch.full((2, 3), 0.3))
     assert torch.equal(raw[::2, 1::2], torch.full((3, 3), 0.2))
@@ -147,12 +150,12 @@ def test_the_mosaic_keeps_slopes_and_blurs_what_is_finer() -> None:
     colours = demosaic(slope[None])[0, 2:-2, 2:-2]
     assert torch.allclose(colours, slope[2:-2, 2:-2, None].expand_as(colours), atol=1e-12)
     fine = (x % 2).double()[..., None].expand(1, 12, 14, 3)
-    seen = demosaic(photosites(fine, Sensor(blur=0.0)))
+    seen = demosaic(photosites(fine, SensorModel(blur=0.0)))
     assert float((seen - fine).abs().max()) > 0.3, "a mosaic cannot hold stripes of one pixel"
 
 
 def test_a_full_photosite_holds_no_more_and_has_no_slope() -> None:
-    sensor = Sensor(full=0.5, noise=0.05)
+    sensor = SensorModel(full=0.5, noise=0.05)
     light = torch.full((1, 8, 8, 3), 5.0, dtype=torch.float64, requires_grad=True)
     sample = draw_noise((1, 8, 8), sensor, draws(0))
     shown = develop(light, 1.0, sensor, sample)
@@ -174,7 +177,7 @@ def test_a_full_photosite_holds_no_more_and_has_no_slope() -> None:
 @pytest.mark.parametrize("exposure", [DAY_EXPOSURE, 16 * DAY_EXPOSURE])
 def test_noise_has_the_stated_deviation_and_no_bias(mosaic: bool, exposure: float) -> None:
     """Of red at its own sites, where no neighbour is mixed in. The exposure of a night has more of it."""
-    sensor, light = Sensor(noise=0.02, mosaic=mosaic), 0.25
+    sensor, light = SensorModel(noise=0.02, mosaic=mosaic), 0.25
     photons, dark = noise_levels(sensor.noise, exposure)
     assert (photons, dark) == pytest.approx((0.0004, 0.004) if exposure == DAY_EXPOSURE else (0.0016, 0.016))
     expected = np.sqrt(photons * light + dark**2)
@@ -195,7 +198,7 @@ def test_noise_has_the_stated_deviation_and_no_bias(mosaic: bool, exposure: floa
 
 def test_equal_seeds_give_equal_noise_and_others_do_not() -> None:
     flat = torch.full((2, 20, 30, 3), 0.5)
-    for sensor in (Sensor(noise=0.02), Sensor(noise=0.02, mosaic=False)):
+    for sensor in (SensorModel(noise=0.02), SensorModel(noise=0.02, mosaic=False)):
         once, again = (developed(flat, [sensor] * 2, first_seed=s) for s in (5, 6))
         assert (once[1] == again[0]).all()
         assert (once[0] != once[1]).mean() > 0.5
@@ -269,17 +272,17 @@ def check(part: Callable[[Tensor], Tensor], given: Tensor) -> None:
 
 def test_every_part_has_the_gradient_of_finite_differences() -> None:
     light, raw = 0.2 + 0.1 * uniform(2, 7, 8, 3, seed=1), 0.2 + uniform(2, 7, 8, seed=2)  # nothing full, nothing black
-    sensor = Sensor(noise=0.1)
+    sensor = SensorModel(noise=0.1)
     sample = 0.1 * draw_noise((2, 7, 8), sensor, draws(4)).double()
     exposure = torch.tensor([0.3, 2.0], dtype=torch.float64)
     check(lambda v: photosites(v, sensor), light)
-    check(lambda v: photosites(v, Sensor(mosaic=False)), light)
+    check(lambda v: photosites(v, SensorModel(mosaic=False)), light)
     check(lambda v: fill(v, exposure, sensor, sample), raw)
     check(demosaic, raw)
     check(lambda v: curve(v * 3.0), raw)
     check(lambda v: curve(v * 0.002), raw)
     check(lambda v: develop(v, exposure, sensor, sample), light)
-    check(lambda v: develop(v, exposure, Sensor(mosaic=False)), light)
+    check(lambda v: develop(v, exposure, SensorModel(mosaic=False)), light)
 
 
 @pytest.mark.parametrize("subsampling", ["420", "444"])
@@ -389,8 +392,12 @@ TOUCHED = {
 
 @pytest.mark.parametrize("quality", [None, 75])
 @pytest.mark.parametrize("subsampling", ["420", "444"])
-@pytest.mark.parametrize("sensor", [Sensor(noise=0.02), Sensor(mosaic=False), PINHOLE], ids=["all", "lens", "pinhole"])
-def test_touched_pixels_are_those_of_the_whole_picture(sensor: Sensor, quality: int | None, subsampling: str) -> None:
+@pytest.mark.parametrize(
+    "sensor", [SensorModel(noise=0.02), SensorModel(mosaic=False), PINHOLE], ids=["all", "lens", "pinhole"]
+)
+def test_touched_pixels_are_those_of_the_whole_picture(
+    sensor: SensorModel, quality: int | None, subsampling: str
+) -> None:
     before = 1.2 * uniform(*SHAPE, 3, seed=1)
     exposure = torch.tensor([0.5, 1.5], dtype=torch.float64)
     noise = draw_noise(SHAPE, sensor, draws(2)).double()
@@ -415,25 +422,25 @@ def test_touched_pixels_are_those_of_the_whole_picture(sensor: Sensor, quality: 
         after = before.reshape(-1, 3).clone()
         after[pixels] = 0.2 + after[pixels].flip(0)
         after = after.reshape(before.shape)
-        window = Window.around(pixels, SHAPE, sensor, quality=quality, subsampling=subsampling)
+        window = ChangedWindow.around(pixels, SHAPE, sensor, quality=quality, subsampling=subsampling)
         renewed = window.paste(window.develop(window.crop(after), exposure, window.crop(noise)), base)
         assert float((renewed - whole(after)).abs().max()) < 3e-8, name
 
 
 def test_a_window_reads_little() -> None:
-    window = Window.around(flat((0, 20, 30), (0, 24, 33)), SHAPE, Sensor())
+    window = ChangedWindow.around(flat((0, 20, 30), (0, 24, 33)), SHAPE, SensorModel())
     assert window.changed[0] == ((17, 28), (27, 37))
     # three more all around, from an even corner to one that leaves an even rest of the picture
     assert window.crop(torch.zeros(*SHAPE, 3)).shape[1:3] == (19, 16)
-    blocks = Window.around(flat((0, 20, 30)), SHAPE, Sensor(), quality=75)
+    blocks = ChangedWindow.around(flat((0, 20, 30)), SHAPE, SensorModel(), quality=75)
     assert blocks.changed[0] == ((15, 33), (15, 49)), "whole blocks, and what their colours bleed into"
 
 
-def test_a_texture_is_put_into_the_window_alone(stage: Scene) -> None:
+def test_a_texture_is_put_into_the_window_alone(stage: RenderScene) -> None:
     picture = render(stage, [look(worn=True, away=16.0)])
-    taps = taps_of(picture, 32, dtype=torch.float64)
+    taps = texture_taps(picture, 32, dtype=torch.float64)
     radiance, exposure = torch.tensor(picture.radiance).double(), float(picture.exposure[0])
-    window = Window.around(taps.pixel, radiance.shape[:3], Sensor(), quality=92)
+    window = ChangedWindow.around(taps.pixel, radiance.shape[:3], SensorModel(), quality=92)
     base = jpeg(develop(radiance, exposure))
     colours = uniform(3, 32, 32)
     grads = []
@@ -459,28 +466,28 @@ def test_a_texture_is_put_into_the_window_alone(stage: Scene) -> None:
 # ---------------------------------------------------------------- bad input
 
 
-def test_wrong_use_is_refused_in_one_line(stage: Scene) -> None:
+def test_wrong_use_is_refused_in_one_line(stage: RenderScene) -> None:
     radiance = torch.zeros(*SHAPE, 3)
-    window = Window.around(flat((0, 20, 30)), SHAPE, Sensor())
+    window = ChangedWindow.around(flat((0, 20, 30)), SHAPE, SensorModel())
     none = torch.zeros(1, 8)
     far = Taps((4, 4), None, flat((1, 50, 60)), torch.zeros(1, 3), none.long(), none)
     small = View(Camera.typical(3, 3), FORWARD)
     for call in (
-        lambda: Sensor(blur=0.8),
-        lambda: Sensor(blur=float("nan")),
-        lambda: Sensor(noise=-0.1),
-        lambda: Sensor(noise=float("inf")),
-        lambda: Sensor(full=0.0),
-        lambda: Sensor(full=5.0),
+        lambda: SensorModel(blur=0.8),
+        lambda: SensorModel(blur=float("nan")),
+        lambda: SensorModel(noise=-0.1),
+        lambda: SensorModel(noise=float("inf")),
+        lambda: SensorModel(full=0.0),
+        lambda: SensorModel(full=5.0),
         lambda: render(stage, [small]),
         lambda: develop(torch.zeros(1, 3, 8, 3), 1.0),
-        lambda: develop(radiance, 1.0, Sensor(noise=0.1), torch.zeros(2, 53, 72, 3)),
+        lambda: develop(radiance, 1.0, SensorModel(noise=0.1), torch.zeros(2, 53, 72, 3)),
         lambda: jpeg(torch.zeros(1, 3, 8, 8), 0),
         lambda: jpeg(torch.zeros(1, 3, 8, 8), 101),
         lambda: jpeg(torch.zeros(1, 3, 8, 8), 92, "422"),
-        lambda: Window.around(torch.tensor([-1]), SHAPE, Sensor()),
-        lambda: Window.around(torch.tensor([2 * 53 * 72]), SHAPE, Sensor()),
-        lambda: Window.around(flat((0, 20, 30)), SHAPE, Sensor(), quality=101),
+        lambda: ChangedWindow.around(torch.tensor([-1]), SHAPE, SensorModel()),
+        lambda: ChangedWindow.around(torch.tensor([2 * 53 * 72]), SHAPE, SensorModel()),
+        lambda: ChangedWindow.around(flat((0, 20, 30)), SHAPE, SensorModel(), quality=101),
         lambda: window.crop(radiance[:1]),
         lambda: window.taps(far),
     ):

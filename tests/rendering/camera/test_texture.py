@@ -15,25 +15,25 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
-from ssad.rendering.camera.render import PLAIN, Picture, View, Weather, render
-from ssad.rendering.camera.scene import Decal, Layer, Scene, Thing
-from ssad.rendering.camera.texture import PRINTABLE, levels_of, paint_mask, printable, pyramid, retexture, taps_of
+from ssad.rendering.camera.render import PLAIN, Rendering, SceneWeather, View, render
+from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureDecal, TextureLayer
+from ssad.rendering.camera.texture import PRINTABLE, levels_of, paint_mask, printable, pyramid, retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)
 CAMERA = Camera(64, 48, np.array([[50.0, 0, 32.0], [0, 50.0, 24.0], [0, 0, 1]]))
-NOON = Weather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
+NOON = SceneWeather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
 CAR = make_body("car", style="sedan", generator=generator("texture"))
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> RenderScene:
     vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) * 60
     ground = build(vertices, np.array([[0, 1, 2], [0, 2, 3]]), materials=(GREY,))
     cube = meshes.box((4.0, 2.0, 1.5), material=PAINT, centre=(0.0, 0.0, 0.75), panel="body")
-    return Scene(None, [ground, cube, CAR])
+    return RenderScene(None, [ground, cube, CAR])
 
 
 def place(x: float, y: float, z: float = 0.0) -> Any:
@@ -42,30 +42,30 @@ def place(x: float, y: float, z: float = 0.0) -> Any:
     return pose
 
 
-def view(*things: Thing, **other: Any) -> View:
-    return View(CAMERA, FORWARD, (Thing(0, np.eye(4)), *things), NOON, **other)
+def view(*things: SceneObject, **other: Any) -> View:
+    return View(CAMERA, FORWARD, (SceneObject(0, np.eye(4)), *things), NOON, **other)
 
 
-def box(x: float = 7.0, *layers: Layer, paint: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> Thing:
-    return Thing(1, place(x, 0.4), paint, 1, layers)
+def box(x: float = 7.0, *layers: TextureLayer, paint: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> SceneObject:
+    return SceneObject(1, place(x, 0.4), paint, 1, layers)
 
 
 def flat(colour: tuple[float, float, float], size: tuple[int, int] = (32, 32)) -> torch.Tensor:
     return torch.tensor(colour, dtype=torch.float64)[:, None, None].expand(3, *size)
 
 
-def base(picture: Picture) -> torch.Tensor:
+def base(picture: Rendering) -> torch.Tensor:
     return torch.tensor(picture.radiance, dtype=torch.float64)
 
 
-def taps(picture: Picture, size: int | tuple[int, int], **other: Any) -> Any:
-    return taps_of(picture, size, dtype=torch.float64, **other)
+def taps(picture: Rendering, size: int | tuple[int, int], **other: Any) -> Any:
+    return texture_taps(picture, size, dtype=torch.float64, **other)
 
 
-def test_a_texture_of_one_colour_is_a_paint(scene: Scene) -> None:
+def test_a_texture_of_one_colour_is_a_paint(scene: RenderScene) -> None:
     colour = (0.7, 0.2, 0.4)
     painted = render(scene, [view(box(paint=colour))])
-    textured = render(scene, [view(box(7.0, Layer(0)))])
+    textured = render(scene, [view(box(7.0, TextureLayer(0)))])
     for size in (32, (20, 50), 1):
         seen = taps(textured, size)
         assert len(seen.pixel) > 50
@@ -74,11 +74,11 @@ def test_a_texture_of_one_colour_is_a_paint(scene: Scene) -> None:
         assert out.numpy() == pytest.approx(painted.radiance, rel=1e-4, abs=1e-5)
 
 
-def test_layers_lie_one_above_the_other(scene: Scene) -> None:
+def test_layers_lie_one_above_the_other(scene: RenderScene) -> None:
     """Two half transparent layers over paint: what is seen is their mixture, in their order."""
     below, above, paint = (0.8, 0.1, 0.1), (0.1, 0.1, 0.9), (0.2, 0.6, 0.2)
     mask = np.full((3, 5), 0.5, np.float32)
-    worn = (Layer(3, opacity=0.6), Layer(7, mask=mask))
+    worn = (TextureLayer(3, opacity=0.6), TextureLayer(7, mask=mask))
     mixed = tuple(0.5 * a + 0.5 * (0.6 * b + 0.4 * p) for a, b, p in zip(above, below, paint, strict=True))
     expected = render(scene, [view(box(paint=mixed))])
     picture = render(scene, [view(box(7.0, *worn, paint=paint))])
@@ -87,19 +87,19 @@ def test_layers_lie_one_above_the_other(scene: Scene) -> None:
     assert out.numpy() == pytest.approx(expected.radiance, rel=1e-4, abs=1e-5)
 
 
-def test_a_patch_stays_in_its_rectangle(scene: Scene) -> None:
-    whole = render(scene, [view(box(7.0, Layer(0)))])
-    part = render(scene, [view(box(7.0, Layer(0, (0.0, 0.0, 0.4, 0.4))))])
+def test_a_patch_stays_in_its_rectangle(scene: RenderScene) -> None:
+    whole = render(scene, [view(box(7.0, TextureLayer(0)))])
+    part = render(scene, [view(box(7.0, TextureLayer(0, (0.0, 0.0, 0.4, 0.4))))])
     assert 0 < len(part.fragments) < len(whole.fragments)
     assert part.fragments["u"].min() >= 0
     assert part.fragments["u"].max() <= 1
 
 
-def test_a_decal_lies_on_what_faces_it(scene: Scene) -> None:
+def test_a_decal_lies_on_what_faces_it(scene: RenderScene) -> None:
     """On the ground: the pixels that it changes are those that the camera's geometry says."""
     # x to the camera's right, y towards it, z down
     down = np.array([[0, -1.0, 0, 9.0], [-1.0, 0, 0, 0.5], [0, 0, -1.0, 0.0], [0, 0, 0, 1.0]])
-    decal = Decal(0, down, (2.0, 3.0))
+    decal = TextureDecal(0, down, (2.0, 3.0))
     bare, marked = (render(scene, [v], quality=PLAIN) for v in (view(), view(decals=(decal,))))
     white = retexture(taps(marked, 16), flat((1.0, 1.0, 1.0), (16, 16)), base(marked))
     changed = (np.abs(white.numpy() - bare.radiance).max(-1) > 1e-3)[0]
@@ -121,9 +121,9 @@ def test_a_decal_lies_on_what_faces_it(scene: Scene) -> None:
     assert not len(render(scene, [view(decals=(replace(decal, tag=5),))]).fragments), "somebody else wears it"
 
 
-def test_the_gradient_equals_finite_differences(scene: Scene) -> None:
+def test_the_gradient_equals_finite_differences(scene: RenderScene) -> None:
     rng = np.random.default_rng(0)
-    picture = render(scene, [view(box(7.0, Layer(0)))])
+    picture = render(scene, [view(box(7.0, TextureLayer(0)))])
     for size in ((16, 16), (64, 48), (255, 256)):
         seen = taps(picture, size)
         texture, step = torch.tensor(rng.uniform(0.2, 0.8, (3, *size))), torch.tensor(rng.normal(size=(3, *size)))
@@ -135,11 +135,11 @@ def test_the_gradient_equals_finite_differences(scene: Scene) -> None:
         assert float((leaf.grad * step).sum()) == pytest.approx(float(ahead - behind) / 2e-2, rel=1e-5)
 
 
-def test_small_textures_and_far_things_still_get_gradient(scene: Scene) -> None:
+def test_small_textures_and_far_things_still_get_gradient(scene: RenderScene) -> None:
     """Far away a pixel spans many texels: through the pyramid each of those that are seen gets its share."""
     shares = []
     for distance in (8.0, 40.0):
-        picture = render(scene, [view(box(distance, Layer(0)))])
+        picture = render(scene, [view(box(distance, TextureLayer(0)))])
         leaf = torch.zeros(3, 128, 128, dtype=torch.float64, requires_grad=True)
         retexture(taps(picture, 128), leaf, base(picture)).sum().backward()
         assert leaf.grad is not None
@@ -163,7 +163,7 @@ def test_the_pyramid_keeps_the_mean_over_the_mask(height: int, width: int, seed:
 
 
 @pytest.mark.parametrize("size", [(64, 64), (256, 256), (100, 180)])
-def test_the_colour_of_the_gutter_changes_no_pixel(scene: Scene, size: tuple[int, int]) -> None:
+def test_the_colour_of_the_gutter_changes_no_pixel(scene: RenderScene, size: tuple[int, int]) -> None:
     """From near and far, a car in every direction: what is printed where the car is not is never seen."""
     mask = paint_mask(CAR, size)
     assert 0.1 < mask.mean() < 0.9
@@ -172,7 +172,7 @@ def test_the_colour_of_the_gutter_changes_no_pixel(scene: Scene, size: tuple[int
         pose = place(distance, 0.0)
         cos, sin = np.cos(1.3 * k + 0.4), np.sin(1.3 * k + 0.4)
         pose[:2, :2] = [[cos, -sin], [sin, cos]]
-        views.append(view(Thing(2, pose, tag=1, layers=(Layer(0),))))
+        views.append(view(SceneObject(2, pose, tag=1, layers=(TextureLayer(0),))))
     picture = render(scene, views)
     seen = taps(picture, size, mask=mask)
     colours = torch.tensor(np.random.default_rng(0).uniform(0, 1, (3, *size)))
@@ -184,8 +184,8 @@ def test_the_colour_of_the_gutter_changes_no_pixel(scene: Scene, size: tuple[int
     assert leak > 0.01, "without the mask it is seen"
 
 
-def test_wrong_textures_are_refused_in_one_line(scene: Scene) -> None:
-    picture = render(scene, [view(box(7.0, Layer(0)))])
+def test_wrong_textures_are_refused_in_one_line(scene: RenderScene) -> None:
+    picture = render(scene, [view(box(7.0, TextureLayer(0)))])
     seen = taps(picture, 16)
     grey = torch.full((3, 16, 16), 0.5, dtype=torch.float64)
     nan = grey.clone()
@@ -196,19 +196,19 @@ def test_wrong_textures_are_refused_in_one_line(scene: Scene) -> None:
         assert "\n" not in str(error.value)
     for size in (0, (4, 0), 1 << 15):
         with pytest.raises(ConfigError, match="texels"):
-            taps_of(picture, size)
+            texture_taps(picture, size)
     with pytest.raises(ConfigError, match="mask"):
-        taps_of(picture, 16, mask=np.ones((8, 8), bool))
+        texture_taps(picture, 16, mask=np.ones((8, 8), bool))
     with pytest.raises(ConfigError, match="mask"):
-        taps_of(picture, 16, mask=np.zeros((16, 16), bool))
+        texture_taps(picture, 16, mask=np.zeros((16, 16), bool))
     for wrong_layer in (
-        lambda: Layer(-1),
-        lambda: Layer(0, (0.5, 0.0, 0.5, 1.0)),
-        lambda: Layer(0, opacity=1.5),
-        lambda: Layer(0, mask=np.full((2, 2), 2.0, np.float32)),
-        lambda: Layer(0, mask=np.zeros(4, np.float32)),
-        lambda: Decal(0, np.eye(3), (1.0, 1.0)),
-        lambda: Decal(0, np.eye(4), (0.0, 1.0)),
+        lambda: TextureLayer(-1),
+        lambda: TextureLayer(0, (0.5, 0.0, 0.5, 1.0)),
+        lambda: TextureLayer(0, opacity=1.5),
+        lambda: TextureLayer(0, mask=np.full((2, 2), 2.0, np.float32)),
+        lambda: TextureLayer(0, mask=np.zeros(4, np.float32)),
+        lambda: TextureDecal(0, np.eye(3), (1.0, 1.0)),
+        lambda: TextureDecal(0, np.eye(4), (0.0, 1.0)),
     ):
         with pytest.raises(ConfigError):
             wrong_layer()

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
-from ssad.rendering.camera.lamps import Lamp
-from ssad.rendering.camera.render import PLAIN, Picture, View, Weather, render
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.lamps import SceneLamp
+from ssad.rendering.camera.render import PLAIN, Rendering, SceneWeather, View, render
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.camera.torch_lamp import lamp_light, shine
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
@@ -24,32 +24,32 @@ FOG = 0.01
 
 
 @pytest.fixture(scope="module")
-def view() -> tuple[Scene, View]:
+def view() -> tuple[RenderScene, View]:
     """A block on the ground by dusk, from 1.7 m."""
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) * 60
     ground = build(corners, np.array([[0, 1, 2], [0, 2, 3]]), materials=(GREY,))
     block = meshes.box((2.0, 3.0, 2.0), material=GREY, centre=(0.0, 0.0, 1.0))
     eye = FORWARD.copy()
     eye[:3, 3] = -9.0, 0.0, 1.7
-    things = Thing(0, np.eye(4)), Thing(1, np.eye(4))
-    return Scene(None, [ground, block]), View(CAMERA, eye, things, Weather(sun_height=0.0, fog=FOG))
+    things = SceneObject(0, np.eye(4)), SceneObject(1, np.eye(4))
+    return RenderScene(None, [ground, block]), View(CAMERA, eye, things, SceneWeather(sun_height=0.0, fog=FOG))
 
 
-def lamp(**other: object) -> Lamp:
+def lamp(**other: object) -> SceneLamp:
     """Above the camera and to its left, turned towards the block."""
     pose = FORWARD.copy()
     cos, sin = np.cos(0.3), np.sin(0.3)
     pose[:3, :3] = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) @ pose[:3, :3]
     pose[:3, 3] = -8.0, 2.0, 2.5
-    return Lamp(**({"pose": pose, "power": 40.0, "spread": (0.5, 0.3), "shadows": False, "reach": 40.0} | other))  # type: ignore[arg-type]
+    return SceneLamp(**({"pose": pose, "power": 40.0, "spread": (0.5, 0.3), "shadows": False, "reach": 40.0} | other))  # type: ignore[arg-type]
 
 
-def seen(made: tuple[Scene, View], *lamps: Lamp) -> Picture:
+def seen(made: tuple[RenderScene, View], *lamps: SceneLamp) -> Rendering:
     scene, view = made
     return render(scene, [replace(view, lamps=lamps)], surface=True, quality=PLAIN)
 
 
-def added(picture: Picture, one: Lamp, **given: Tensor) -> Tensor:
+def added(picture: Rendering, one: SceneLamp, **given: Tensor) -> Tensor:
     """What the lamp adds to the radiance of a picture, float64."""
     assert picture.surface is not None
     place, normal = (torch.tensor(v, dtype=torch.float64) for v in (picture.surface.position, picture.surface.normal))
@@ -57,7 +57,7 @@ def added(picture: Picture, one: Lamp, **given: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("other", [{}, {"square": True}, {"soft": 0.0}, {"colour": (0.2, 1.0, 0.5), "reach": 12.0}])
-def test_the_light_is_the_renderers(view: tuple[Scene, View], other: dict[str, object]) -> None:
+def test_the_light_is_the_renderers(view: tuple[RenderScene, View], other: dict[str, object]) -> None:
     """But at the edges of things, where a pixel shows two, and at the rim of the light."""
     one = lamp(**other)
     dark, lit = seen(view), seen(view, one)
@@ -68,7 +68,7 @@ def test_the_light_is_the_renderers(view: tuple[Scene, View], other: dict[str, o
     assert (np.abs(found - wanted) < 0.002 + 0.01 * wanted).mean() > 0.95
 
 
-def test_gradients_are_those_of_finite_differences(view: tuple[Scene, View]) -> None:
+def test_gradients_are_those_of_finite_differences(view: tuple[RenderScene, View]) -> None:
     one, dark = lamp(soft=0.8), seen(view)
     assert dark.surface is not None
     some = np.flatnonzero(dark.tag.ravel() >= 0)[::97]
@@ -85,7 +85,7 @@ def test_gradients_are_those_of_finite_differences(view: tuple[Scene, View]) -> 
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_the_gradient_is_how_rendered_pictures_change(view: tuple[Scene, View], axis: int) -> None:
+def test_the_gradient_is_how_rendered_pictures_change(view: tuple[RenderScene, View], axis: int) -> None:
     """The light that a patch of the block gets while the lamp moves, rendered and by the gradient."""
     one, step = lamp(soft=1.0, spread=(0.6, 0.5)), 0.05
     patch = (slice(0, 1), slice(24, 34), slice(42, 56))
@@ -101,7 +101,7 @@ def test_the_gradient_is_how_rendered_pictures_change(view: tuple[Scene, View], 
     assert float(pose.grad[axis, 3]) == pytest.approx(slope, rel=0.05, abs=0.05)
 
 
-def test_what_cannot_be_is_refused(view: tuple[Scene, View]) -> None:
+def test_what_cannot_be_is_refused(view: tuple[RenderScene, View]) -> None:
     scene, plain = view
     with pytest.raises(ConfigError, match="projects a texture"):
         lamp_light(lamp(texture=0), torch.zeros(3), torch.zeros(3))

@@ -176,7 +176,7 @@ def test_arrays_tiles_and_levels(name: str) -> None:
     eye = (float(town(name).xy[0, 0]), float(town(name).xy[0, 1]))
     near = scene.select(eye)
     assert len(np.unique(near)) == len(near) < 0.8 * len(scene.faces)
-    assert set(scene.select(eye, reach=(1e4, 1e4), far=1e4).tolist()) == set(parts[0].tolist())
+    assert set(scene.select(eye, reach=(1e4, 1e4), max_distance=1e4).tolist()) == set(parts[0].tolist())
 
 
 @pytest.mark.parametrize("name", others_slow(TOWNS, QUICK))

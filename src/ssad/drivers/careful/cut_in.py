@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.types import F64, Bool
 from ssad.drivers.careful.encounter import Encounter
-from ssad.drivers.careful.models import CarefulModel, Reaction, calm, react
+from ssad.drivers.careful.models import CarefulModel, Reaction, initial_reaction, react
 
 STEP = 0.1  # s
 CHUNK = 4096  # encounters at a time, so that they stay in the cache
@@ -42,7 +42,7 @@ class CutIns:
         return len(self.speed)
 
 
-def grid(
+def cut_in_grid(
     pairs: Iterable[tuple[float, float]], gaps: Iterable[float], *, lateral: float = 1.6, sideways: int = 18
 ) -> CutIns:
     """Return all combinations of speeds, gaps and lateral speeds.
@@ -62,9 +62,9 @@ def grid(
     return CutIns(speeds[speed_pair.astype(int), 0], speeds[speed_pair.astype(int), 1], gap, lateral_speed, lateral)
 
 
-def slower(speeds: Iterable[int], least: int = 10) -> list[tuple[int, int]]:
-    """Each speed with all lower ones, km/h, in steps of 10 from `least`."""
-    return [(speed, lead) for speed in speeds for lead in range(least, speed, 10)]
+def speed_pairs(speeds: Iterable[int], lowest: int = 10) -> list[tuple[int, int]]:
+    """Each speed with all lower ones, km/h, in steps of 10 from `lowest`."""
+    return [(speed, lead) for speed in speeds for lead in range(lowest, speed, 10)]
 
 
 def crashes(model: CarefulModel, cases: CutIns, *, seconds: float = 60.0) -> Bool:
@@ -93,7 +93,7 @@ def _crashes(model: CarefulModel, cases: CutIns, part: slice, steps: int) -> Boo
         column[part].copy() for column in (cases.speed, cases.lead, cases.gap, cases.approach)
     )
     rows = np.arange(len(speed))
-    crashed, brake, memory = np.zeros(len(rows), bool), np.zeros(len(rows)), calm((len(rows),))
+    crashed, brake, memory = np.zeros(len(rows), bool), np.zeros(len(rows)), initial_reaction((len(rows),))
     lateral, joint_length = np.full(len(rows), cases.lateral), 2.0 * cases.length
     for _ in range(steps):
         lateral_speed = np.where(lateral > -cases.width, approach, 0.0)

@@ -76,7 +76,7 @@ class Careful:
         )
         memory = Reaction(np.where(visible, self._memory.since[scenes], -1.0), self._memory.brake[scenes])
         # hidden agents are moved far behind, where no model reacts to them
-        demanded, updated_memory = react(self.model, _only(encounter, visible), memory, STEP)
+        demanded, updated_memory = react(self.model, _visible_only(encounter, visible), memory, STEP)
         self._memory.since[scenes], self._memory.brake[scenes], self._moved[scenes] = (
             updated_memory.since,
             updated_memory.brake,
@@ -87,12 +87,12 @@ class Careful:
         self._cruise[scenes] = np.where(is_new, speed, self._cruise[scenes])
         target_speed = np.asarray(view.target_speed, np.float64)
         target = np.maximum(self._cruise[scenes], 1.0) if self.keep_speed else target_speed
-        allowed = bends(view.route)
+        allowed = squared_bend_speeds(view.route)
         bend_limit = bend_speed(allowed, np.arange(allowed.shape[1], dtype=np.float64))
         acceleration = np.clip(2.0 * (np.minimum(target, bend_limit) - speed), -2.0 * EASY, PULL)
-        must_wait = (visible & in_the_way(encounter, half_size[:, :1])).any(1)
-        acceleration = np.where((visible & comes(encounter)).any(1), np.minimum(acceleration, 0.0), acceleration)
-        brake = np.maximum(demanded.max(1, initial=0.0), _red_light(view, half_size[:, 0]))
+        must_wait = (visible & is_in_the_way(encounter, half_size[:, :1])).any(1)
+        acceleration = np.where((visible & is_coming(encounter)).any(1), np.minimum(acceleration, 0.0), acceleration)
+        brake = np.maximum(demanded.max(1, initial=0.0), _red_light_braking(view, half_size[:, 0]))
         brake = np.where(must_wait & (speed < 1.5), np.maximum(brake, 2.0 * EASY), brake)
         acceleration = np.where(brake > 0.0, np.minimum(acceleration, -brake), acceleration)
         power, steering = self._power[scenes], self._wheel[scenes]
@@ -102,27 +102,32 @@ class Careful:
         return np.clip(controls, [0.0, 0.0, -1.0], 1.0).astype(np.float32)
 
 
-def _only(e: Encounter, seen: Bool) -> Encounter:
-    """The encounters with those who are seen; the others are far behind."""
-    values = vars(e) | {"gap": np.where(seen, e.gap, -1e6)}
+def _visible_only(encounter: Encounter, is_visible: Bool) -> Encounter:
+    """Return the encounters with visible agents; all others are moved far behind."""
+    values = vars(encounter) | {"gap": np.where(is_visible, encounter.gap, -1e6)}
     return Encounter(**values)
 
 
-def in_the_way(e: Encounter, half: F64) -> Bool:
-    """For whom a driver that stands stays there: who stands before it, and who crosses or will within a moment."""
-    is_near = (e.gap > -half) & (e.lead < 1.0)
-    is_blocking = (e.lateral <= 0.0) & (e.gap < WAIT)
-    is_crossing = (e.approach > 0.3) & (e.gap < CROSSING) & (e.time_to_enter() < 3.0)
+def is_in_the_way(encounter: Encounter, half_length: F64) -> Bool:
+    """Return the agents for which a standing driver waits: those ahead of it, and those that cross or soon will."""
+    is_near = (encounter.gap > -half_length) & (encounter.lead < 1.0)
+    is_blocking = (encounter.lateral <= 0.0) & (encounter.gap < WAIT)
+    is_crossing = (encounter.approach > 0.3) & (encounter.gap < CROSSING) & (encounter.time_to_enter() < 3.0)
     return np.asarray(is_near & (is_blocking | is_crossing))
 
 
-def comes(e: Encounter) -> Bool:
-    """Towards whom no driver speeds up: who is in its way or will be within a moment, and is reached soon."""
-    is_soon = np.maximum(e.gap, 0.0) < SOON * np.maximum(e.closing(), 1.0)
-    return np.asarray(is_soon & (e.gap > -e.length) & (e.lead < e.speed) & (e.time_to_enter() < 3.0))
+def is_coming(encounter: Encounter) -> Bool:
+    """Return the agents towards which no driver speeds up: those in its way, or soon to be, and reached soon."""
+    is_soon = np.maximum(encounter.gap, 0.0) < SOON * np.maximum(encounter.closing(), 1.0)
+    return np.asarray(
+        is_soon
+        & (encounter.gap > -encounter.length)
+        & (encounter.lead < encounter.speed)
+        & (encounter.time_to_enter() < 3.0)
+    )
 
 
-def bends(route: npt.NDArray[np.floating]) -> F64:
+def squared_bend_speeds(route: npt.NDArray[np.floating]) -> F64:
     """Return squared speed limits of bends [N, R - 4], (m/s)^2, of routes [N, R, 2] with a point per metre."""
     points = np.asarray(route, np.float64)
     steps = np.diff(points, axis=1)
@@ -140,11 +145,11 @@ def bend_speed(allowed: F64, ahead: F64) -> F64:
     return np.asarray(np.sqrt(np.where(ahead > -0.5, allowed + braking_term, np.inf).min(1)))
 
 
-def _red_light(view: Observation, half: F64) -> F64:
+def _red_light_braking(view: Observation, half_length: F64) -> F64:
     """m/s^2 to stop before a red light, or a yellow one if that is easy; 0 as long as there is time."""
     state, line_distance = np.asarray(view.signal, np.float64).T
     speed = np.asarray(view.speed, np.float64)
-    room = line_distance - half - 1.0
+    room = line_distance - half_length - 1.0
     required = speed * speed / (2.0 * np.maximum(room, 0.2))
     must_stop = (state == SignalState.RED) & (required > EASY) & (room > -2.0) & (required < 8.0)
     must_stop |= (state == SignalState.YELLOW) & (required > EASY) & (required < 3.5) & (room > 0.0)

@@ -14,9 +14,9 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Bool, Episode, EpisodeTrace
 from ssad.core.visibility import in_sight
 from ssad.drivers.careful.driver import REACH, Careful
-from ssad.drivers.careful.limit import Evasions, Limit, OwnSide, limit_of, manoeuvres
+from ssad.drivers.careful.limit import Evasions, Limit, WrongSideObserver, limit_of, manoeuvres
 from ssad.drivers.careful.models import MODELS
-from ssad.drivers.careful.replay import Ending, Takeover, play
+from ssad.drivers.careful.replay import ReplayPlan, Takeover, run_replays
 from ssad.metrics.criticality import ttc
 from ssad.metrics.driving import first_contact
 from ssad.world.world import World
@@ -64,7 +64,7 @@ class Grade:
         return fields | {"avoided_by_limit": float(self.verdict != "unavoidable")}
 
 
-class _Onlooker:
+class _ReplayObserver:
     """Observer of replays, one drive per scene: fidelity, trigger and visibility of the other agent.
 
     Attributes:
@@ -99,7 +99,7 @@ class _Onlooker:
             self.seen[:, step] = is_observed & visible[rows, self.agents]
 
 
-def danger_begins(trace: EpisodeTrace, agent: int, contact: int, triggered: Bool, seen: Bool) -> int:
+def danger_start(trace: EpisodeTrace, agent: int, contact: int, is_triggered: Bool, is_visible: Bool) -> int:
     """The step in which a danger begins that ends in a contact.
 
     It exists once the other is triggered (if it follows a script), or while both would touch within 4 s if they went
@@ -107,10 +107,10 @@ def danger_begins(trace: EpisodeTrace, agent: int, contact: int, triggered: Bool
 
     Args:
         trace: The drive.
-        agent: Who was hit.
+        agent: Index of the agent that was hit.
         contact: The step of the contact.
-        triggered: [T] whether its script has begun.
-        seen: [T] whether the ego sees it.
+        is_triggered: [T] True once its script has begun.
+        is_visible: [T] True where the ego sees it.
 
     Returns:
         A step from 6 s before the contact to the contact.
@@ -119,16 +119,16 @@ def danger_begins(trace: EpisodeTrace, agent: int, contact: int, triggered: Bool
     if agent < 1:
         return earliest
     on_course = ttc(trace)[: contact + 1, agent - 1] <= HORIZON
-    danger_step = earliest + conflict_begins(on_course[earliest:])
-    trigger_steps = np.flatnonzero(triggered[: contact + 1])
+    danger_step = earliest + conflict_start(on_course[earliest:])
+    trigger_steps = np.flatnonzero(is_triggered[: contact + 1])
     if len(trigger_steps):
         danger_step = min(danger_step, int(trigger_steps[0]))
     danger_step = max(danger_step, earliest)
-    visible_steps = np.flatnonzero(seen[danger_step:contact])
+    visible_steps = np.flatnonzero(is_visible[danger_step:contact])
     return danger_step + int(visible_steps[0]) if len(visible_steps) else contact
 
 
-def conflict_begins(on_course: Bool) -> int:
+def conflict_start(on_course: Bool) -> int:
     """Return the step since which two agents are on a collision course, up to the last one [T], the contact."""
     first_step, interruption = len(on_course) - 1, 0
     for step in range(len(on_course) - 2, -1, -1):
@@ -186,23 +186,23 @@ def grade_collisions(
     contacts = [first_contact(trace) for _, _, trace in drives]
     contact_times = [step * trace.dt for (step, _), (_, _, trace) in zip(contacts, drives, strict=True)]
     no_takeover = Takeover(Careful(), math.inf)
-    observer = _Onlooker(drives, [agent for _, agent in contacts])
-    play(
-        [Ending(*drive, [no_takeover], end) for drive, end in zip(drives, contact_times, strict=True)],
+    observer = _ReplayObserver(drives, [agent for _, agent in contacts])
+    run_replays(
+        [ReplayPlan(*drive, [no_takeover], end) for drive, end in zip(drives, contact_times, strict=True)],
         watch=observer,
         **run_options,
     )
     danger_steps = [
-        danger_begins(
+        danger_start(
             trace, agent, contact, observer.triggered[index, : len(trace.x)], observer.seen[index, : len(trace.x)]
         )
         for index, ((_, _, trace), (contact, agent)) in enumerate(zip(drives, contacts, strict=True))
     ]
     takeover_times = [begin * trace.dt for begin, (_, _, trace) in zip(danger_steps, drives, strict=True)]
     models = [Careful(name, keep_speed=True) for name in MODELS]
-    collided = play(
+    collided = run_replays(
         [
-            Ending(*drive, [Takeover(model, start) for model in models], end + AFTER)
+            ReplayPlan(*drive, [Takeover(model, start) for model in models], end + AFTER)
             for drive, start, end in zip(drives, takeover_times, contact_times, strict=True)
         ],
         **run_options,
@@ -222,7 +222,7 @@ def grade_collisions(
 
 
 def _limits(
-    drives: Sequence[Drive], starts: Sequence[float], ends: Sequence[float], about: Mapping[str, Any]
+    drives: Sequence[Drive], starts: Sequence[float], ends: Sequence[float], run_options: Mapping[str, Any]
 ) -> list[Limit]:
     """The kinematic limits, of as many drives side by side as fit into a world."""
     options_by_drive = [
@@ -236,20 +236,20 @@ def _limits(
         options = [manoeuvre for index in chunk for manoeuvre in options_by_drive[index]]
         evasions = Evasions(options)
         episodes = [drives[index][0] for index in chunk for _ in options_by_drive[index]]
-        side_watch = OwnSide(
+        side_watch = WrongSideObserver(
             episodes,
             {drives[index][0].town: drives[index][1] for index in chunk},
             [manoeuvre.start for manoeuvre in options],
         )
         endings = [
-            Ending(
+            ReplayPlan(
                 *drives[index],
                 [Takeover(evasions, manoeuvre.start) for manoeuvre in options_by_drive[index]],
                 ends[index] + AFTER,
             )
             for index in chunk
         ]
-        hits = play(endings, watch=side_watch, **about)
+        hits = run_replays(endings, watch=side_watch, **run_options)
         left_road = np.split(side_watch.left, np.cumsum([len(collided) for collided in hits])[:-1])
         for index, collided, left_side in zip(chunk, hits, left_road, strict=True):
             limits.append(limit_of(options_by_drive[index], ~collided & ~left_side, contact=ends[index]))

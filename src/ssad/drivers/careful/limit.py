@@ -118,7 +118,7 @@ class Evasions:
         return np.clip(controls, [0.0, 0.0, -1.0], 1.0).astype(np.float32)
 
 
-class OwnSide:
+class WrongSideObserver:
     """Observer of egos that leave the road or cross to its other side after their takeover.
 
     Args:

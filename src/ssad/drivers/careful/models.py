@@ -41,7 +41,7 @@ class CarefulModel:
     coast: float
     hold: float
 
-    def demand(self, e: Encounter) -> F64:
+    def demand(self, encounter: Encounter) -> F64:
         """Return the braking that each other agent requires, m/s^2; 0: no danger, or not perceived yet."""
         raise NotImplementedError
 
@@ -67,11 +67,17 @@ class CarefulHuman(CarefulModel):
     critical: float = 2.0
     wait_for_overlap: bool = False
 
-    def demand(self, e: Encounter) -> F64:
+    def demand(self, encounter: Encounter) -> F64:
         """Brake hard below the critical TTC, once the other is perceived."""
-        is_cutting_in = (e.moved > self.wander + self.evaluate) & (e.approach > 0.0) & (not self.wait_for_overlap)
-        is_perceived = (e.lateral <= 0.0) | is_cutting_in
-        return np.where(is_perceived & e.ahead() & stays(e) & (e.time_to_reach() < self.critical), HARD, 0.0)
+        is_cutting_in = (
+            (encounter.moved > self.wander + self.evaluate) & (encounter.approach > 0.0) & (not self.wait_for_overlap)
+        )
+        is_perceived = (encounter.lateral <= 0.0) | is_cutting_in
+        return np.where(
+            is_perceived & encounter.ahead() & stays_in_path(encounter) & (encounter.time_to_reach() < self.critical),
+            HARD,
+            0.0,
+        )
 
 
 @dataclass(frozen=True)
@@ -95,11 +101,17 @@ class Reg157(CarefulModel):
     spare: float = 0.1
     reach: float = 46.0
 
-    def demand(self, e: Encounter) -> F64:
+    def demand(self, encounter: Encounter) -> F64:
         """Brake once the TTC of a vehicle in the lane falls below the time that braking takes."""
-        in_lane = (e.lateral <= 0.0) | ((e.lateral <= self.margin) & (e.approach > 0.0))
-        required_time = e.closing() / (2.0 * self.brake) + self.delay + self.spare
-        is_danger = in_lane & e.ahead() & stays(e) & (e.gap < self.reach) & (e.time_to_reach() < required_time)
+        in_lane = (encounter.lateral <= 0.0) | ((encounter.lateral <= self.margin) & (encounter.approach > 0.0))
+        required_time = encounter.closing() / (2.0 * self.brake) + self.delay + self.spare
+        is_danger = (
+            in_lane
+            & encounter.ahead()
+            & stays_in_path(encounter)
+            & (encounter.gap < self.reach)
+            & (encounter.time_to_reach() < required_time)
+        )
         return np.where(is_danger, self.brake, 0.0)
 
 
@@ -127,23 +139,29 @@ class RSS(CarefulModel):
     sideways: float = 1.0
     wander: float = 0.3
 
-    def _runs(self, speed: F64, push: float, brake: float) -> F64:
-        """How far a body goes that speeds up during the delay and then brakes, m."""
-        final_speed = speed + push * self.delay
-        return (speed + 0.5 * push * self.delay) * self.delay + final_speed * final_speed / (2.0 * brake)
+    def _runs(self, speed: F64, acceleration: float, brake: float) -> F64:
+        """Return the stopping distance, m, of a body that speeds up during the delay and then brakes."""
+        final_speed = speed + acceleration * self.delay
+        return (speed + 0.5 * acceleration * self.delay) * self.delay + final_speed * final_speed / (2.0 * brake)
 
-    def demand(self, e: Encounter) -> F64:
+    def demand(self, encounter: Encounter) -> F64:
         """Brake hard while both the longitudinal and the lateral distance are unsafe."""
-        ego_distance = self._runs(e.speed, self.accelerate, self.brake)
-        leader_distance = -e.lead * np.abs(e.lead) / (2.0 * self.brake)
-        oncoming_distance = self._runs(np.abs(e.lead), self.accelerate, self.brake)
-        safe_gap = np.maximum(ego_distance + np.where(e.lead >= 0.0, leader_distance, oncoming_distance), 0.0)
-        lateral_stop = self._runs(np.zeros_like(e.speed), self.sideways, self.sideways)
+        ego_distance = self._runs(encounter.speed, self.accelerate, self.brake)
+        leader_distance = -encounter.lead * np.abs(encounter.lead) / (2.0 * self.brake)
+        oncoming_distance = self._runs(np.abs(encounter.lead), self.accelerate, self.brake)
+        safe_gap = np.maximum(ego_distance + np.where(encounter.lead >= 0.0, leader_distance, oncoming_distance), 0.0)
+        lateral_stop = self._runs(np.zeros_like(encounter.speed), self.sideways, self.sideways)
         safe_lateral = (
-            self.wander + lateral_stop + self._runs(np.maximum(e.approach, 0.0), self.sideways, self.sideways)
+            self.wander + lateral_stop + self._runs(np.maximum(encounter.approach, 0.0), self.sideways, self.sideways)
         )
-        is_beside = (e.lateral <= 0.0) | ((e.lateral < safe_lateral) & (e.approach > 0.0))
-        is_danger = (e.gap < safe_gap) & is_beside & (e.gap > -e.length) & (e.speed > 0.0) & stays(e)
+        is_beside = (encounter.lateral <= 0.0) | ((encounter.lateral < safe_lateral) & (encounter.approach > 0.0))
+        is_danger = (
+            (encounter.gap < safe_gap)
+            & is_beside
+            & (encounter.gap > -encounter.length)
+            & (encounter.speed > 0.0)
+            & stays_in_path(encounter)
+        )
         return np.where(is_danger, HARD, 0.0)
 
 
@@ -152,8 +170,8 @@ class FSM(CarefulModel):
     """Fuzzy Safety Model: brakes gently where a stop gets tight, hard where it would not succeed.
 
     Attributes:
-        least: Comfortable braking, m/s^2.
-        most: Hard braking, m/s^2.
+        gentle_braking: Comfortable braking, m/s^2.
+        hard_braking: Hard braking, m/s^2.
         leader: Assumed braking of the leader, m/s^2.
         margin: Standstill gap, m.
     """
@@ -163,50 +181,58 @@ class FSM(CarefulModel):
     jerk: float = JERK
     coast: float = 0.0
     hold: float = 0.0
-    least: float = 4.0
-    most: float = 6.0
+    gentle_braking: float = 4.0
+    hard_braking: float = 6.0
     leader: float = 7.0
     margin: float = 2.0
 
-    def demand(self, e: Encounter) -> F64:
+    def demand(self, encounter: Encounter) -> F64:
         """Brake according to the critical fuzzy score, else the proactive one."""
-        proactive, critical = self.proactive(e), self.critical(e)
-        level = np.where(critical > 0.0, self.least + (self.most - self.least) * critical, self.least * proactive)
-        passes_before = e.time_to_enter() > e.time_to_pass() + SPARE
-        is_relevant = (e.lateral <= 0.0) | (e.approach > 0.0)
-        return np.where(is_relevant & ~passes_before & (e.gap > -e.length) & stays(e), np.minimum(level, HARD), 0.0)
+        proactive, critical = self.proactive(encounter), self.critical(encounter)
+        level = np.where(
+            critical > 0.0,
+            self.gentle_braking + (self.hard_braking - self.gentle_braking) * critical,
+            self.gentle_braking * proactive,
+        )
+        passes_before = encounter.time_to_enter() > encounter.time_to_pass() + SPARE
+        is_relevant = (encounter.lateral <= 0.0) | (encounter.approach > 0.0)
+        return np.where(
+            is_relevant & ~passes_before & (encounter.gap > -encounter.length) & stays_in_path(encounter),
+            np.minimum(level, HARD),
+            0.0,
+        )
 
-    def proactive(self, e: Encounter) -> F64:
+    def proactive(self, encounter: Encounter) -> F64:
         """PFS, 0 to 1: could the driver stop behind a leader that brakes?"""
-        speed, leader_stop = e.speed, e.lead * np.abs(e.lead) / (2.0 * self.leader)
-        safe = speed * self.delay + speed * speed / (2.0 * self.least) - leader_stop + self.margin
-        unsafe = speed * self.delay + speed * speed / (2.0 * self.most) - leader_stop
-        return _between(e.gap - self.margin, safe, unsafe)
+        speed, leader_stop = encounter.speed, encounter.lead * np.abs(encounter.lead) / (2.0 * self.leader)
+        safe = speed * self.delay + speed * speed / (2.0 * self.gentle_braking) - leader_stop + self.margin
+        unsafe = speed * self.delay + speed * speed / (2.0 * self.hard_braking) - leader_stop
+        return _danger_level(encounter.gap - self.margin, safe, unsafe)
 
-    def critical(self, e: Encounter) -> F64:
+    def critical(self, encounter: Encounter) -> F64:
         """CFS, 0 to 1: could the driver slow down to a leader that keeps its speed?"""
-        speed, lead_speed, gap = e.speed, e.lead, e.gap
-        acceleration = np.maximum(e.accel, -self.least)
+        speed, lead_speed, gap = encounter.speed, encounter.lead, encounter.gap
+        acceleration = np.maximum(encounter.accel, -self.gentle_braking)
         final_speed = speed + acceleration * self.delay
-        braking = np.where(acceleration < 0.0, acceleration, -self.least)
+        braking = np.where(acceleration < 0.0, acceleration, -self.gentle_braking)
         is_critical = (gap < (speed - lead_speed) ** 2 / (2.0 * np.abs(braking))).astype(np.float64)
         delay_distance = (0.5 * (speed + final_speed) - lead_speed) * self.delay
-        safe = delay_distance + (final_speed - lead_speed) ** 2 / (2.0 * self.least)
-        unsafe = delay_distance + (final_speed - lead_speed) ** 2 / (2.0 * self.most)
+        safe = delay_distance + (final_speed - lead_speed) ** 2 / (2.0 * self.gentle_braking)
+        unsafe = delay_distance + (final_speed - lead_speed) ** 2 / (2.0 * self.hard_braking)
         return np.where(
-            speed > lead_speed, np.where(final_speed < lead_speed, is_critical, _between(gap, safe, unsafe)), 0.0
+            speed > lead_speed, np.where(final_speed < lead_speed, is_critical, _danger_level(gap, safe, unsafe)), 0.0
         )
 
 
-def _between(gap: F64, safe: F64, unsafe: F64) -> F64:
+def _danger_level(gap: F64, safe: F64, unsafe: F64) -> F64:
     """Return 0 above `safe`, 1 below `unsafe`, linear in between."""
     width = np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(gap >= safe, 0.0, np.where(gap <= unsafe, 1.0, (safe - gap) / width))
 
 
-def stays(e: Encounter) -> Bool:
-    """Whether the other is not gone from the path by the time that the driver reaches it."""
-    return np.asarray(e.time_to_leave() + SPARE > e.time_to_reach())
+def stays_in_path(encounter: Encounter) -> Bool:
+    """Return True where the other agent is still in the path when the driver reaches it."""
+    return np.asarray(encounter.time_to_leave() + SPARE > encounter.time_to_reach())
 
 
 MODELS: dict[str, CarefulModel] = {m.name: m for m in (CarefulHuman(), Reg157(), RSS(), FSM())}
@@ -233,36 +259,36 @@ class Reaction:
     brake: F64
 
 
-def calm(shape: tuple[int, ...]) -> Reaction:
+def initial_reaction(shape: tuple[int, ...]) -> Reaction:
     """Return the memory without danger and braking."""
     return Reaction(np.full(shape, -1.0), np.zeros(shape))
 
 
-def react(model: CarefulModel, e: Encounter, before: Reaction, dt: float) -> tuple[F64, Reaction]:
+def react(model: CarefulModel, encounter: Encounter, previous: Reaction, dt: float) -> tuple[F64, Reaction]:
     """One step of a model.
 
     Args:
         model: The model.
-        e: Everybody that the driver sees.
-        before: What it remembered.
+        encounter: Everybody that the driver sees.
+        previous: What it remembered.
         dt: s of the step.
 
     Returns:
         Mean braking over the step that each other asks for, m/s^2, and what the model remembers now.
     """
-    demanded = model.demand(e)
-    is_braking = (before.since + dt > model.delay) & (before.since >= 0.0)
+    demanded = model.demand(encounter)
+    is_braking = (previous.since + dt > model.delay) & (previous.since >= 0.0)
     if model.hold > 0.0:
-        is_relevant = (e.lateral <= 0.0) | (e.approach > 0.0)
-        demanded = np.where(is_braking & e.ahead() & is_relevant, np.maximum(demanded, model.hold), demanded)
-    since = np.where(demanded > 0.0, np.maximum(before.since, 0.0), -1.0)
+        is_relevant = (encounter.lateral <= 0.0) | (encounter.approach > 0.0)
+        demanded = np.where(is_braking & encounter.ahead() & is_relevant, np.maximum(demanded, model.hold), demanded)
+    since = np.where(demanded > 0.0, np.maximum(previous.since, 0.0), -1.0)
     # the delay may end within the step
     share = np.clip((since + dt - model.delay) / dt, 0.0, 1.0)
     if np.isinf(model.jerk):
         brake = np.where(share > 0.0, demanded, 0.0)
         mean_braking = demanded * share
     else:
-        brake = np.where(share > 0.0, np.minimum(demanded, before.brake + model.jerk * dt * share), 0.0)
-        mean_braking = 0.5 * (np.minimum(before.brake, demanded) + brake)
+        brake = np.where(share > 0.0, np.minimum(demanded, previous.brake + model.jerk * dt * share), 0.0)
+        mean_braking = 0.5 * (np.minimum(previous.brake, demanded) + brake)
     mean_braking = np.where((since >= 0.0) & (share < 1.0), np.maximum(mean_braking, model.coast), mean_braking)
     return mean_braking, Reaction(np.where(since >= 0.0, since + dt, -1.0), brake)

@@ -16,7 +16,7 @@ from ssad.world.rollout import Loop
 from ssad.world.world import World
 
 
-class Hand(Protocol):
+class ReplacementDriver(Protocol):
     """Protocol of a driver that takes over: the required part of `Driver`.
 
     Attributes:
@@ -37,11 +37,11 @@ class Takeover:
     """Driver that takes over a scene, and the time of the takeover.
 
     Attributes:
-        hand: The driver; one driver may take many scenes.
+        driver: The driver; one driver may take many scenes.
         start: Time of the takeover, s.
     """
 
-    hand: Hand
+    driver: ReplacementDriver
     start: float
 
 
@@ -55,7 +55,7 @@ def recorded_controls(trace: EpisodeTrace) -> F32:
 
 
 @dataclass(frozen=True)
-class Ending:
+class ReplayPlan:
     """Drive that is replayed once for each takeover.
 
     Attributes:
@@ -78,8 +78,8 @@ class Ending:
         return round(self.until / self.trace.dt)
 
 
-def play(
-    endings: Sequence[Ending],
+def run_replays(
+    endings: Sequence[ReplayPlan],
     *,
     device: str = "cpu",
     policies: Policies | None = None,
@@ -111,10 +111,10 @@ def play(
     loop = Loop(world, {}, policies=policies, sensors=sensors)
     loop.reset()
     takeovers = [takeover for ending in endings for takeover in ending.takeovers]
-    drivers = list(dict.fromkeys(candidate.hand for candidate in takeovers))
+    drivers = list(dict.fromkeys(candidate.driver for candidate in takeovers))
     for driver in drivers:
         driver.reset([replayed[index] for index in scenes])
-    driver_index = np.array([drivers.index(candidate.hand) for candidate in takeovers])
+    driver_index = np.array([drivers.index(candidate.driver) for candidate in takeovers])
     start, dt = (
         np.array([candidate.start for candidate in takeovers]),
         np.array([ending.trace.dt for ending in endings])[scenes],

@@ -26,11 +26,11 @@ class Path:
         steps = np.diff(points, axis=1)
         lengths = np.hypot(steps[..., 0], steps[..., 1])
         is_segment = lengths > 1e-3
-        first_direction = _unit(np.where(is_segment[:, :1, None], steps[:, :1], [1.0, 0.0]))
+        first_direction = _unit_vectors(np.where(is_segment[:, :1, None], steps[:, :1], [1.0, 0.0]))
         # past the end the last point is repeated: its direction is that of the last step that moves
         last_segment = np.maximum.accumulate(np.where(is_segment, np.arange(is_segment.shape[1]), 0), axis=1)
         directions = np.take_along_axis(
-            np.where(is_segment[..., None], _unit(steps), first_direction), last_segment[..., None], 1
+            np.where(is_segment[..., None], _unit_vectors(steps), first_direction), last_segment[..., None], 1
         )
         extended_start = points[:, :1] - BEHIND * first_direction
         self.a = np.concatenate([extended_start, points], 1)
@@ -38,21 +38,21 @@ class Path:
         self.size = np.concatenate([np.full((len(points), 1), BEHIND), lengths, np.full((len(points), 1), BEYOND)], 1)
         self.s = np.concatenate([np.zeros((len(points), 1)), np.cumsum(self.size[:, :-1], 1)], 1)
 
-    def project(self, xy: F64) -> tuple[F64, F64, F64]:
+    def project(self, points: F64) -> tuple[F64, F64, F64]:
         """Return the nearest point on the chain.
 
         Args:
-            xy: [N, K, 2], m.
+            points: [N, K, 2], m.
 
         Returns:
             m along the chain, m left of it, and its heading there, rad; [N, K] each.
         """
-        offsets = xy[:, :, None] - self.a[:, None]  # [N, K, S, 2]
+        offsets = points[:, :, None] - self.a[:, None]  # [N, K, S, 2]
         projections = np.clip((offsets * self.t[:, None]).sum(-1), 0.0, self.size[:, None])
         residuals = offsets - projections[..., None] * self.t[:, None]
         nearest = np.argmin((residuals * residuals).sum(-1), axis=-1)[..., None]
         gather = np.take_along_axis
-        rows = np.arange(len(xy))[:, None]
+        rows = np.arange(len(points))[:, None]
         direction = self.t[rows, nearest[..., 0]]
         residual = gather(residuals, nearest[..., None], 2)[..., 0, :]
         left = direction[..., 0] * residual[..., 1] - direction[..., 1] * residual[..., 0]
@@ -99,10 +99,10 @@ def encounters(
     """
     belief: Belief = view.readings["truth"]
     visible = in_sight(view.pose[:, :2], belief, reach) & (belief.kind != AgentKind.NONE)
-    encounter = meet(
+    encounter = encounters_on_paths(
         path,
-        half=half,
-        place=np.asarray(to_local(view.pose[:, None], belief.pose[..., :2]), np.float64),
+        half_extent=half,
+        places=np.asarray(to_local(view.pose[:, None], belief.pose[..., :2]), np.float64),
         yaw=np.asarray(belief.pose[..., 2] - view.pose[:, None, 2], np.float64),
         speed=np.asarray(belief.speed),
         size=np.asarray(belief.size),
@@ -114,11 +114,11 @@ def encounters(
     return replace(encounter, moved=lateral_travel), visible, lateral_travel
 
 
-def meet(
+def encounters_on_paths(
     path: Path,
     *,
-    half: F64,
-    place: F64,
+    half_extent: F64,
+    places: F64,
     yaw: F64,
     speed: npt.NDArray[np.floating],
     size: npt.NDArray[np.floating],
@@ -129,16 +129,16 @@ def meet(
 
     Args:
         path: The paths of N drivers.
-        half: [N, 2] half length and width of their bodies, m.
-        place: [N, K, 2] positions of the agents in the drivers' frames, m.
+        half_extent: [N, 2] half length and width of their bodies, m.
+        places: [N, K, 2] positions of the agents in the drivers' frames, m.
         yaw: [N, K] their headings, rad.
         speed: [N, K] m/s.
         size: [N, K, 2] length and width of their bodies, m.
         own_speed: [N] speed of the drivers, m/s.
         own_accel: [N] acceleration of the drivers, m/s^2.
     """
-    ego_position, _, _ = path.project(np.zeros((len(place), 1, 2)))
-    position, left, heading = path.project(place)
+    ego_position, _, _ = path.project(np.zeros((len(places), 1, 2)))
+    position, left, heading = path.project(places)
     relative_yaw = yaw - heading
     speeds: F64 = np.asarray(speed, np.float64)
     along_speed, lateral_speed = speeds * np.cos(relative_yaw), speeds * np.sin(relative_yaw)
@@ -148,7 +148,7 @@ def meet(
         half_size[..., 0] * cosine + half_size[..., 1] * sine,
         half_size[..., 0] * sine + half_size[..., 1] * cosine,
     )
-    clearance = half[:, 1:] + half_width
+    clearance = half_extent[:, 1:] + half_width
     lateral = np.abs(left) - clearance
     in_path = lateral <= 0.0
     approach = np.where(in_path, np.abs(lateral_speed), -np.sign(left) * lateral_speed)
@@ -157,15 +157,15 @@ def meet(
     return Encounter(
         speed=np.broadcast_to(np.asarray(own_speed, np.float64)[:, None], position.shape),
         accel=np.broadcast_to(np.asarray(own_accel, np.float64)[:, None], position.shape),
-        gap=position - ego_position - half[:, :1] - half_length,
+        gap=position - ego_position - half_extent[:, :1] - half_length,
         lead=along_speed,
         lateral=lateral,
         approach=approach,
         through=np.maximum(through, 0.0),
-        length=2.0 * (half[:, :1] + half_length),
+        length=2.0 * (half_extent[:, :1] + half_length),
         moved=np.zeros(position.shape),
     )
 
 
-def _unit(v: F64) -> F64:
-    return np.asarray(v / np.maximum(np.hypot(v[..., :1], v[..., 1:]), 1e-9))
+def _unit_vectors(vectors: F64) -> F64:
+    return np.asarray(vectors / np.maximum(np.hypot(vectors[..., :1], vectors[..., 1:]), 1e-9))

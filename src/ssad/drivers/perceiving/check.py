@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.perception import I64, Objects, Tracks, no_objects
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, AgentKind, Episode
-from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
+from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent, TrackingEvent
 from ssad.drivers.perceiving.eyes import PerfectEyes
 from ssad.drivers.perceiving.parts import Perceiver, Percepts, Planner, Tracker, restored, snapshot_of
 from ssad.drivers.perceiving.sensors import sensors_of
@@ -30,9 +30,9 @@ class PartCheckError(AssertionError):
     """Violation of a guarantee by a part of a perceiving driver; the message names the guarantee."""
 
 
-def _need(ok: bool, promise: str) -> None:
-    if not ok:
-        raise PartCheckError(promise)
+def _require(is_met: bool, guarantee: str) -> None:
+    if not is_met:
+        raise PartCheckError(guarantee)
 
 
 def check_perceiver(
@@ -56,24 +56,26 @@ def check_perceiver(
         PartCheckError: A guarantee is broken; the message names it.
     """
     perceiver = make()
-    _need(
+    _require(
         isinstance(perceiver, Perceiver),
         "it has the methods and attributes of ssad.drivers.perceiving.parts.Perceiver",
     )
     for attribute in ("sensors", "classes"):
         value = getattr(perceiver, attribute)
-        _need(not isinstance(value, str) and all(isinstance(name, str) for name in value), f"its {attribute} are names")
-    _need(len(perceiver.sensors) > 0, "it reads a sensor")
+        _require(
+            not isinstance(value, str) and all(isinstance(name, str) for name in value), f"its {attribute} are names"
+        )
+    _require(len(perceiver.sensors) > 0, "it reads a sensor")
     assignment = list(range(min(episodes, 3)))
 
     def run(part: Perceiver, order: Sequence[int]) -> list[list[bytes | None]]:
-        return _looks(part, simulator(order), steps, sensors)
+        return _record_looks(part, simulator(order), steps, sensors)
 
     reference = run(perceiver, assignment)
-    _need(run(perceiver, assignment) == reference, "reset makes it forget: the same again is perceived the same")
-    _need(run(make(), assignment[::-1])[::-1] == reference, "the order of scenes does not matter")
-    _need(run(make(), assignment[:1]) == reference[:1], "a scene alone is perceived as it is in a batch")
-    _need(
+    _require(run(perceiver, assignment) == reference, "reset makes it forget: the same again is perceived the same")
+    _require(run(make(), assignment[::-1])[::-1] == reference, "the order of scenes does not matter")
+    _require(run(make(), assignment[:1]) == reference[:1], "a scene alone is perceived as it is in a batch")
+    _require(
         any(look for scene in reference for look in scene),
         "an object is detected, or else nothing is checked: take episodes with one in range, or more steps",
     )
@@ -93,28 +95,28 @@ def check_tracker(make: Callable[[], Tracker], *, episodes: Sequence[Episode], l
     Raises:
         PartCheckError: A guarantee is broken; the message names it.
     """
-    _need(len(episodes) >= 2, "there are at least two episodes to check with")
+    _require(len(episodes) >= 2, "there are at least two episodes to check with")
     tracker = make()
-    _need(isinstance(tracker, Tracker), "it has the methods of ssad.drivers.perceiving.parts.Tracker")
+    _require(isinstance(tracker, Tracker), "it has the methods of ssad.drivers.perceiving.parts.Tracker")
     scenes = list(range(len(episodes)))
 
     def run(part: Tracker, order: Sequence[int]) -> list[list[bytes]]:
         part.reset([episodes[scene] for scene in order])
-        return _followed(part, order, range(looks))
+        return _track_scenes(part, order, range(looks))
 
     reference = run(tracker, scenes)
-    _need(run(tracker, scenes) == reference, "reset makes it forget: the same again is tracked the same")
-    _need(run(make(), scenes[::-1])[::-1] == reference, "the order of scenes does not matter")
-    _need(run(make(), scenes[:1]) == reference[:1], "a scene alone is tracked as it is in a batch")
+    _require(run(tracker, scenes) == reference, "reset makes it forget: the same again is tracked the same")
+    _require(run(make(), scenes[::-1])[::-1] == reference, "the order of scenes does not matter")
+    _require(run(make(), scenes[:1]) == reference[:1], "a scene alone is tracked as it is in a batch")
     _check_following(make(), episodes, looks)
 
     tracker, half = make(), looks // 2
     tracker.reset(list(episodes))
-    _followed(tracker, scenes, range(half))
+    _track_scenes(tracker, scenes, range(half))
     saved = snapshot_of(tracker)
-    ends = _followed(tracker, scenes, range(half, looks))
+    ends = _track_scenes(tracker, scenes, range(half, looks))
     tracker = restored(tracker, saved)
-    _need(_followed(tracker, scenes, range(half, looks)) == ends, "a restored snapshot continues as before")
+    _require(_track_scenes(tracker, scenes, range(half, looks)) == ends, "a restored snapshot continues as before")
 
 
 def check_planner(make: Callable[[], Planner], simulator: MakeSimulator, *, episodes: int, steps: int = 40) -> None:
@@ -130,7 +132,7 @@ def check_planner(make: Callable[[], Planner], simulator: MakeSimulator, *, epis
         PartCheckError: A guarantee is broken; the message names it.
     """
     planner = make()
-    _need(isinstance(planner, Planner), "it has the methods of ssad.drivers.perceiving.parts.Planner")
+    _require(isinstance(planner, Planner), "it has the methods of ssad.drivers.perceiving.parts.Planner")
     assignment = list(range(min(episodes, 4)))
 
     def run(part: Planner, order: Sequence[int]) -> list[bytes]:
@@ -140,14 +142,14 @@ def check_planner(make: Callable[[], Planner], simulator: MakeSimulator, *, epis
         loop.reset()
         poses = []
         for _ in range(min(steps, step_limit(world))):
-            _guarded(loop.step)
+            _run_guarded(loop.step)
             poses.append(world.state().pose[:, 0].copy())
         return [np.stack(poses)[:, scene].tobytes() for scene in range(world.batch)]
 
     reference = run(planner, assignment)
-    _need(run(planner, assignment) == reference, "reset makes it forget: the same again is driven the same")
-    _need(run(make(), assignment[::-1])[::-1] == reference, "the order of scenes does not matter")
-    _need(run(make(), assignment[:1]) == reference[:1], "a scene alone is driven as it is in a batch")
+    _require(run(planner, assignment) == reference, "reset makes it forget: the same again is driven the same")
+    _require(run(make(), assignment[::-1])[::-1] == reference, "the order of scenes does not matter")
+    _require(run(make(), assignment[:1]) == reference[:1], "a scene alone is driven as it is in a batch")
 
 
 class _ControlledDriver(Perceiving):
@@ -156,13 +158,13 @@ class _ControlledDriver(Perceiving):
     def act(self, view: Observation) -> F32:
         pose = view.pose.copy()
         controls = np.asarray(super().act(view), np.float32)
-        _need(controls.ndim == 2 and len(controls) == len(pose), "plan returns [N, 3] for the N egos that it sees")
+        _require(controls.ndim == 2 and len(controls) == len(pose), "plan returns [N, 3] for the N egos that it sees")
         running = ~view.done
-        _need(bool(np.isfinite(controls[running]).all()), "its controls are finite")
-        least = np.array([0.0, 0.0, -1.0], np.float32)
-        in_range = (controls[running, :3] >= least) & (controls[running, :3] <= 1.0)
-        _need(bool(in_range.all()), "its controls are in range")
-        _need(bool((view.pose == pose).all()), "it changes nothing that it is given")
+        _require(bool(np.isfinite(controls[running]).all()), "its controls are finite")
+        lower_limits = np.array([0.0, 0.0, -1.0], np.float32)
+        in_range = (controls[running, :3] >= lower_limits) & (controls[running, :3] <= 1.0)
+        _require(bool(in_range.all()), "its controls are in range")
+        _require(bool((view.pose == pose).all()), "it changes nothing that it is given")
         return controls
 
 
@@ -179,12 +181,12 @@ class _GuardedPerceiver:
         return getattr(self._perceiver, name)
 
     def perceive(self, view: Observation, rows: I64) -> Percepts:
-        given = {name: _arrays(view.readings[name]) for name in self._perceiver.sensors}
-        given |= {"pose": _arrays(view.pose), "rows": _arrays(rows)}
+        inputs = {name: _arrays(view.readings[name]) for name in self._perceiver.sensors}
+        inputs |= {"pose": _arrays(view.pose), "rows": _arrays(rows)}
         percepts = self._perceiver.perceive(view, rows)
-        after = {name: _arrays(view.readings[name]) for name in self._perceiver.sensors}
-        after |= {"pose": _arrays(view.pose), "rows": _arrays(rows)}
-        _need(after == given, "it changes nothing that it is given")
+        inputs_after = {name: _arrays(view.readings[name]) for name in self._perceiver.sensors}
+        inputs_after |= {"pose": _arrays(view.pose), "rows": _arrays(rows)}
+        _require(inputs_after == inputs, "it changes nothing that it is given")
         return percepts
 
 
@@ -194,7 +196,7 @@ def _arrays(value: Any) -> list[bytes]:
     return [np.asarray(column).tobytes() for column in columns if column is not None]
 
 
-def _guarded(step: Callable[[], None]) -> None:
+def _run_guarded(step: Callable[[], None]) -> None:
     """Take a step; an output that the driver refuses is a broken guarantee."""
     try:
         step()
@@ -208,12 +210,12 @@ def _loop(
     """Return a loop in which a perceiver looks at every step, its driver, and the record of its looks by scene."""
     looks: list[list[bytes | None]] = [[] for _ in range(world.batch)]
 
-    def watch(event: Sighting | Known) -> None:
-        if isinstance(event, Sighting):
-            found = event.found
+    def watch(event: PerceptionEvent | TrackingEvent) -> None:
+        if isinstance(event, PerceptionEvent):
+            objects = event.objects
             # Without the index of the scene, which depends on the batch.
-            columns = [] if found is None else [getattr(found, column.name) for column in fields(found)[1:]]
-            looks[event.scene].append(None if found is None else b"".join(column.tobytes() for column in columns))
+            columns = [] if objects is None else [getattr(objects, column.name) for column in fields(objects)[1:]]
+            looks[event.scene].append(None if objects is None else b"".join(column.tobytes() for column in columns))
 
     guarded = cast(Perceiver, _GuardedPerceiver(perceiver))
     driver = Perceiving(guarded, rate=1.0 / world.dt, latency=0.0, watch=watch)
@@ -223,34 +225,34 @@ def _loop(
     return loop, driver, looks
 
 
-def _looks(
+def _record_looks(
     perceiver: Perceiver, world: Simulator, steps: int, sensors: Mapping[str, Sensor] | None
 ) -> list[list[bytes | None]]:
     """Return the objects of each look, [B][looks]; None without a reading."""
     loop, _, looks = _loop(perceiver, world, sensors)
     for _ in range(min(steps, step_limit(world))):
-        _guarded(loop.step)
+        _run_guarded(loop.step)
     return looks
 
 
 def _check_snapshot(perceiver: Perceiver, world: Simulator, steps: int, sensors: Mapping[str, Sensor] | None) -> None:
     loop, driver, looks = _loop(perceiver, world, sensors)
     for _ in range(steps // 2):
-        _guarded(loop.step)
+        _run_guarded(loop.step)
     saved = cast(Reproducible, world).snapshot(), driver.snapshot()
     runs = []
     for _ in range(2):
         for scene in looks:
             scene.clear()
         for _ in range(steps - steps // 2):
-            _guarded(loop.step)
+            _run_guarded(loop.step)
         runs.append([list(scene) for scene in looks])
         cast(Reproducible, world).restore(saved[0])
         driver.restore(saved[1])
-    _need(runs[0] == runs[1], "a restored snapshot continues as before")
+    _require(runs[0] == runs[1], "a restored snapshot continues as before")
 
 
-def _cars(scene: int, look: int) -> tuple[F64, F64]:
+def _car_states(scene: int, look: int) -> tuple[F64, F64]:
     """Return positions and velocities [M, 2] of the cars of a scene at a look."""
     draws = generator("check_tracker", scene)
     count = 2 + scene % 3
@@ -259,10 +261,10 @@ def _cars(scene: int, look: int) -> tuple[F64, F64]:
     return start + velocity * (look * STEP), velocity
 
 
-def _detected(scene: int, index: int, look: int) -> Objects:
+def _simulated_detections(scene: int, index: int, look: int) -> Objects:
     """Return detections of the cars of a scene, with errors of 0.1 m, and now and then a false or a missed one."""
     draws = generator("check_tracker look", scene, look)
-    place, _ = _cars(scene, look)
+    place, _ = _car_states(scene, look)
     place = place + draws.normal(0.0, 0.1, place.shape)
     if look % 7 == 5:
         place = np.concatenate([place[1:], draws.uniform(-40.0, -30.0, (1, 2))])
@@ -279,7 +281,7 @@ def _detected(scene: int, index: int, look: int) -> Objects:
     )
 
 
-def _confirmed(tracker: Tracker, scenes: I64, times: F64) -> Tracks:
+def _confirmed_tracks(tracker: Tracker, scenes: I64, times: F64) -> Tracks:
     """Return confirmed tracks, checked."""
     tracks = tracker.confirmed(scenes, times)
     try:
@@ -287,35 +289,40 @@ def _confirmed(tracker: Tracker, scenes: I64, times: F64) -> Tracks:
     except ConfigError as error:
         raise PartCheckError(f"what it returns is as its protocol says: {error}") from error
     columns = (tracks.place, tracks.velocity, tracks.yaw, tracks.size, tracks.score)
-    _need(all(bool(np.isfinite(column).all()) for column in columns), "its tracks are finite")
-    _need(bool((tracks.size > 0.0).all()), "its tracks have a size above 0 m")
+    _require(all(bool(np.isfinite(column).all()) for column in columns), "its tracks are finite")
+    _require(bool((tracks.size > 0.0).all()), "its tracks have a size above 0 m")
     kinds = np.asarray(tracks.kind)
-    _need(bool(((kinds > 0) & (kinds < len(AgentKind))).all()), "its tracks have a kind of AgentKind")
+    _require(bool(((kinds > 0) & (kinds < len(AgentKind))).all()), "its tracks have a kind of AgentKind")
     names = list(zip(np.asarray(tracks.scene).tolist(), np.asarray(tracks.ident).tolist(), strict=True))
-    _need(len(set(names)) == len(names), "the numbers of its tracks are unique in a scene")
+    _require(len(set(names)) == len(names), "the numbers of its tracks are unique in a scene")
     return tracks
 
 
-def _followed(tracker: Tracker, order: Sequence[int], looks: range) -> list[list[bytes]]:
+def _track_scenes(tracker: Tracker, order: Sequence[int], looks: range) -> list[list[bytes]]:
     """Return the confirmed tracks of each scene after each look."""
     indices = np.arange(len(order), dtype=np.int64)
     rows: list[list[bytes]] = [[] for _ in order]
     for look in looks:
         # Scenes are not all looked at each time, as when one has lost its signal.
-        seen = np.array([index for index, scene in enumerate(order) if (look + scene) % 11], np.int64)
-        parts = [no_objects(), *(_detected(order[index], index, look) for index in seen.tolist())]
-        found, times = Objects.joined(parts), np.full(len(seen), look * STEP)
-        given = _arrays(found)
-        tracker.update(seen, times, found, np.zeros((len(seen), 3)))
-        _need(_arrays(found) == given, "it changes nothing that it is given")
+        observed_scenes = np.array([index for index, scene in enumerate(order) if (look + scene) % 11], np.int64)
+        parts = [
+            no_objects(),
+            *(_simulated_detections(order[index], index, look) for index in observed_scenes.tolist()),
+        ]
+        detections, times = Objects.cat(parts), np.full(len(observed_scenes), look * STEP)
+        input_arrays = _arrays(detections)
+        tracker.update(observed_scenes, times, detections, np.zeros((len(observed_scenes), 3)))
+        _require(_arrays(detections) == input_arrays, "it changes nothing that it is given")
         now = np.full(len(order), look * STEP + 0.1)
-        tracks = _confirmed(tracker, indices, now)
-        again = _confirmed(tracker, indices, now)
-        _need(_arrays(again) == _arrays(tracks), "confirmed changes no state: asked twice, it answers the same")
+        tracks = _confirmed_tracks(tracker, indices, now)
+        repeated_tracks = _confirmed_tracks(tracker, indices, now)
+        _require(
+            _arrays(repeated_tracks) == _arrays(tracks), "confirmed changes no state: asked twice, it answers the same"
+        )
         for index in indices.tolist():
-            own = tracks.take(np.flatnonzero(tracks.scene == index))
-            order_of_tracks = np.argsort(own.ident, kind="stable")
-            columns = [getattr(own, column.name)[order_of_tracks] for column in fields(Tracks)[1:]]
+            scene_tracks = tracks.take(np.flatnonzero(tracks.scene == index))
+            order_of_tracks = np.argsort(scene_tracks.ident, kind="stable")
+            columns = [getattr(scene_tracks, column.name)[order_of_tracks] for column in fields(Tracks)[1:]]
             rows[index].append(b"".join(np.ascontiguousarray(column).tobytes() for column in columns))
     return rows
 
@@ -325,20 +332,20 @@ def _check_following(tracker: Tracker, episodes: Sequence[Episode], looks: int) 
     tracker.reset(list(episodes))
     index, numbers = np.zeros(1, np.int64), []
     for look in range(looks):
-        place, _ = _cars(0, look)
-        found = _detected(0, 0, 0).take(slice(0, len(place)))
-        found.place[:] = place
-        tracker.update(index, np.array([look * STEP]), found, np.zeros((1, 3)))
+        place, _ = _car_states(0, look)
+        detections = _simulated_detections(0, 0, 0).take(slice(0, len(place)))
+        detections.place[:] = place
+        tracker.update(index, np.array([look * STEP]), detections, np.zeros((1, 3)))
         if look < 10:
             continue
         later = look * STEP + 0.3
-        tracks = _confirmed(tracker, index, np.array([later]))
-        true_place = _cars(0, 0)[0] + _cars(0, 0)[1] * later
+        tracks = _confirmed_tracks(tracker, index, np.array([later]))
+        true_place = _car_states(0, 0)[0] + _car_states(0, 0)[1] * later
         distances = np.linalg.norm(true_place[:, None] - np.asarray(tracks.place)[None], axis=-1)
         nearest = distances.min(1, initial=np.inf)
-        _need(
+        _require(
             bool((nearest < CLOSE).all()),
             f"a car that is detected at every look is tracked, and predicted to the present within {CLOSE:g} m",
         )
         numbers.append(np.asarray(tracks.ident)[distances.argmin(1)].tolist())
-    _need(all(row == numbers[0] for row in numbers), "a car that is detected at every look keeps its number")
+    _require(all(row == numbers[0] for row in numbers), "a car that is detected at every look keeps its number")

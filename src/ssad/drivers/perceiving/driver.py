@@ -23,8 +23,8 @@ from ssad.core.frames import Camera
 from ssad.core.perception import I64, Objects, Tracks, no_objects
 from ssad.core.rotations import upright_poses
 from ssad.core.types import F32, F64, I32, U8, Bool, Controller, Episode
-from ssad.drivers.perceiving.ego_boxes import EgoBoxes, boxes_in_world, check_boxes, sign_places
-from ssad.drivers.perceiving.lift import Lifting, lift, merged
+from ssad.drivers.perceiving.ego_boxes import EgoBoxes, boxes_in_world, check_boxes, stop_sign_positions
+from ssad.drivers.perceiving.lift import Lifting, lift, merge_duplicates
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     Planner,
@@ -38,7 +38,7 @@ from ssad.drivers.perceiving.planner import AutopilotPlanner
 from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.signs import SignMemory, SignReading, read_signs, sign_labels
 from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
-from ssad.drivers.perceiving.tracks import believed, check_tracks
+from ssad.drivers.perceiving.tracks import belief_from_tracks, check_tracks
 
 if TYPE_CHECKING:
     from ssad.rendering.lidar import Lidar
@@ -47,29 +47,29 @@ LATE = 1e-4  # s, less than a step: times are 32-bit numbers
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """One look of a scene, for who watches.
+class PerceptionEvent:
+    """Perception result of one scene at one time, for observers.
 
     Attributes:
-        scene: Which scene.
-        time: s when the pictures were taken.
-        found: What was found in them, in the world; None: no sensor had a reading.
-        pictures: What the cameras showed, uint8 [3, H, W] by name, where the perceiver reads images; tensors where
+        scene: Index of the scene.
+        time: Time of the images, s.
+        objects: Detected objects in the world; None: no sensor had a reading.
+        images: Camera images, uint8 [3, H, W] by name, where the perceiver reads images; tensors where
             images stay on a GPU.
-        signs: Where the stop signs stand that were read, if the driver reads them: x, y in the world [M, 2], m.
-        pose: Pose of the ego then: x, y, yaw [3].
+        signs: Positions of the stop signs that were read, if the driver reads them: x, y in the world [M, 2], m.
+        pose: Pose of the ego at that time: x, y, yaw [3].
     """
 
     scene: int
     time: float
-    found: Objects | None
-    pictures: Mapping[str, U8] = field(default_factory=dict)
+    objects: Objects | None
+    images: Mapping[str, U8] = field(default_factory=dict)
     signs: F64 | None = None
     pose: F64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class TrackingEvent:
     """Belief at a step, for observers.
 
     Attributes:
@@ -119,7 +119,7 @@ class Perceiving:
         tracking: Tracking | None = None,
         rate: float = 5.0,
         latency: float = 0.1,
-        watch: Callable[[Sighting | Known], None] | None = None,
+        watch: Callable[[PerceptionEvent | TrackingEvent], None] | None = None,
         repair: Repair | None = None,
         signs: SignReading | None = None,
     ) -> None:
@@ -138,10 +138,10 @@ class Perceiving:
         self._views = cameras_of(perceiver)  # those of a perfect detector are no sensors
         self._signs = None if signs is None else SignMemory(signs)
         self._looks = np.zeros(0, np.int64)
-        self._waiting: list[Sighting] = []
+        self._waiting: list[PerceptionEvent] = []
         if self.controller == Controller.AUTOPILOT:
             # Only a driver with this method is a Believer, whose belief the world plans over.
-            self.believe = self._believed
+            self.believe = self._perceived_belief
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -204,27 +204,27 @@ class Perceiving:
         """
         if self.controller == Controller.AUTOPILOT:
             raise RuntimeError("the Autopilot runs inside the world")
-        return self.planner.plan(without_truth(view, readings=False), self._believed(view))
+        return self.planner.plan(without_truth(view, readings=False), self._perceived_belief(view))
 
-    def _believed(self, view: Observation) -> Belief:
+    def _perceived_belief(self, view: Observation) -> Belief:
         """Return the tracked objects around the egos."""
         now = view.time.astype(np.float64)
         look_counts = np.floor((now + LATE) * self.rate).astype(np.int64)
         due_rows = np.flatnonzero(~view.done & (look_counts > self._looks[view.scene]))
         if len(due_rows):
             self._looks[view.scene[due_rows]] = look_counts[due_rows]
-            self._waiting += self._sightings(view, due_rows, now)
-        self._take_in(dict(zip(view.scene.tolist(), now.tolist(), strict=True)))
+            self._waiting += self._perceive_rows(view, due_rows, now)
+        self._track_arrivals(dict(zip(view.scene.tolist(), now.tolist(), strict=True)))
         tracks = self.tracker.confirmed(view.scene, now)
         check_tracks(tracks, view.scene, type(self.tracker).__name__)
         if self.watch is not None:
-            self.watch(Known(view.scene, now, tracks))
-        belief = believed(tracks, view.scene)
+            self.watch(TrackingEvent(view.scene, now, tracks))
+        belief = belief_from_tracks(tracks, view.scene)
         if self._signs is None:
             return belief
-        return replace(belief, stop_sign=self._signs.known(view.scene, now, view.pose))
+        return replace(belief, stop_sign=self._signs.is_sign_ahead(view.scene, now, view.pose))
 
-    def _sightings(self, view: Observation, rows: I64, now: F64) -> list[Sighting]:
+    def _perceive_rows(self, view: Observation, rows: I64, now: F64) -> list[PerceptionEvent]:
         """Return the sightings of some rows at the present time."""
         percepts = self.perceiver.perceive(without_truth(view, readings=True), rows)
         scenes = view.scene[rows].astype(np.int64)
@@ -234,17 +234,17 @@ class Perceiving:
         else:
             parts, without_reading, signs = self._from_boxes(percepts, ego_poses, scenes)
         # Neighbouring sensors overlap, so an object can be detected twice.
-        merged_objects = merged(Objects.joined(parts), self.lifting.merge)
-        sightings = []
+        merged_objects = merge_duplicates(Objects.cat(parts), self.lifting.merge)
+        events = []
         for index, row in enumerate(rows.tolist()):
             scene_slice = slice(*np.searchsorted(merged_objects.scene, [scenes[index], scenes[index] + 1]))
             scene_objects = None if without_reading[index] else merged_objects.take(scene_slice)
             if self.repair is not None:
                 scene_objects = self.repair(view, row, scene_objects or no_objects(), self._views, self.lifting)
-            images = {} if self.watch is None else self._pictures(view, row)
+            images = {} if self.watch is None else self._camera_images(view, row)
             sign_positions = None if self._signs is None else np.concatenate(signs[index])
-            sightings.append(
-                Sighting(
+            events.append(
+                PerceptionEvent(
                     int(scenes[index]),
                     float(now[row]),
                     scene_objects,
@@ -254,8 +254,8 @@ class Perceiving:
                 )
             )
             if self.watch is not None:
-                self.watch(sightings[-1])
-        return sightings
+                self.watch(events[-1])
+        return events
 
     def _from_images(
         self, detections_by_camera: Mapping[str, Sequence[Detections | None]], ego_poses: F64, scenes: I64
@@ -310,7 +310,7 @@ class Perceiving:
         if self._signs is not None:
             labels, score = sign_labels(classes), self._signs.settings.score
             for row, boxes in zip(read_rows, read_boxes, strict=True):
-                signs[row].append(sign_places(boxes, ego_poses[row], labels, score=score))
+                signs[row].append(stop_sign_positions(boxes, ego_poses[row], labels, score=score))
         return [objects], without_reading, signs
 
     def _check_percepts(self, detections_by_camera: Mapping[str, Sequence[Detections | None]], count: int) -> None:
@@ -325,33 +325,31 @@ class Perceiving:
             if len(detections) != count:
                 raise ConfigError(f"perceiver {name}: camera {camera} has {len(detections)} rows; expected {count}")
 
-    def _pictures(self, view: Observation, row: int) -> dict[str, U8]:
+    def _camera_images(self, view: Observation, row: int) -> dict[str, U8]:
         """Return the camera images of a row."""
         return {name: view.readings[name][row] for name in self.cameras}
 
-    def _take_in(self, now: Mapping[int, float]) -> None:
+    def _track_arrivals(self, now: Mapping[int, float]) -> None:
         """Pass arrived sightings to the tracker, look by look; a look without images carries no information."""
         ready = [
-            arrival
-            for arrival in self._waiting
-            if arrival.scene in now and arrival.time + self.latency <= now[arrival.scene] + LATE
+            event
+            for event in self._waiting
+            if event.scene in now and event.time + self.latency <= now[event.scene] + LATE
         ]
-        ready_ids = {id(arrival) for arrival in ready}
-        self._waiting = [arrival for arrival in self._waiting if id(arrival) not in ready_ids]
+        ready_ids = {id(event) for event in ready}
+        self._waiting = [event for event in self._waiting if id(event) not in ready_ids]
         while ready:
             # The tracker takes at most one look per scene and call, in order of time.
-            first_of_scene: dict[int, Sighting] = {}
-            for sighting in ready:
-                first_of_scene.setdefault(sighting.scene, sighting)
-            ready = [arrival for arrival in ready if first_of_scene[arrival.scene] is not arrival]
-            batch = [arrival for arrival in first_of_scene.values() if arrival.found is not None]
+            first_of_scene: dict[int, PerceptionEvent] = {}
+            for ready_event in ready:
+                first_of_scene.setdefault(ready_event.scene, ready_event)
+            ready = [event for event in ready if first_of_scene[event.scene] is not event]
+            batch = [event for event in first_of_scene.values() if event.objects is not None]
             if batch:
-                scenes = np.array([arrival.scene for arrival in batch])
-                times = np.array([arrival.time for arrival in batch])
-                poses = np.array([arrival.pose for arrival in batch])
-                objects = Objects.joined(
-                    [no_objects(), *(arrival.found for arrival in batch if arrival.found is not None)]
-                )
+                scenes = np.array([event.scene for event in batch])
+                times = np.array([event.time for event in batch])
+                poses = np.array([event.pose for event in batch])
+                objects = Objects.cat([no_objects(), *(event.objects for event in batch if event.objects is not None)])
                 self.tracker.update(scenes, times, objects, poses)
                 for processed in batch:
                     if self._signs is not None and processed.signs is not None and processed.pose is not None:

@@ -99,7 +99,7 @@ def boxes_in_world(
         order = order[kinds[label[order]] > 0]
         rotation, count = pose[:2, :2], len(order)
         ego_pose = np.broadcast_to(pose, (count, 4, 4))
-        place = _turned(np.asarray(ego_boxes.centre, np.float64)[order, :2], rotation) + pose[:2, 3]
+        place = _rotate(np.asarray(ego_boxes.centre, np.float64)[order, :2], rotation) + pose[:2, 3]
         if ego_boxes.spread is None:
             spread, _ = position_spread(place, ego_pose, settings)
         else:
@@ -111,15 +111,15 @@ def boxes_in_world(
             spread,
             np.asarray(wrap_angle(yaw), np.float64),
             np.maximum(np.asarray(ego_boxes.size_lwh, np.float64)[order, :2], LEAST_SIZE),
-            _turned(np.asarray(ego_boxes.velocity, np.float64)[order], rotation),
+            _rotate(np.asarray(ego_boxes.velocity, np.float64)[order], rotation),
             kinds[label[order]],
             score[order],
         )
         parts.append(objects)
-    return Objects.joined(parts)
+    return Objects.cat(parts)
 
 
-def sign_places(boxes: EgoBoxes, pose: F64, labels: Sequence[int], *, score: float) -> F64:
+def stop_sign_positions(boxes: EgoBoxes, pose: F64, labels: Sequence[int], *, score: float) -> F64:
     """Return the positions of the stop signs among boxes, x, y in the world [M, 2], m.
 
     Args:
@@ -129,9 +129,9 @@ def sign_places(boxes: EgoBoxes, pose: F64, labels: Sequence[int], *, score: flo
         score: Minimum score.
     """
     selected = np.isin(boxes.label, labels) & (np.asarray(boxes.score) >= score)
-    return _turned(np.asarray(boxes.centre, np.float64)[selected, :2], pose[:2, :2]) + pose[:2, 3]
+    return _rotate(np.asarray(boxes.centre, np.float64)[selected, :2], pose[:2, :2]) + pose[:2, 3]
 
 
-def _turned(vectors: F64, rotation: F64) -> F64:
+def _rotate(vectors: F64, rotation: F64) -> F64:
     """Rotate vectors [M, 2], row by row: bit-identical in any batch."""
     return np.asarray((rotation[None] * vectors[:, None, :]).sum(-1))

@@ -27,7 +27,7 @@ from ssad.core.types import F64, AgentKind, Episode
 from ssad.core.visibility import in_sight
 from ssad.detectors import make_detector
 from ssad.drivers.perceiving.objects import SIZES
-from ssad.drivers.perceiving.tracker import tracking_of
+from ssad.drivers.perceiving.tracker import tracking_settings
 from ssad.rendering.camera.rig import rig_camera
 
 FRONT = ("CAM_FRONT",)
@@ -45,7 +45,7 @@ MEMORY = 100  # approximate bytes of GPU memory that a detector needs per image 
 _SLOTS = 64  # more than the agents of any scene: with fixed draws per look none depends on the number of agents
 
 
-def front(width: int = 640, channels: Sequence[str] = FRONT) -> dict[str, Camera]:
+def nuscenes_cameras(width: int = 640, channels: Sequence[str] = FRONT) -> dict[str, Camera]:
     """Return cameras of the nuScenes rig with images of a width in pixels, by channel."""
     return {channel: rig_camera(channel, width) for channel in channels}
 
@@ -74,8 +74,8 @@ def camera_perceiver(
         ConfigError: There is no such camera.
     """
     options: dict[str, Any] = {"weights": weights} | ({} if input_width is None else {"input_width": input_width})
-    least = tracking_of(detector).low if threshold is None else threshold
-    eyes = CameraEyes(detector, _rig(cameras, width), threshold=least, **options)
+    min_score = tracking_settings(detector).low if threshold is None else threshold
+    eyes = CameraEyes(detector, _rig_cameras(cameras, width), threshold=min_score, **options)
     _ = eyes.detector  # so that a wrong name fails here
     return eyes
 
@@ -91,17 +91,19 @@ def perfect_perceiver(
     phantoms: float = 0.0,
 ) -> PerfectEyes:
     """Return the built-in perceiver that knows the truth; arguments as of `camera_perceiver` and `PerfectEyes`."""
-    return PerfectEyes(_rig(cameras, width), reach=reach, missed=missed, burst=burst, noise=noise, phantoms=phantoms)
+    return PerfectEyes(
+        _rig_cameras(cameras, width), reach=reach, missed=missed, burst=burst, noise=noise, phantoms=phantoms
+    )
 
 
-def _rig(channels: Sequence[str], width: int) -> dict[str, Camera]:
+def _rig_cameras(channels: Sequence[str], width: int) -> dict[str, Camera]:
     unknown = [channel for channel in channels if channel not in CAMERAS]
     if unknown or not channels or isinstance(channels, str) or not 64 <= width <= 1600:
         raise ConfigError(
             f"cameras must be a list of some of {', '.join(CAMERAS)}, and width 64 to 1600 pixels, not {channels} and "
             f"{width}"
         )
-    return front(width, channels)
+    return nuscenes_cameras(width, channels)
 
 
 class CameraEyes:
@@ -124,27 +126,27 @@ class CameraEyes:
         device: str = "cpu",
         **options: Any,
     ) -> None:
-        self.cameras: Mapping[str, Camera] = front() if cameras is None else dict(cameras)
+        self.cameras: Mapping[str, Camera] = nuscenes_cameras() if cameras is None else dict(cameras)
         self.sensors: tuple[str, ...] = tuple(self.cameras)
         self.threshold, self.device = threshold, device
-        self._given, self._options = detector, options
-        self._made: Detector | None = None
+        self._detector_or_name, self._options = detector, options
+        self._loaded_detector: Detector | None = None
 
     @property
     def detector(self) -> Detector:
         """The detector, on its device."""
-        if self._made is None:
-            if isinstance(self._given, str):
-                made: Detector = make_detector(self._given, device=self.device, **self._options)
-                self._made = made
+        if self._loaded_detector is None:
+            if isinstance(self._detector_or_name, str):
+                loaded: Detector = make_detector(self._detector_or_name, device=self.device, **self._options)
+                self._loaded_detector = loaded
             else:
-                self._made = self._given
-        return self._made
+                self._loaded_detector = self._detector_or_name
+        return self._loaded_detector
 
     @property
     def name(self) -> str:
         """Name of the detector."""
-        return self._given if isinstance(self._given, str) else self._given.name
+        return self._detector_or_name if isinstance(self._detector_or_name, str) else self._detector_or_name.name
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -153,8 +155,8 @@ class CameraEyes:
 
     def to(self, device: str) -> None:
         """Remake a named detector on another device."""
-        if device != self.device and isinstance(self._given, str):
-            self.device, self._made = device, None
+        if device != self.device and isinstance(self._detector_or_name, str):
+            self.device, self._loaded_detector = device, None
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Do nothing: the detector is stateless."""
@@ -170,11 +172,11 @@ class CameraEyes:
         detections: dict[str, list[Detections | None]] = {}
         batches: dict[Any, list[tuple[str, I64, torch.Tensor]]] = {}
         for name in self.cameras:
-            images = self._pictures(view, rows, name)
+            images = self._images(view, rows, name)
             detections[name] = [None] * len(rows)
             valid_rows = np.flatnonzero(images.flatten(1).any(1).cpu().numpy())
             if len(valid_rows):
-                valid_images = images if len(valid_rows) == len(rows) else images[_at(valid_rows, images)]
+                valid_images = images if len(valid_rows) == len(rows) else images[_row_indices(valid_rows, images)]
                 batches.setdefault(images.shape[1:] if images.is_cuda else name, []).append(
                     (name, valid_rows, valid_images)
                 )
@@ -188,7 +190,7 @@ class CameraEyes:
                 detections[name][index] = entry
         return detections
 
-    def _pictures(self, view: Observation, rows: I64, name: str) -> torch.Tensor:
+    def _images(self, view: Observation, rows: I64, name: str) -> torch.Tensor:
         """Return images uint8 [n, 3, H, W] of a camera on the detector's device, from arrays or tensors."""
         reading, camera = view.readings[name], self.cameras[name]
         if reading.shape[1:] != (3, camera.height, camera.width):
@@ -200,34 +202,34 @@ class CameraEyes:
             reading = np.asarray(reading)
             reading = torch.from_numpy(reading if reading.flags.writeable else reading.copy())
         if len(rows) < len(reading):
-            reading = reading[_at(rows, reading)]
+            reading = reading[_row_indices(rows, reading)]
         return reading.to(self.device).contiguous()
 
-    def detect(self, pictures: torch.Tensor, lens: Floats) -> list[Detections]:
-        """What is in pictures uint8 [n, 3, H, W] with intrinsics [n, 3, 3]; all of it on the host."""
-        intrinsics = torch.from_numpy(lens).to(self.device) if self.detector.task == "3d" else None
-        batch_size, detections = _room(pictures), []
-        for start in range(0, len(pictures), batch_size):
+    def detect(self, images: torch.Tensor, lens_intrinsics: Floats) -> list[Detections]:
+        """Return the detections, on the host, in images uint8 [n, 3, H, W] with intrinsics [n, 3, 3]."""
+        intrinsics = torch.from_numpy(lens_intrinsics).to(self.device) if self.detector.task == "3d" else None
+        batch_size, detections = _batch_capacity(images), []
+        for start in range(0, len(images), batch_size):
             batch_intrinsics = None if intrinsics is None else intrinsics[start : start + batch_size]
             detections += self.detector.predict(
-                pictures[start : start + batch_size].float() / 255.0, batch_intrinsics, threshold=self.threshold
+                images[start : start + batch_size].float() / 255.0, batch_intrinsics, threshold=self.threshold
             )
-        return Detections.cpu(detections) if pictures.is_cuda else detections
+        return Detections.cpu(detections) if images.is_cuda else detections
 
 
-def _room(pictures: torch.Tensor) -> int:
-    """Pictures that a detector is given at once: on a GPU as many as need a quarter of the memory that is left."""
-    if not pictures.is_cuda:
-        return max(len(pictures), 1)
-    device = pictures.device
+def _batch_capacity(images: torch.Tensor) -> int:
+    """Return the batch size of the detector: on a GPU, as many images as fit into a quarter of the free memory."""
+    if not images.is_cuda:
+        return max(len(images), 1)
+    device = images.device
     free_bytes = (
         torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     )
-    return max(free_bytes // 4 // (MEMORY * pictures[0].numel()), 16)
+    return max(free_bytes // 4 // (MEMORY * images[0].numel()), 16)
 
 
-def _at(rows: I64, like: torch.Tensor) -> torch.Tensor:
-    return torch.from_numpy(rows).to(like.device)
+def _row_indices(rows: I64, reference: torch.Tensor) -> torch.Tensor:
+    return torch.from_numpy(rows).to(reference.device)
 
 
 class PerfectEyes:
@@ -265,7 +267,7 @@ class PerfectEyes:
                 "perfect eyes need missed in [0, 1), burst >= 1, noise >= 0 and phantoms >= 0, "
                 f"not {missed}, {burst}, {noise} and {phantoms}"
             )
-        self.cameras: Mapping[str, Camera] = front() if cameras is None else dict(cameras)
+        self.cameras: Mapping[str, Camera] = nuscenes_cameras() if cameras is None else dict(cameras)
         self.sensors: tuple[str, ...] = ("truth",)
         self.reach, self.missed, self.noise, self.phantoms = reach, missed, noise, phantoms
         self.again = 1.0 / max(burst, missed / (1.0 - missed))
@@ -295,16 +297,18 @@ class PerfectEyes:
         for name, camera in self.cameras.items():
             detections[name] = []
             for index, row in enumerate(rows.tolist()):
-                object_boxes = boxes_of(truth, index, visible[index])
+                visible_boxes = object_boxes(truth, index, visible[index])
                 pose = upright_pose(*view.pose[row].astype(np.float64).tolist()) @ camera.to_ego
-                projected_objects = projected(
-                    object_boxes,
+                projected_objects = project_boxes(
+                    visible_boxes,
                     np.asarray(np.linalg.inv(pose), np.float64),
                     camera,
                     distance_factors[index][visible[index]],
                 )
                 scene = int(view.scene[row])
-                detections[name].append(Detections.cat([projected_objects, self._invented(self._draws[scene], camera)]))
+                detections[name].append(
+                    Detections.cat([projected_objects, self._draw_phantoms(self._draws[scene], camera)])
+                )
         return detections
 
     def snapshot(self) -> Any:
@@ -315,7 +319,7 @@ class PerfectEyes:
         """Restore the random generators and the missed objects."""
         self._draws, self._missing = deepcopy(snapshot[0]), snapshot[1].copy()
 
-    def _invented(self, draws: np.random.Generator, camera: Camera) -> Detections:
+    def _draw_phantoms(self, draws: np.random.Generator, camera: Camera) -> Detections:
         """Return phantom cars."""
         count = int(draws.poisson(self.phantoms)) if self.phantoms else 0
         column, depth = draws.uniform(0, camera.width, count), draws.uniform(5.0, 40.0, count)
@@ -327,7 +331,7 @@ class PerfectEyes:
         return _detections(np.stack([x, y, depth], 1), size, yaw, [AgentKind.CAR] * count, np.zeros((count, 2)), camera)
 
 
-def boxes_of(truth: Belief, scene: int, mask: Any) -> tuple[F64, F64, F64, list[int], F64]:
+def object_boxes(truth: Belief, scene: int, mask: Any) -> tuple[F64, F64, F64, list[int], F64]:
     """Return objects of a scene as upright boxes in the world, with the default heights of their kinds.
 
     Args:
@@ -347,13 +351,13 @@ def boxes_of(truth: Belief, scene: int, mask: Any) -> tuple[F64, F64, F64, list[
     return centre, size, pose[:, 2], kind, velocity
 
 
-def projected(
+def project_boxes(
     boxes: tuple[F64, F64, F64, list[int], F64], to_camera: F64, camera: Camera, shift: Floats | None = None
 ) -> Detections:
-    """What a perfect detector reports of upright boxes in the world.
+    """Return the detections of upright boxes in the world by a perfect detector.
 
     Args:
-        boxes: As `boxes_of` gives them.
+        boxes: As `object_boxes` gives them.
         to_camera: From the world to the camera, [4, 4].
         camera: The camera.
         shift: Factors [N] on the distances.

@@ -71,5 +71,12 @@ def distance(mean: F64, covariance: F64, place: F64, spread: F64) -> F64:
     x, y = (place - mean[:, :2]).T
     innovation = covariance[:, :2, :2] + spread
     # Closed-form inverse of the symmetric 2x2 matrix [[a, b], [b, c]].
-    a, b, c = innovation[:, 0, 0], 0.5 * (innovation[:, 0, 1] + innovation[:, 1, 0]), innovation[:, 1, 1]
-    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
+    variance_x, covariance_xy, variance_y = (
+        innovation[:, 0, 0],
+        0.5 * (innovation[:, 0, 1] + innovation[:, 1, 0]),
+        innovation[:, 1, 1],
+    )
+    return np.asarray(
+        (variance_y * x * x - 2.0 * covariance_xy * x * y + variance_x * y * y)
+        / (variance_x * variance_y - covariance_xy * covariance_xy)
+    )

@@ -148,14 +148,14 @@ class Tracker(Protocol):
             episodes: The B episodes that are driven next; scenes count them.
         """
 
-    def update(self, scenes: I64, times: F64, found: Objects, poses: F64) -> None:
+    def update(self, scenes: I64, times: F64, objects: Objects, poses: F64) -> None:
         """Take in the detections of one look at each of some scenes.
 
         Args:
             scenes: [n] scenes that were looked at, each once. In a scene without objects nothing was detected. A scene
                 without a reading is left out.
             times: [n] times of the looks, s, in ascending order for each scene from call to call.
-            found: Objects of these scenes, best first; not to be modified.
+            objects: Objects of these scenes, best first; not to be modified.
             poses: [n, 3] x, y, yaw of the egos at these times.
         """
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.perception import Perceived
 from ssad.core.types import F64, U8
-from ssad.drivers.perceiving.driver import Known, Sighting
+from ssad.drivers.perceiving.driver import PerceptionEvent, TrackingEvent
 
 
 class PerceptionRecorder:
@@ -29,21 +29,21 @@ class PerceptionRecorder:
         self._shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
         self.signs: list[list[tuple[float, F64]]] = [[] for _ in range(scenes)]
 
-    def __call__(self, told: Sighting | Known) -> None:
+    def __call__(self, event: PerceptionEvent | TrackingEvent) -> None:
         """See `Perceiving`."""
-        if isinstance(told, Sighting):
-            self.looks[told.scene].append((told.time, told.found))
-            if told.signs is not None:
-                self.signs[told.scene].append((told.time, told.signs))
+        if isinstance(event, PerceptionEvent):
+            self.looks[event.scene].append((event.time, event.objects))
+            if event.signs is not None:
+                self.signs[event.scene].append((event.time, event.signs))
             if self.every is not None:
-                for image in list(told.pictures.values())[:1]:
-                    self._keep(self._shots[told.scene], told.time, image, self.every)
+                for image in list(event.images.values())[:1]:
+                    self._keep(self._shots[event.scene], event.time, image, self.every)
             return
         # Tracks of all scenes come together; sorted by scene, each scene is a slice.
-        tracks = told.tracks.take(np.argsort(told.tracks.scene, kind="stable"))
-        track_limits = (np.searchsorted(tracks.scene, told.scene, side=side).tolist() for side in ("left", "right"))
+        tracks = event.tracks.take(np.argsort(event.tracks.scene, kind="stable"))
+        track_limits = (np.searchsorted(tracks.scene, event.scene, side=side).tolist() for side in ("left", "right"))
         for scene, time, first_track, last_track in zip(
-            told.scene.tolist(), told.time.tolist(), *track_limits, strict=True
+            event.scene.tolist(), event.time.tolist(), *track_limits, strict=True
         ):
             self.known[scene].append((time, tracks.take(slice(first_track, last_track))))
 

@@ -13,7 +13,7 @@ from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import Bool
 from ssad.core.visibility import in_sight
-from ssad.drivers.perceiving.eyes import PerfectEyes, boxes_of, projected
+from ssad.drivers.perceiving.eyes import PerfectEyes, object_boxes, project_boxes
 from ssad.drivers.perceiving.lift import Lifting, lift
 
 AROUND = 5.0  # m around the object within which what was found is taken for it
@@ -21,7 +21,7 @@ AROUND = 5.0  # m around the object within which what was found is taken for it
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """Whose detections are repaired, for `ssad.drivers.perceiving.driver.Perceiving`.
+    """Selection of the agents whose detections are repaired, for `ssad.drivers.perceiving.driver.Perceiving`.
 
     Where the object can be seen, it is found where it is, and what was found within 5 m of it and near nobody else is
     left out; where it cannot be seen, nothing changes.
@@ -35,46 +35,46 @@ class Repair:
     reach: float = 60.0
 
     def __call__(
-        self, view: Observation, row: int, found: Objects, cameras: Mapping[str, Camera], lifting: Lifting
+        self, view: Observation, row: int, objects: Objects, cameras: Mapping[str, Camera], lifting: Lifting
     ) -> Objects:
-        """What was found in a row, with the error repaired.
+        """Return the detected objects of a row, with the error repaired.
 
         Args:
             view: What the egos see; the sensor `truth` among it.
             row: Which row.
-            found: What was found there.
+            objects: What was found there.
             cameras: Through which was looked.
             lifting: How detections become places.
         """
         agent = self.agents.get(int(view.scene[row]))
         truth: Belief = view.readings["truth"].rows([row])
         if agent is None or not in_sight(view.pose[[row], :2], truth, self.reach)[0, agent]:
-            return found
+            return objects
         ego = upright_pose(*view.pose[row].astype(np.float64).tolist())
         parts = [no_objects()]
         agent_mask = np.arange(truth.kind.shape[1]) == agent
         for camera in cameras.values():
             pose = ego @ camera.to_ego
-            projected_agent = projected(
-                boxes_of(truth, 0, agent_mask), np.asarray(np.linalg.inv(pose), np.float64), camera
+            projected_agent = project_boxes(
+                object_boxes(truth, 0, agent_mask), np.asarray(np.linalg.inv(pose), np.float64), camera
             )
             scene = view.scene[[row]].astype(np.int64)
             parts.append(lift([projected_agent], camera, pose[None], scene, PerfectEyes.classes, settings=lifting))
         if not cameras:  # a perceiver of LiDAR or radar: its own boxes are in no image
             parts.append(_true_object(truth, agent_mask, view.scene[row], lifting))
-        perfect = Objects.joined(parts).take(np.arange(min(1, sum(len(part) for part in parts))))
+        perfect = Objects.cat(parts).take(np.arange(min(1, sum(len(part) for part in parts))))
         if not len(perfect):
-            return found
+            return objects
         true_positions = truth.pose[0, :, :2].astype(np.float64)
-        distances = np.linalg.norm(found.place[:, None] - true_positions[None], axis=-1)
+        distances = np.linalg.norm(objects.place[:, None] - true_positions[None], axis=-1)
         distances[:, truth.kind[0] == 0] = np.inf
         replaced = (distances[:, agent] < AROUND) & (distances[:, agent] <= distances.min(1, initial=np.inf))
-        return Objects.joined([found.take(~replaced), perfect])
+        return Objects.cat([objects.take(~replaced), perfect])
 
 
 def _true_object(truth: Belief, mask: Bool, scene: int, lifting: Lifting) -> Objects:
     """Return the selected object of a belief of one row as it is, with the covariance of detections at 0 m."""
-    centre, size, yaw, kind, velocity = boxes_of(truth, 0, mask)
+    centre, size, yaw, kind, velocity = object_boxes(truth, 0, mask)
     count = len(kind)
     spread = np.tile(np.diag([lifting.along[0] ** 2, lifting.across[0] ** 2]), (count, 1, 1))
     scenes, kinds = np.full(count, scene, np.int64), np.array(kind, np.int64)

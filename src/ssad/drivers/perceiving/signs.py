@@ -60,11 +60,11 @@ def sign_labels(classes: Sequence[str]) -> list[int]:
     return labels
 
 
-def read_signs(found: Detections, camera: Camera, pose: F64, classes: Sequence[str], *, score: float) -> F64:
-    """Where the stop signs of a picture stand.
+def read_signs(detections: Detections, camera: Camera, pose: F64, classes: Sequence[str], *, score: float) -> F64:
+    """Return the positions of the stop signs in an image.
 
     Args:
-        found: What was found in it; a sign's distance is told by the height of its box.
+        detections: What was found in it; a sign's distance is told by the height of its box.
         camera: The camera.
         pose: Of the camera in the world, [4, 4].
         classes: Names of the labels.
@@ -76,8 +76,10 @@ def read_signs(found: Detections, camera: Camera, pose: F64, classes: Sequence[s
     Raises:
         ConfigError: The detector knows no stop signs.
     """
-    selected = np.isin(found.label.cpu().numpy(), sign_labels(classes)) & (found.score.detach().cpu().numpy() >= score)
-    box = found.box.detach().cpu().double().numpy()[selected]
+    selected = np.isin(detections.label.cpu().numpy(), sign_labels(classes)) & (
+        detections.score.detach().cpu().numpy() >= score
+    )
+    box = detections.box.detach().cpu().double().numpy()[selected]
     depth = camera.intrinsic[1, 1] * FACE / np.maximum(box[:, 3] - box[:, 1], 1.0)
     image_centre = np.stack([0.5 * (box[:, 0] + box[:, 2]), 0.5 * (box[:, 1] + box[:, 3]), np.ones(len(box))], 1)
     local = image_centre @ np.linalg.inv(camera.intrinsic).T * depth[:, None]
@@ -101,39 +103,39 @@ class SignMemory:
     """
 
     settings: SignReading
-    _known: list[list[_Sign]] = field(default_factory=list)
+    _signs_by_scene: list[list[_Sign]] = field(default_factory=list)
 
     def reset(self, batch: int) -> None:
         """Forget all signs of all scenes."""
-        self._known = [[] for _ in range(batch)]
+        self._signs_by_scene = [[] for _ in range(batch)]
 
-    def update(self, scene: int, time: float, eye: F64, places: F64) -> None:
+    def update(self, scene: int, time: float, viewpoint: F64, places: F64) -> None:
         """Update the memory with the signs of one look.
 
         Args:
             scene: Index of the scene.
             time: s when the image was taken.
-            eye: [2] x, y of the viewpoint.
+            viewpoint: [2] x, y of the viewpoint.
             places: [M, 2] positions of the signs.
         """
         updated: set[int] = set()
         for place in places:
-            reach = SIGN_MATCH_SHARE * float(np.linalg.norm(place - eye)) + 1.0
+            reach = SIGN_MATCH_SHARE * float(np.linalg.norm(place - viewpoint)) + 1.0
             distances = [
                 (float(np.linalg.norm(sign.place - place)), sign_index)
-                for sign_index, sign in enumerate(self._known[scene])
+                for sign_index, sign in enumerate(self._signs_by_scene[scene])
             ]
             min_distance, sign_index = min(distances, default=(np.inf, -1))
             if min_distance > reach:
-                self._known[scene].append(_Sign(place, 1, time))
-                updated.add(len(self._known[scene]) - 1)
+                self._signs_by_scene[scene].append(_Sign(place, 1, time))
+                updated.add(len(self._signs_by_scene[scene]) - 1)
                 continue
-            sign = self._known[scene][sign_index]
+            sign = self._signs_by_scene[scene][sign_index]
             # nearer readings are more accurate, so the latest position replaces the earlier one
-            self._known[scene][sign_index] = _Sign(place, sign.hits + (sign_index not in updated), time)
+            self._signs_by_scene[scene][sign_index] = _Sign(place, sign.hits + (sign_index not in updated), time)
             updated.add(sign_index)
 
-    def known(self, scenes: I32, time: F64, pose: F32) -> U8:
+    def is_sign_ahead(self, scenes: I32, time: F64, pose: F32) -> U8:
         """Return whether egos know of a stop sign ahead.
 
         Args:
@@ -145,7 +147,7 @@ class SignMemory:
             [N] 1 or 0.
         """
         is_ahead = np.zeros(len(scenes), np.uint8)
-        signs = [(row, sign) for row, scene in enumerate(scenes.tolist()) for sign in self._known[scene]]
+        signs = [(row, sign) for row, scene in enumerate(scenes.tolist()) for sign in self._signs_by_scene[scene]]
         if not signs:
             return is_ahead
         row = np.array([row_index for row_index, _ in signs])
@@ -161,8 +163,10 @@ class SignMemory:
 
     def snapshot(self) -> Any:
         """Return a copy of the memory."""
-        return [[_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in self._known]
+        return [[_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in self._signs_by_scene]
 
     def restore(self, snapshot: Any) -> None:
         """Continue from an earlier snapshot."""
-        self._known = [[_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in snapshot]
+        self._signs_by_scene = [
+            [_Sign(sign.place.copy(), sign.hits, sign.last) for sign in scene] for scene in snapshot
+        ]

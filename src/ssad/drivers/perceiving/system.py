@@ -14,8 +14,8 @@ from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.safeio import dump_json, parse_json
 from ssad.core.schema import Schema
-from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent, TrackingEvent
+from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     cameras_of,
@@ -26,7 +26,7 @@ from ssad.drivers.perceiving.parts import (
 )
 from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.signs import SignReading, sign_labels
-from ssad.drivers.perceiving.tracker import Tracking, tracking_of
+from ssad.drivers.perceiving.tracker import Tracking, tracking_settings
 
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
 KEYS_OF_PERCEIVER: Final = (
@@ -129,7 +129,7 @@ class PerceivingSystem(Schema):
     @property
     def views(self) -> Mapping[str, Camera]:
         """Cameras in whose images objects count as in view; none of a perceiver without cameras."""
-        return cameras_of(self._make_perceiver()) if self.perceiver else front(self.width, self.cameras)
+        return cameras_of(self._make_perceiver()) if self.perceiver else nuscenes_cameras(self.width, self.cameras)
 
     @property
     def tracking(self) -> Tracking:
@@ -138,7 +138,7 @@ class PerceivingSystem(Schema):
         detector = (options.get("detector", self.detector) if name == "camera" else "") if name else self.detector
         tracker, settings = self._part("tracker")
         given: dict[str, Any] = {"confirm": self.confirm, "reserve": self.reserve, "high": self.high, "low": self.low}
-        return tracking_of(detector, **(given | settings if tracker == "kalman" else given))
+        return tracking_settings(detector, **(given | settings if tracker == "kalman" else given))
 
     def check(self) -> None:
         """Validate the settings, and make the parts that are named.
@@ -176,7 +176,7 @@ class PerceivingSystem(Schema):
 
     def make(
         self,
-        watch: Callable[[Sighting | Known], None] | None = None,
+        watch: Callable[[PerceptionEvent | TrackingEvent], None] | None = None,
         *,
         repair: Repair | None = None,
         device: str = "cpu",
@@ -234,7 +234,7 @@ class PerceivingSystem(Schema):
             if name == "camera":
                 options = {"threshold": tracking.low} | options
             return _perceiver(name, dump_json(options), device)
-        cameras = front(self.width, self.cameras)
+        cameras = nuscenes_cameras(self.width, self.cameras)
         if self.perfect:
             return PerfectEyes(cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms)
         detector = _detector(self.detector, self.weights, self.input_width, device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     Tracker,
@@ -14,7 +14,7 @@ from ssad.drivers.perceiving.parts import (
     make_tracker,
     part_version,
 )
-from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking, tracking_of
+from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking, tracking_settings
 
 
 class OneCamera(Perceiving):
@@ -27,9 +27,9 @@ class OneCamera(Perceiving):
     weights: ClassVar[str]
 
     def __init__(self, *, width: int = 640, tracking: Tracking | None = None, **settings: Any) -> None:
-        tracker_settings = tracking or tracking_of(self.weights)
+        tracker_settings = tracking or tracking_settings(self.weights)
         super().__init__(
-            CameraEyes(self.weights, front(width), threshold=tracker_settings.low),
+            CameraEyes(self.weights, nuscenes_cameras(width), threshold=tracker_settings.low),
             tracking=tracker_settings,
             **settings,
         )
@@ -110,5 +110,5 @@ class Composed(Perceiving):
 def _tracker(name: str, perceiver: Perceiver) -> Tracker:
     """Return a tracker by name; the built-in one without arguments gets the scores that suit the detector."""
     if name == "kalman" and isinstance(perceiver, CameraEyes):
-        return KalmanTracker(tracking_of(perceiver.name))
+        return KalmanTracker(tracking_settings(perceiver.name))
     return make_tracker(name)

@@ -74,7 +74,9 @@ class Tracking:
             raise ConfigError("tracking needs gate, density and speed above 0, and stranger of at least 0")
 
 
-def tracking_of(detector: str, *, high: float | None = None, low: float | None = None, **settings: Any) -> Tracking:
+def tracking_settings(
+    detector: str, *, high: float | None = None, low: float | None = None, **settings: Any
+) -> Tracking:
     """Return tracker settings for a detector, by default adapted to the scores that it reports.
 
     Args:
@@ -196,49 +198,49 @@ class KalmanTracker:
     def __init__(self, settings: Tracking | None = None, scenes: int = 1) -> None:
         self.settings = settings or Tracking()
         self.tracks = no_kalman_tracks()
-        self._born = np.zeros(scenes, np.int64)
+        self._track_counts = np.zeros(scenes, np.int64)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Forget all tracks; one scene for each of the episodes."""
-        self.tracks, self._born = no_kalman_tracks(), np.zeros(len(episodes), np.int64)
+        self.tracks, self._track_counts = no_kalman_tracks(), np.zeros(len(episodes), np.int64)
 
     def snapshot(self) -> tuple[KalmanTracks, I64]:
         """Return the complete state; `restore` continues from it, bit by bit."""
-        return self.tracks, self._born.copy()
+        return self.tracks, self._track_counts.copy()
 
     def restore(self, snapshot: tuple[KalmanTracks, I64]) -> None:
         """Continue from an earlier snapshot."""
-        self.tracks, self._born = snapshot[0], snapshot[1].copy()
+        self.tracks, self._track_counts = snapshot[0], snapshot[1].copy()
 
-    def update(self, scenes: I64, times: F64, found: Objects, poses: F64 | None = None) -> None:
-        """Take in what was found in one look at each of some scenes.
+    def update(self, scenes: I64, times: F64, objects: Objects, poses: F64 | None = None) -> None:
+        """Process the detections of one look at each of some scenes.
 
         Args:
             scenes: [n] the scenes, each once; where nothing was found, all tracks missed a look.
             times: [n] s of the looks, none before the last one of its scene.
-            found: The objects; those of other scenes do not count.
+            objects: The objects; those of other scenes do not count.
             poses: Not used: objects are in the world frame.
         """
-        settings, look_times = self.settings, np.full(len(self._born), np.nan)
+        settings, look_times = self.settings, np.full(len(self._track_counts), np.nan)
         look_times[scenes] = times
         was_looked_at = np.isfinite(look_times[self.tracks.scene])
         tracks = self.tracks.at(
             np.where(was_looked_at, look_times[self.tracks.scene], self.tracks.time), settings.density
         )
-        found = found.take(np.isfinite(look_times[found.scene]) & (found.score >= settings.low))
-        rows, hits = self._matched(tracks, found, np.sort(scenes))
+        objects = objects.take(np.isfinite(look_times[objects.scene]) & (objects.score >= settings.low))
+        rows, hits = self._match(tracks, objects, np.sort(scenes))
         tracks = replace(tracks, missed=np.where(was_looked_at, tracks.missed + 1, tracks.missed))
-        tracks = self._with_hits(tracks, rows, found.take(hits))
-        unmatched = np.setdiff1d(np.flatnonzero(found.score >= settings.high), hits)
+        tracks = self._update_tracks(tracks, rows, objects.take(hits))
+        unmatched = np.setdiff1d(np.flatnonzero(objects.score >= settings.high), hits)
         max_missed = np.where(tracks.hits >= settings.confirm, settings.reserve, settings.patience)
         tracks = tracks.take(tracks.missed <= max_missed)
-        self.tracks = concatenate([tracks, self._begun(found.take(unmatched), look_times)])
+        self.tracks = concatenate([tracks, self._new_tracks(objects.take(unmatched), look_times)])
 
-    def _matched(self, tracks: KalmanTracks, found: Objects, scenes: I64) -> tuple[I64, I64]:
+    def _match(self, tracks: KalmanTracks, objects: Objects, scenes: I64) -> tuple[I64, I64]:
         """Rows of tracks and of objects that belong together, scene by scene."""
         settings = self.settings
-        rows, track_begin, track_count = _by_scene(tracks.scene, scenes)
-        hits, object_begin, object_count = _by_scene(found.scene, scenes)
+        rows, track_begin, track_count = _group_by_scene(tracks.scene, scenes)
+        hits, object_begin, object_count = _group_by_scene(objects.scene, scenes)
         # distances of all pairs of all scenes in one batch, ordered by scene, then by track
         pair_count = track_count * object_count
         pair_scene = np.repeat(np.arange(len(scenes)), pair_count)
@@ -250,18 +252,18 @@ class KalmanTracker:
         distances = distance(
             tracks.mean[track_index],
             tracks.covariance[track_index],
-            found.place[object_index],
-            found.spread[object_index],
+            objects.place[object_index],
+            objects.spread[object_index],
         )
         # Clipping at the gate keeps impossible pairs from distorting the optimal assignment.
         distances = np.minimum(
-            distances + settings.stranger * (tracks.kind[track_index] != found.kind[object_index]), settings.gate
+            distances + settings.stranger * (tracks.kind[track_index] != objects.kind[object_index]), settings.gate
         )
-        confirmed, is_high = tracks.hits >= settings.confirm, found.score >= settings.high
+        confirmed, is_high = tracks.hits >= settings.confirm, objects.score >= settings.high
         stages = ((confirmed, is_high), (confirmed & (tracks.missed == 0), ~is_high), (~confirmed, is_high))
         track_matches: list[I64] = [np.zeros(0, np.int64)]
         object_matches: list[I64] = [np.zeros(0, np.int64)]
-        free_tracks, free_objects = np.ones(len(tracks), bool), np.ones(len(found), bool)
+        free_tracks, free_objects = np.ones(len(tracks), bool), np.ones(len(objects), bool)
         offset = 0
         for scene_index in np.flatnonzero(pair_count).tolist():
             scene_tracks, scene_objects = (
@@ -284,12 +286,12 @@ class KalmanTracker:
                     free_tracks[track_matches[-1]], free_objects[object_matches[-1]] = False, False
         return np.concatenate(track_matches), np.concatenate(object_matches)
 
-    def _with_hits(self, tracks: KalmanTracks, rows: I64, hits: Objects) -> KalmanTracks:
+    def _update_tracks(self, tracks: KalmanTracks, rows: I64, hits: Objects) -> KalmanTracks:
         """Update tracks with their hits."""
         columns = {column.name: getattr(tracks, column.name).copy() for column in fields(tracks)}
         filtered = update(tracks.mean[rows], tracks.covariance[rows], hits.place, hits.spread)
         columns["mean"][rows], columns["covariance"][rows] = filtered
-        axis, heading, votes = _looks(hits)
+        axis, heading, votes = _appearance_votes(hits)
         for name, value in (("axis", axis), ("heading", heading), ("votes", votes)):
             columns[name][rows] = MEMORY * columns[name][rows] + value
         columns["size"][rows] = MEMORY * columns["size"][rows] + (1.0 - MEMORY) * hits.size
@@ -297,32 +299,32 @@ class KalmanTracker:
         columns["hits"][rows] += 1
         return KalmanTracks(**columns)
 
-    def _begun(self, found: Objects, when: F64) -> KalmanTracks:
-        """New tracks, numbered on in each scene."""
-        count = len(found)
+    def _new_tracks(self, objects: Objects, times: F64) -> KalmanTracks:
+        """Start new tracks, numbered consecutively in each scene."""
+        count = len(objects)
         numbers = np.zeros(count, np.int64)
-        for scene in np.unique(found.scene):
-            in_scene = found.scene == scene
-            numbers[in_scene] = self._born[scene] + np.arange(in_scene.sum())
-            self._born[scene] += in_scene.sum()
-        has_velocity = np.asarray(np.isfinite(found.velocity).all(1))
-        mean = np.concatenate([found.place, np.where(has_velocity[:, None], found.velocity, 0.0)], 1)
+        for scene in np.unique(objects.scene):
+            in_scene = objects.scene == scene
+            numbers[in_scene] = self._track_counts[scene] + np.arange(in_scene.sum())
+            self._track_counts[scene] += in_scene.sum()
+        has_velocity = np.asarray(np.isfinite(objects.velocity).all(1))
+        mean = np.concatenate([objects.place, np.where(has_velocity[:, None], objects.velocity, 0.0)], 1)
         covariance = np.zeros((count, 4, 4))
-        covariance[:, :2, :2] = found.spread
+        covariance[:, :2, :2] = objects.spread
         covariance[:, 2, 2] = covariance[:, 3, 3] = self.settings.speed**2
-        axis, heading, votes = _looks(found)
+        axis, heading, votes = _appearance_votes(objects)
         first_hits, no_misses = np.ones(count, np.int64), np.zeros(count, np.int64)
         return KalmanTracks(
-            found.scene,
+            objects.scene,
             numbers,
-            when[found.scene],
+            times[objects.scene],
             mean,
             covariance,
             axis,
             heading,
-            found.size,
+            objects.size,
             votes,
-            found.score,
+            objects.score,
             first_hits,
             no_misses,
         )
@@ -334,7 +336,7 @@ class KalmanTracker:
             scenes: [n] distinct scenes.
             times: [n] s.
         """
-        scene_times = np.full(len(self._born), np.nan)
+        scene_times = np.full(len(self._track_counts), np.nan)
         scene_times[scenes] = times
         selected = self.tracks.take(
             (self.tracks.hits >= self.settings.confirm) & np.isfinite(scene_times[self.tracks.scene])
@@ -374,17 +376,17 @@ def kalman_tracker(  # plain values, as they stand in a suite
     )
 
 
-def _by_scene(scene: I64, scenes: I64) -> tuple[I64, I64, I64]:
+def _group_by_scene(scene: I64, scenes: I64) -> tuple[I64, I64, I64]:
     """Return rows ordered by scene, and the first position and number of rows of each given scene."""
     order = np.argsort(scene, kind="stable")
     begin, end = (np.searchsorted(scene[order], scenes, side=side) for side in ("left", "right"))
     return order, begin, end - begin
 
 
-def _looks(found: Objects) -> tuple[F64, F64, F64]:
-    """What a look says of heading (twice, once) and kind, weighed by the score; no heading: nothing."""
-    yaw, has_yaw = np.nan_to_num(found.yaw), np.isfinite(found.yaw)
-    weight = (found.score * has_yaw)[:, None]
+def _appearance_votes(objects: Objects) -> tuple[F64, F64, F64]:
+    """Return the votes of detections for axis, heading and kind, weighted by the score; no heading, no vote."""
+    yaw, has_yaw = np.nan_to_num(objects.yaw), np.isfinite(objects.yaw)
+    weight = (objects.score * has_yaw)[:, None]
     axis = weight * np.stack([np.cos(2 * yaw), np.sin(2 * yaw)], 1)
     heading = weight * np.stack([np.cos(yaw), np.sin(yaw)], 1)
-    return axis, heading, found.score[:, None] * np.eye(len(AgentKind))[found.kind]
+    return axis, heading, objects.score[:, None] * np.eye(len(AgentKind))[objects.kind]

@@ -38,7 +38,7 @@ def check_tracks(tracks: Any, scenes: I32 | I64, tracker: str) -> None:
         raise ConfigError(f"tracker {tracker}: confirmed returned a track of a scene that it was not asked for")
 
 
-def believed(tracks: Tracks, scenes: I32 | I64) -> Belief:
+def belief_from_tracks(tracks: Tracks, scenes: I32 | I64) -> Belief:
     """Convert tracks to the belief of the planner: pose, speed, size and kind.
 
     Args:

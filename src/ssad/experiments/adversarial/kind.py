@@ -33,7 +33,7 @@ from ssad.experiments.adversarial.verdict import verdict
 from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, described
 from ssad.report.load import Run
 from ssad.report.tables import Table
-from ssad.simulators.closed_loop import grades_of, system_version, town
+from ssad.simulators.closed_loop import cached_town, grades_of, system_version
 
 
 class AdversarialSuite(ScenarioSuite):
@@ -110,7 +110,7 @@ class Adversarial(ScenarioKind):
         scenarios, towns = described(suite)
         if check:
             episodes = [
-                build_episode(scenario.scenario, town(scenario.scenario.town), seed=0) for scenario in scenarios
+                build_episode(scenario.scenario, cached_town(scenario.scenario.town), seed=0) for scenario in scenarios
             ]
             for name, factory in factories.items():
                 refusals = [refusal(factory, episode) for episode in episodes]
@@ -163,7 +163,7 @@ class Adversarial(ScenarioKind):
         scenarios = [scenario_from(cell.spec["scenario"]) for cell in cells]
         seeds = [cell.seed for cell in cells]
         driven_bases = trials.bases(
-            [(value, town(value.town), seed) for value, seed in zip(scenarios, seeds, strict=True)]
+            [(value, cached_town(value.town), seed) for value, seed in zip(scenarios, seeds, strict=True)]
         )
         bases = {cell.key: base for cell, base in zip(cells, driven_bases, strict=True)}
         factory = generator_factory(spec["generator"])

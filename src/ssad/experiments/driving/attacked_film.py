@@ -13,8 +13,8 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.protocols import Detector
 from ssad.core.types import U8, AgentKind, EpisodeTrace
 from ssad.detectors.drawing import marked
-from ssad.rendering.agent_edit import LiveAttack
-from ssad.rendering.camera.render import Weather
+from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.onboard import DAY, Onboard
 
 NEAR = 40.0  # m ahead of the ego within which an agent is worth filming
@@ -34,12 +34,12 @@ def first_ahead(trace: EpisodeTrace, kind: AgentKind = AgentKind.CAR) -> int | N
 def attacked_frames(
     trace: EpisodeTrace,
     graph: LaneGraph,
-    attack: LiveAttack,
+    attack: AgentEdit,
     *,
     detector: Detector | None = None,
     width: int = 640,
     every: int = 2,
-    weather: Weather = DAY,
+    weather: SceneWeather = DAY,
 ) -> Iterator[U8]:
     """The drive as the ego's camera sees it, without the attack on the left and with it on the right.
 

@@ -27,10 +27,10 @@ from ssad.report.tables import Table
 from ssad.simulators.closed_loop import (
     HIGHWAY_TYPE,
     drive,
-    embedded,
     episode_of,
     grade_of,
-    in_highway,
+    runs_embedded,
+    runs_in_highway_env,
     system_version,
 )
 
@@ -79,13 +79,13 @@ class Driving(ScenarioKind):
         scenarios, towns = described(suite)
         remote_spec: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
         if remote_spec:
-            from ssad.simulators.carla.server import Server, probe
+            from ssad.simulators.carla.server import Server, check_version
 
             server = Server.of(suite.simulator)
             if any(scenario.scenario.type == HIGHWAY_TYPE for scenario in scenarios):
                 raise ConfigError(f"suite {suite.name}: scenarios of highway-env do not run in {server}")
             if check:
-                probe(server)
+                check_version(server)
         # the seed does not depend on the system: systems meet the same episodes
         cells = tuple(
             self.scenario_cell(
@@ -126,7 +126,7 @@ class Driving(ScenarioKind):
 
     def alike(self, cell: Cell) -> Hashable:
         """Return system and simulator; CARLA drives one cell at a time."""
-        return cell.key if "simulator" in cell.spec else (cell.system, in_highway(cell))
+        return cell.key if "simulator" in cell.spec else (cell.system, runs_in_highway_env(cell))
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drive the episodes as one batch of the world, measure them, write their traces."""
@@ -140,7 +140,7 @@ class Driving(ScenarioKind):
             if measured:
                 result["metrics"]["lane_crossings"] = measured["lane_crossings"]
                 result["measured"] = plain(measured)
-            if job.settings["witness"] and trace.end == "collision" and embedded(cell):
+            if job.settings["witness"] and trace.end == "collision" and runs_embedded(cell):
                 grade = grade_of(episode, trace, job.device)
                 result["metrics"] |= grade.metrics()
                 result["witness"] = plain(grade.as_dict())

@@ -39,7 +39,7 @@ from ssad.report.tables import Table
 from ssad.scenarios.static.catalogue import NONE, PerturbationTable
 from ssad.scenarios.static.perturbation import EGO, Perturbation
 from ssad.scenarios.static.physical.textures.perturbation import signs_of_route
-from ssad.simulators.closed_loop import episode_of, system_version, town
+from ssad.simulators.closed_loop import cached_town, episode_of, system_version
 
 EVERY = 0.2  # s from one frame of a film to the next
 
@@ -128,7 +128,7 @@ class Gap(ScenarioKind):
                 episode = episode_of(self._cell(suite, entry, conditions[0], 0, "", EGO))
                 for condition in targeted:
                     assert condition.perturbation is not None
-                    agent = condition.perturbation.applies_to(episode, town(entry.scenario.town))
+                    agent = condition.perturbation.applies_to(episode, cached_town(entry.scenario.town))
                     targets[condition.title, entry.scenario.name] = agent
         cells = [
             self._cell(suite, entry, condition, repetition, versions[condition.system_name], target)
@@ -208,13 +208,13 @@ class Gap(ScenarioKind):
             if perception is not None:
                 system, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), perception.perceived(index)
                 metrics |= component_metrics(trace, perceived, sure=system.tracking.high)
-                metrics |= sign_metrics(trace, perceived, signs_of_route(town(trace.town), trace.route))
+                metrics |= sign_metrics(trace, perceived, signs_of_route(cached_town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
                 record_fields["cause"] = cause_of_collision(trace, perceived)
                 if job.settings["sheets"] and (sheet_images := perception.shots(index)):
                     result["artefacts"]["sheet"] = f"sheets/{cell.key}.jpg"
                     safeio.make_folder(job.folder / "sheets")
-                    picture = drive_sheet(trace, perceived, sheet_images, town(trace.town))
+                    picture = drive_sheet(trace, perceived, sheet_images, cached_town(trace.town))
                     save_picture(job.folder / result["artefacts"]["sheet"], picture)
             metrics = {name: round(value, 6) if isinstance(value, float) else value for name, value in metrics.items()}
             record_fields |= {"repaired": repaired[index]} if index in repaired else {}
@@ -226,7 +226,7 @@ class Gap(ScenarioKind):
         """Drive the episode again and compare every bit of its trace; film it beside the clean drive."""
         quiet_warp()
         recorded = load_trace(folder / record["artefacts"]["trace"])
-        spec, graph = cell.spec, town(recorded.town)
+        spec, graph = cell.spec, cached_town(recorded.town)
         # The clean drive shows what the perturbation alone changes.
         clean = replace(cell, spec={**spec, "perturbation": None})
         drives, replayed_traces = [], []

@@ -23,7 +23,7 @@ def _drives() -> list[tuple[EpisodeTrace, LaneGraph]]:
     """Return traces of the Autopilot in drives of other towns, with their towns."""
     from ssad.drivers import make_system
     from ssad.scenarios.dynamic import build_episode, load_scenarios
-    from ssad.simulators.closed_loop import town
+    from ssad.simulators.closed_loop import cached_town
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
@@ -35,7 +35,7 @@ def _drives() -> list[tuple[EpisodeTrace, LaneGraph]]:
     selected = natural_scenarios[:: len(natural_scenarios) // DRIVES][:DRIVES]
     traces = []
     for scenario in selected:
-        graph = town(scenario.town)
+        graph = cached_town(scenario.town)
         world = World([build_episode(scenario, graph, seed=0)], {graph.name: graph})
         traces += [(trace, graph) for trace in rollout(world, make_system("autopilot"))]
     return traces

@@ -18,11 +18,11 @@ from ssad.experiments.gap.other_drives import images_of_other_drives
 from ssad.metrics import episode_metrics
 from ssad.scenarios.static.catalogue import parse_perturbation
 from ssad.scenarios.static.perturbation import Perturbation
-from ssad.simulators.closed_loop import Order, drive
+from ssad.simulators.closed_loop import EpisodeRequest, drive
 
 
 def drive_perceiving(
-    orders: Sequence[Order],
+    orders: Sequence[EpisodeRequest],
     *,
     device: str,
     seed: int,
@@ -70,7 +70,7 @@ def perturbation_of(spec: Mapping[str, Any]) -> Perturbation | None:
 
 
 def drive_repaired(
-    orders: Sequence[Order], traces: Sequence[EpisodeTrace], *, device: str, seed: int
+    orders: Sequence[EpisodeRequest], traces: Sequence[EpisodeTrace], *, device: str, seed: int
 ) -> dict[int, dict[str, Any]]:
     """Drives that ended in a collision driven again with whom they hit found where it is: does that one error decide?
 
@@ -102,6 +102,6 @@ def drive_repaired(
     }
 
 
-def _paired(order: Order) -> str:
+def _paired(order: EpisodeRequest) -> str:
     """Pictures are keyed by the episode: conditions of one drive must share their noise and weather."""
     return digest("gap", order.spec["scenario"]["name"], order.seed)[:16]

@@ -19,7 +19,7 @@ from ssad.experiments.how_often.failure_rate import ChanceEpisode, Method
 from ssad.experiments.how_often.verdict import verdict
 from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, described
 from ssad.report.load import Run
-from ssad.simulators.closed_loop import system_of, system_version, town
+from ssad.simulators.closed_loop import cached_town, system_of, system_version
 
 SETTINGS = ("episodes", "particles", "repeats", "components", "batch")  # of the estimators, as suites name them
 
@@ -144,6 +144,6 @@ def chance_of(cell: Cell, device: str) -> ChanceEpisode:
     from ssad.scenarios.dynamic import build_episode, scenario_from
 
     scenario = scenario_from(cell.spec["scenario"])
-    graph = town(scenario.town)
+    graph = cached_town(scenario.town)
     episode = build_episode(scenario, graph, seed=scenario.seed)
     return ChanceEpisode(episode, graph, system_of(cell.system), cell.spec["noise"], device, cell.seed)

@@ -130,7 +130,7 @@ def _mattress(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
     outline = np.stack([np.cos(angles) * corner_radius, np.sin(angles) * corner_radius], 1)
     outline /= np.abs(outline).max(axis=0)
 
-    def slab(levels: Sequence[tuple[float, float]], look: Material) -> Mesh:
+    def slab(levels: Sequence[tuple[float, float]], material: Material) -> Mesh:
         half_height = 0.5 * height
         sections = [
             np.column_stack(
@@ -141,7 +141,7 @@ def _mattress(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
             )
             for inset_share, z in levels
         ]
-        return loft(np.array(sections), material=look)
+        return loft(np.array(sections), material=material)
 
     parts = [
         slab(
@@ -480,30 +480,32 @@ def animal(style: str, size: Point, *, generator: np.random.Generator, detail: i
     ring_segments = (6, 8, 14)[detail]
     limb_segments = (3, 5, 8)[detail]
     subdivision = (1, 1, 3)[detail]
-    trunk = _along(_rounded(shape.trunk, subdivision), coat_material, ring_segments, shape.narrow)
+    trunk = _tapered_body(_smooth_path(shape.trunk, subdivision), coat_material, ring_segments, shape.narrow)
     # Only white cows have dark patches.
     if style == "cow" and coat_colour[1] > 0.5:
-        trunk = _spotted(trunk, patch_centres, Material("patches", (0.02, 0.018, 0.017), specular=0.02, gloss=0.15))
+        trunk = _paint_spots(trunk, patch_centres, Material("patches", (0.02, 0.018, 0.017), specular=0.02, gloss=0.15))
     elif style != "cow":
-        trunk = _spotted(trunk, np.array([[0.0, 0.0, -1.0]]), belly_material, upright=True)
-    neck, head = (_rounded(path, subdivision) for path in (shape.neck, shape.head))
+        trunk = _paint_spots(trunk, np.array([[0.0, 0.0, -1.0]]), belly_material, upright=True)
+    neck, head = (_smooth_path(path, subdivision) for path in (shape.neck, shape.head))
     parts = [
         trunk,
-        _along(neck, coat_material, ring_segments, shape.narrow),
-        _along(head, coat_material, ring_segments, 0.8),
+        _tapered_body(neck, coat_material, ring_segments, shape.narrow),
+        _tapered_body(head, coat_material, ring_segments, 0.8),
     ]
     x, z, radius = shape.head[-1]
     parts.append(
         sphere((0.8 * radius, 0.8 * radius, 0.7 * radius), material=HOOF, segments=limb_segments + 1).moved(x, 0.0, z)
     )
-    parts.append(_along(shape.tail, mane_material if style in ("horse", "cow") else coat_material, limb_segments, 1.0))
+    parts.append(
+        _tapered_body(shape.tail, mane_material if style in ("horse", "cow") else coat_material, limb_segments, 1.0)
+    )
     for leg, swing_share in ((shape.foreleg, leg_swings[0]), (shape.hindleg, leg_swings[1])):
         leg_top = leg[0][1]
         for side in (-1.0, 1.0):
             path = [(x + side * swing_share * 0.35 * (leg_top - z), z, ring_radius) for x, z, ring_radius in leg]
             shoulder = (path[0][0], leg_top + 0.9 * path[0][2], 0.35 * path[0][2])
-            path = _rounded([shoulder, *path], subdivision)
-            parts.append(_along(path, coat_material, max(limb_segments, 4), 0.9).moved(y=side * shape.apart))
+            path = _smooth_path([shoulder, *path], subdivision)
+            parts.append(_tapered_body(path, coat_material, max(limb_segments, 4), 0.9).moved(y=side * shape.apart))
             if style != "dog":
                 x, _, ring_radius = path[-1]
                 hoof = tube(
@@ -560,11 +562,11 @@ def _headgear(style: str, beast: _Beast, sides: int, *, antlers: bool, dark: Mat
             for neck_x, neck_z, neck_radius in beast.neck
         ]
         forelock = [(x + 0.06, z + 0.09, 0.04), (x + 0.17, z - 0.03, 0.02)]
-        return [_along(crest, dark, sides, 0.7), _along(forelock, dark, sides, 0.9)]
+        return [_tapered_body(crest, dark, sides, 0.7), _tapered_body(forelock, dark, sides, 0.9)]
     return []
 
 
-def _rounded(path: Path, finer: int) -> list[tuple[float, float, float]]:
+def _smooth_path(path: Path, finer: int) -> list[tuple[float, float, float]]:
     """The path with `finer` pieces for each of its pieces, on smooth lines."""
     if finer == 1:
         return list(path)
@@ -576,15 +578,15 @@ def _rounded(path: Path, finer: int) -> list[tuple[float, float, float]]:
     return [(x, z, radius) for x, z, radius in zip(*columns, strict=True)]
 
 
-def _along(path: Path, look: Material, sides: int, narrow: float) -> Mesh:
-    """A round body along a path of (x, z, radius) in the plane y = 0, `narrow` times as wide as it is high."""
+def _tapered_body(path: Path, material: Material, sides: int, width_share: float) -> Mesh:
+    """A round body along a path of (x, z, radius) in the plane y = 0, `width_share` times as wide as it is high."""
     columns = np.array(path)
     points = np.stack([columns[:, 0], np.zeros(len(columns)), columns[:, 1]], 1)
-    body = tube(points, columns[:, 2], material=look, segments=sides)
-    return body.transformed(np.diag([1.0, narrow, 1.0]))
+    body = tube(points, columns[:, 2], material=material, segments=sides)
+    return body.transformed(np.diag([1.0, width_share, 1.0]))
 
 
-def _spotted(mesh: Mesh, spots: F64, look: Material, *, upright: bool = False) -> Mesh:
+def _paint_spots(mesh: Mesh, spots: F64, material: Material, *, upright: bool = False) -> Mesh:
     """The mesh with another material on the faces near some of the spots [n, 3] (from -1 to 1 over its bounding box).
 
     upright: the faces that look down get it instead.
@@ -599,7 +601,7 @@ def _spotted(mesh: Mesh, spots: F64, look: Material, *, upright: bool = False) -
     return replace(
         mesh,
         material=np.where(is_spotted, len(mesh.materials), mesh.material).astype(np.int32),
-        materials=(*mesh.materials, look),
+        materials=(*mesh.materials, material),
     )
 
 
@@ -622,10 +624,10 @@ def overturned(style: str, size: Point, *, generator: np.random.Generator, detai
         vehicle = car(OVERTURNED_CARS[style], upright_size, generator=generator, detail=detail)
         underside = _underside(upright_size, 0.17 * upright_size[2], truck=False)
     lying_mesh = merge([vehicle, underside]).transformed(_turned("x", np.pi if is_on_roof else side * np.pi / 2.0))
-    return fit(_settled(lying_mesh, 0.05 * height if is_on_roof else None), size)
+    return fit(_flatten_base(lying_mesh, 0.05 * height if is_on_roof else None), size)
 
 
-def _settled(mesh: Mesh, dent: float | None) -> Mesh:
+def _flatten_base(mesh: Mesh, dent: float | None) -> Mesh:
     """Flatten the mesh at the ground: press in its mirrors, or `dent` m of its roof."""
     corners = mesh.corners()
     lowest = float(corners[..., 2].min())

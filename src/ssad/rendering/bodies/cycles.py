@@ -21,16 +21,16 @@ from ssad.rendering.bodies.parts import (
     TRIM,
     WOOD,
     as_point,
+    assign_side_panels,
     both_sides,
     crate,
     crates,
     finish,
     side_charts,
-    sided,
     tubes,
     wheel,
 )
-from ssad.rendering.bodies.people import CLOTHS, draw_look, figure, seated, torso_charts
+from ssad.rendering.bodies.people import CLOTHS, draw_appearance, figure, seated_pose, torso_charts
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, loft, merge, ring, sphere, tube
 
 BICYCLES = {"plain": 0.3, "city": 0.3, "racing": 0.2, "delivery": 0.2}  # variants and their shares
@@ -71,7 +71,7 @@ def bicycle(
 
     Its variant (see `BICYCLES`) is drawn. `phase` is the angle of the left crank, rad; None draws it.
     """
-    appearance = draw_look(generator, helmet=bool(generator.random() < 0.5), rider=True)
+    appearance = draw_appearance(generator, helmet=bool(generator.random() < 0.5), rider=True)
     random_phase, uprightness = generator.uniform(0.0, 2.0 * np.pi), float(generator.random())
     variant = _variant(BICYCLES, float(generator.random()))
     # Drawn before the variant is known, so that the number of draws is fixed.
@@ -107,7 +107,7 @@ def bicycle(
     painted = [tube(bar, 0.019, material=PAINT, segments=segments) for bar in frame_tubes]
     frame_stays = [(bottom_bracket, rear), (seat_top, rear)] if detail else [(bottom_bracket, rear)]
     painted += [tube(bar, 0.013, material=PAINT, segments=segments) for bar in frame_stays]
-    parts.append(sided(merge(painted), "frame"))
+    parts.append(assign_side_panels(merge(painted), "frame"))
     parts.append(tube([fork_crown, front], 0.018, material=FRAME, segments=segments))
     parts.append(tube([seat_top, saddle], 0.014, material=STEEL, segments=segments))
     parts.append(sphere((0.14, 0.07, 0.035), material=TRIM, centre=(-0.26, 0.0, 0.95), segments=max(6, segments)))
@@ -150,7 +150,7 @@ def bicycle(
     if style == "ridden":
         hand_points = [as_point(grip * [1.0, side, 1.0] + [0.0, 0.0, 0.02]) for side in (1.0, -1.0)]
         trunk_lean = {"city": 0.12, "racing": 0.85}.get(variant, 0.35 + 0.35 * (1.0 - uprightness))
-        pose = seated(
+        pose = seated_pose(
             1.75,
             pelvis=(-0.24, 0.0, 1.03),
             lean=trunk_lean,
@@ -163,7 +163,7 @@ def bicycle(
 
 
 def _carriers(variant: str, radius: float, base: float, detail: int) -> list[Mesh]:
-    """What a city or delivery bicycle carries its load in, and its mudguards."""
+    """Return the racks and boxes of a city or delivery bicycle, and its mudguards."""
     if variant == "city":
         parts = [
             crate((0.44, -0.17, 0.76), (0.72, 0.17, 0.98), WICKER),
@@ -190,7 +190,7 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
 
     Its variant (see `MOTORCYCLES`) is drawn.
     """
-    appearance = draw_look(generator, helmet=True, rider=True, visor=True)
+    appearance = draw_appearance(generator, helmet=True, rider=True, visor=True)
     variant = _variant(MOTORCYCLES, float(generator.random()))
     has_box = bool(generator.random() < BOXED) and variant != "sports"
     # All random numbers are drawn for every variant, so that their number never depends on it.
@@ -200,7 +200,7 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
     painted, parts = (
         _scooter(segments, detail) if is_scooter else _motorbike(segments, detail, fairing=variant == "sports")
     )
-    parts.append(sided(merge(painted), "body"))
+    parts.append(assign_side_panels(merge(painted), "body"))
     grip = np.array([0.32, 0.33, 1.05]) if is_scooter else np.array([0.26, 0.34, 1.04])
     if has_box:
         material = Material("delivery_box", colour, specular=0.03, gloss=0.3)
@@ -219,7 +219,7 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
         )
         trunk_lean = {"sports": 0.55, "naked": 0.25, "scooter": 0.10}[variant]
         knee_spread = 0.05 if is_scooter else 0.25
-        pose = seated(
+        pose = seated_pose(
             1.76,
             pelvis=(-0.30, 0.0, 0.92),
             lean=trunk_lean,
@@ -232,10 +232,10 @@ def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detai
     return finish(parts, charts, size)
 
 
-def _tyres(places: Sequence[tuple[float, float]], radius: float, detail: int) -> list[Mesh]:
+def _tyres(axles: Sequence[tuple[float, float]], radius: float, detail: int) -> list[Mesh]:
     """Return the wheels of a motorcycle at each (x, width), m."""
     parts = []
-    for x, width in places:
+    for x, width in axles:
         half_width, segments = 0.5 * (width + 0.1), (10, 14, 24)[detail]
         tyre = ring(radius, half_width, material=RUBBER, segments=segments, around=(4, 5, 8)[detail])
         parts.append(tyre.moved(x, 0.0, radius))
@@ -254,60 +254,74 @@ def _mirrors(detail: int) -> list[Mesh]:
     return [both_sides(mirror), tubes([(0.32, 0.24, 1.04), (0.36, 0.29, 1.17)], 0.008, TRIM, 4)]
 
 
-def _motorbike(n: int, detail: int, *, fairing: bool) -> tuple[list[Mesh], list[Mesh]]:
+def _motorbike(segments: int, detail: int, *, fairing: bool) -> tuple[list[Mesh], list[Mesh]]:
     """Painted and other parts of a motorcycle with its engine below the tank, with or without a fairing."""
     wheel_radius = 0.32
     front_hub, rear_hub = np.array([0.72, 0.0, wheel_radius]), np.array([-0.70, 0.0, wheel_radius])
     parts = _tyres(((0.72, 0.12), (-0.70, 0.17)), wheel_radius, detail)
-    painted = [_pod(ovals, n) for ovals in (TANK, TAIL_PIECE, MUDGUARD)]
+    painted = [_pod(ovals, segments) for ovals in (TANK, TAIL_PIECE, MUDGUARD)]
     if fairing:
-        painted.append(_pod(FAIRING, n))
-        parts.append(_pod([(0.35, 0.13, 0.98, 1.16), (0.62, 0.11, 0.98, 1.08)], n, GLASS))
-    parts.append(_pod([(-0.74, 0.13, 0.84, 0.94), (-0.35, 0.16, 0.78, 0.85), (-0.10, 0.12, 0.78, 0.86)], n, TRIM))
-    parts.append(_pod([(-0.28, 0.17, 0.26, 0.62), (-0.05, 0.20, 0.22, 0.70), (0.28, 0.17, 0.28, 0.66)], n, DARK))
+        painted.append(_pod(FAIRING, segments))
+        parts.append(_pod([(0.35, 0.13, 0.98, 1.16), (0.62, 0.11, 0.98, 1.08)], segments, GLASS))
+    parts.append(
+        _pod([(-0.74, 0.13, 0.84, 0.94), (-0.35, 0.16, 0.78, 0.85), (-0.10, 0.12, 0.78, 0.86)], segments, TRIM)
+    )
+    parts.append(_pod([(-0.28, 0.17, 0.26, 0.62), (-0.05, 0.20, 0.22, 0.70), (0.28, 0.17, 0.28, 0.66)], segments, DARK))
     parts.append(crate((-0.05, -0.25, 0.30), (0.12, 0.25, 0.42), STEEL))
     fork_crown = np.array([0.40, 0.0, 0.95])
     side_offset = np.array([0.0, 0.09, 0.0])
-    parts.append(tubes([fork_crown + side_offset, front_hub + side_offset], 0.028, STEEL, n))
+    parts.append(tubes([fork_crown + side_offset, front_hub + side_offset], 0.028, STEEL, segments))
     if detail:
-        parts.append(tubes(np.array([(-0.20, 0.11, 0.40), rear_hub + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, n))
+        parts.append(
+            tubes(np.array([(-0.20, 0.11, 0.40), rear_hub + np.array([0.0, 0.11, 0.0])]), 0.03, FRAME, segments)
+        )
         exhaust = [(0.15, -0.16, 0.24), (-0.45, -0.20, 0.24), (-0.82, -0.22, 0.42)]
-        parts.append(tube(exhaust, [0.03, 0.045, 0.06], material=CHROME, segments=n))
+        parts.append(tube(exhaust, [0.03, 0.045, 0.06], material=CHROME, segments=segments))
         blinker = sphere((0.03, 0.03, 0.03), material=BLINKER, centre=(0.46, 0.20, 0.90), segments=6)
         parts.append(both_sides(blinker))
     parts.append(
-        tubes(np.array([fork_crown, fork_crown + np.array([-0.02, 0.16, 0.08]), (0.26, 0.34, 1.04)]), 0.016, TRIM, n)
+        tubes(
+            np.array([fork_crown, fork_crown + np.array([-0.02, 0.16, 0.08]), (0.26, 0.34, 1.04)]),
+            0.016,
+            TRIM,
+            segments,
+        )
     )
     lamp_position = (0.77 if fairing else 0.56, 0.0, 0.90)
-    parts.append(sphere((0.05, 0.095, 0.085), material=HEAD, centre=lamp_position, segments=max(6, n)))
+    parts.append(sphere((0.05, 0.095, 0.085), material=HEAD, centre=lamp_position, segments=max(6, segments)))
     return painted, parts + _mirrors(detail)
 
 
-def _scooter(n: int, detail: int) -> tuple[list[Mesh], list[Mesh]]:
+def _scooter(segments: int, detail: int) -> tuple[list[Mesh], list[Mesh]]:
     """Painted and other parts of a scooter: small wheels, a shield before the legs, a floor to step through."""
-    painted = [_pod(ovals, n) for ovals in (SHIELD, UNDER_SEAT, SMALL_MUDGUARD)]
-    painted.append(_pod([(0.36, 0.12, 0.98, 1.08), (0.46, 0.14, 0.94, 1.12), (0.53, 0.06, 0.97, 1.06)], n))
+    painted = [_pod(ovals, segments) for ovals in (SHIELD, UNDER_SEAT, SMALL_MUDGUARD)]
+    painted.append(_pod([(0.36, 0.12, 0.98, 1.08), (0.46, 0.14, 0.94, 1.12), (0.53, 0.06, 0.97, 1.06)], segments))
     parts = _tyres(((0.66, 0.12), (-0.62, 0.14)), 0.24, detail)
     parts.append(crate((-0.14, -0.18, 0.26), (0.42, 0.18, 0.32), TRIM))
-    parts.append(_pod([(-0.84, 0.13, 0.78, 0.88), (-0.40, 0.16, 0.76, 0.85), (-0.12, 0.12, 0.74, 0.82)], n, TRIM))
-    parts.append(tube([(0.50, 0.0, 0.90), (0.66, 0.0, 0.24)], 0.035, material=STEEL, segments=n))
-    parts.append(tubes([(0.44, 0.10, 1.02), (0.32, 0.33, 1.05)], 0.018, TRIM, n))
-    parts.append(sphere((0.03, 0.085, 0.07), material=HEAD, centre=(0.53, 0.0, 1.02), segments=max(6, n)))
+    parts.append(
+        _pod([(-0.84, 0.13, 0.78, 0.88), (-0.40, 0.16, 0.76, 0.85), (-0.12, 0.12, 0.74, 0.82)], segments, TRIM)
+    )
+    parts.append(tube([(0.50, 0.0, 0.90), (0.66, 0.0, 0.24)], 0.035, material=STEEL, segments=segments))
+    parts.append(tubes([(0.44, 0.10, 1.02), (0.32, 0.33, 1.05)], 0.018, TRIM, segments))
+    parts.append(sphere((0.03, 0.085, 0.07), material=HEAD, centre=(0.53, 0.0, 1.02), segments=max(6, segments)))
     if detail:
         parts.append(crates((0.535, 0.10, 0.74), (0.565, 0.17, 0.79), BLINKER))
-        parts.append(tube([(-0.25, -0.17, 0.26), (-0.80, -0.20, 0.34)], [0.03, 0.05], material=FRAME, segments=n))
+        parts.append(
+            tube([(-0.25, -0.17, 0.26), (-0.80, -0.20, 0.34)], [0.03, 0.05], material=FRAME, segments=segments)
+        )
     return painted, parts + _mirrors(detail)
 
 
-def _pod(rows: Sequence[tuple[float, float, float, float]], n: int, material: Material = PAINT) -> Mesh:
+def _pod(rows: Sequence[tuple[float, float, float, float]], segments: int, material: Material = PAINT) -> Mesh:
     """A rounded body along x through ovals (x, half width, lowest and highest point)."""
-    angles = np.arange(2 * n) * (np.pi / n)
+    angles = np.arange(2 * segments) * (np.pi / segments)
     cosine, sine = np.cos(angles), np.sin(angles)
     # A superellipse: a little fuller than an ellipse.
     cosine, sine = np.sign(cosine) * np.abs(cosine) ** 0.8, np.sign(sine) * np.abs(sine) ** 0.8
     sections = [
         np.stack(
-            [np.full(2 * n, x), half_width * cosine, 0.5 * (lowest + highest) + 0.5 * (highest - lowest) * sine], 1
+            [np.full(2 * segments, x), half_width * cosine, 0.5 * (lowest + highest) + 0.5 * (highest - lowest) * sine],
+            1,
         )
         for x, half_width, lowest, highest in rows
     ]

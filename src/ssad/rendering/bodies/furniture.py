@@ -8,7 +8,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from ssad.rendering.bodies.parts import STEEL, TRIM, WOOD, Chart, as_point, crate, finish, side_charts, sided
+from ssad.rendering.bodies.parts import (
+    STEEL,
+    TRIM,
+    WOOD,
+    Chart,
+    as_point,
+    assign_side_panels,
+    crate,
+    finish,
+    side_charts,
+)
 from ssad.rendering.meshes.mesh import F64, Material, Mesh, Point, build, lathe, merge, prism, triangulate, tube
 
 ORANGE = Material("orange", (0.75, 0.12, 0.01), specular=0.04, gloss=0.3)
@@ -201,7 +211,9 @@ def barrier(style: str, size: Point, *, generator: np.random.Generator, detail: 
         for index in range(piece_count):
             material = CONCRETE if style == "jersey" else RED if (index % 2 == 0) == red_first else WHITE
             parts.append(
-                sided(prism(outline, (cuts[index], cuts[index + 1]), axis=1, material=material, smooth=0.2), "face")
+                assign_side_panels(
+                    prism(outline, (cuts[index], cuts[index + 1]), axis=1, material=material, smooth=0.2), "face"
+                )
             )
     elif style == "fence":
         rail_paths = [
@@ -238,7 +250,11 @@ def barrier(style: str, size: Point, *, generator: np.random.Generator, detail: 
                     (upper_edge[0], top * height),
                     (upper_edge[1], top * height),
                 ]
-                parts.append(sided(prism(stripe_outline, (-0.03, 0.03), axis=0, material=material, smooth=0.0), "face"))
+                parts.append(
+                    assign_side_panels(
+                        prism(stripe_outline, (-0.03, 0.03), axis=0, material=material, smooth=0.0), "face"
+                    )
+                )
         for side in (-1.0, 1.0):
             y = side * 0.82 * half_width
             for end in (-1.0, 1.0):
@@ -379,17 +395,17 @@ def stop_sign(style: str, size: Point, *, generator: np.random.Generator, detail
     """
     _, width, height = size
     radius = 0.5 * width
-    red_material, white_material = _sheeting(generator, worn=style == "worn")
+    red_material, white_material = _sheeting(generator, is_worn=style == "worn")
     octagon = _polygon(8, np.pi / 8, radius / np.cos(np.pi / 8))
     centre = np.array([0.0, height - radius])
     # 30 inches: a border of 0.75 and letters of 10 inches
     layers = [(octagon, white_material), (0.945 * octagon, red_material)]
-    layers += [(radius * stroke, white_material) for stroke in _text("STOP", tall=0.66, wide=1.62)]
+    layers += [(radius * stroke, white_material) for stroke in _text("STOP", height=0.66, width=1.62)]
     parts = [_post(style, height - 0.1 * width, generator), *_plate(layers, centre, detail)]
     if style == "all_way":
         plate_centre = centre - [0.0, 1.36 * radius]
         plate_layers = [(_bar(0.0, 0.0, 0.6 * radius, 0.26 * radius), red_material)]
-        plate_layers += [(radius * stroke, white_material) for stroke in _text("ALL WAY", tall=0.24, wide=1.0)]
+        plate_layers += [(radius * stroke, white_material) for stroke in _text("ALL WAY", height=0.24, width=1.0)]
         parts += _plate(plate_layers, plate_centre, detail, panels=False)
     return finish(parts, _square_charts(radius, height), size)
 
@@ -398,7 +414,7 @@ def yield_sign(style: str, size: Point, *, generator: np.random.Generator, detai
     """Return a yield sign (R1-2 of the US) on a post, with the panels of `stop_sign`."""
     _, width, height = size
     half_width = 0.5 * width
-    red_material, white_material = _sheeting(generator, worn=style == "worn")
+    red_material, white_material = _sheeting(generator, is_worn=style == "worn")
     triangle_height = np.sqrt(3.0) * half_width
     triangle = np.array(
         [(-half_width, 0.5 * triangle_height), (0.0, -0.5 * triangle_height), (half_width, 0.5 * triangle_height)]
@@ -414,12 +430,12 @@ def yield_sign(style: str, size: Point, *, generator: np.random.Generator, detai
     return finish(parts, _square_charts(half_width, height), size)
 
 
-def _sheeting(generator: np.random.Generator, *, worn: bool) -> tuple[Material, Material]:
+def _sheeting(generator: np.random.Generator, *, is_worn: bool) -> tuple[Material, Material]:
     """Draw the red and white of a sign: new, or faded by the sun and dirty.
 
     The number of draws is always the same.
     """
-    shade, age = float(generator.uniform(0.85, 1.15)), float(generator.uniform(0.35, 0.9)) * worn
+    shade, age = float(generator.uniform(0.85, 1.15)), float(generator.uniform(0.35, 0.9)) * is_worn
     new_red, faded_red = np.array(RED.colour) * shade, np.array([0.46, 0.13, 0.10])
     clean_white, dirty_white = np.array(WHITE.colour), np.array([0.52, 0.49, 0.42])
     red_colour, white_colour = (
@@ -458,9 +474,9 @@ def _flat(outline: F64, x: float, material: Material, *, ahead: bool) -> Mesh:
     return build(np.insert(outline, 0, x, axis=1), faces if ahead else faces[:, ::-1], materials=material, smooth=0.0)
 
 
-def _square_charts(r: float, height: float) -> list[Chart]:
+def _square_charts(half_side: float, height: float) -> list[Chart]:
     """Charts of the square of half side r at the top of a sign, seen from before and from behind."""
-    lower, upper = (-0.1, -r, height - 2.0 * r), (0.1, r, height)
+    lower, upper = (-0.1, -half_side, height - 2.0 * half_side), (0.1, half_side, height)
     return [Chart("face", "front", lower, upper), Chart("back", "rear", lower, upper)]
 
 
@@ -470,7 +486,7 @@ def _polygon(count: int, start: float, radius: float) -> F64:
     return np.stack([radius * np.cos(angles), radius * np.sin(angles)], 1)
 
 
-def _text(text: str, *, tall: float, wide: float) -> list[F64]:
+def _text(text: str, *, height: float, width: float) -> list[F64]:
     """Strokes of a line of capitals about 0, 0, read by who looks against +x: y runs to the reader's right."""
     advance = {letter: max(point[0] for stroke in strokes for point in stroke) for letter, strokes in LETTERS.items()}
     gap = 0.16
@@ -479,7 +495,7 @@ def _text(text: str, *, tall: float, wide: float) -> list[F64]:
     for letter in text:
         for stroke in LETTERS.get(letter, ()):
             points = np.array(stroke, np.float64) - np.array([0.5 * length - cursor, 0.5])
-            outlines.append(points * [wide / length, tall])
+            outlines.append(points * [width / length, height])
         cursor += advance.get(letter, 0.35) + gap
     return outlines
 

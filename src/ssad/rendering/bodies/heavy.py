@@ -22,13 +22,13 @@ from ssad.rendering.bodies.parts import (
     TRIM,
     WOOD,
     Chart,
+    assign_side_panels,
     both_sides,
     crate,
     crates,
     finish,
-    shifted,
+    shift_chart,
     side_charts,
-    sided,
     tubes,
     wheels,
 )
@@ -109,7 +109,7 @@ def truck(style: str, size: Point, *, generator: np.random.Generator, detail: in
     radius = shell.radius * cab_height
     cab_shift = 0.5 * (length - cab_length)
     parts = [skin(shell, cab_size, detail=detail).moved(cab_shift)]
-    panels = [shifted(chart, cab_shift) for chart in charts(shell, cab_size)]
+    panels = [shift_chart(chart, cab_shift) for chart in charts(shell, cab_size)]
     rear_x, cargo_front, deck_height = -0.5 * length, 0.5 * length - cab_length - 0.08, 2.05 * radius
     parts.append(crate((rear_x + 0.05, -0.42, 0.75 * radius), (cargo_front + 0.4, 0.42, deck_height), FRAME))
     front_axle = axle_x(shell, cab_size, 0.55) + cab_shift
@@ -181,7 +181,7 @@ def truck(style: str, size: Point, *, generator: np.random.Generator, detail: in
         ]
         outline = [*lower_edge, (cargo_front, height), (cargo_front - 0.12, tub_height), (rear_x, tub_height)]
         tub = prism(outline, (-half_width, half_width), axis=1, material=PAINT)
-        parts.append(sided(tub, "cargo"))
+        parts.append(assign_side_panels(tub, "cargo"))
         panels += side_charts("cargo", (rear_x, -half_width, deck_height), (cargo_front, half_width, height))
         parts.append(
             crate(
@@ -404,7 +404,7 @@ def _bendy(size: Point, detail: int) -> Mesh:
             if not is_first and panel_name == "front":
                 continue
             name = "/".join([panel_name if is_first or panel_name == "rear" else f"rear_{panel_name}", *part_names])
-            panels.append(replace(shifted(chart, section_x), name=name))
+            panels.append(replace(shift_chart(chart, section_x), name=name))
     # The rear of the front section and the front of the rear section lie inside the joint.
     panels = [panel for panel in panels if panel.name != "rear" or panel.low[0] < -0.4 * length]
     front_mesh = parts[0]
@@ -514,7 +514,7 @@ def trailer(style: str, size: Point, *, generator: np.random.Generator, detail: 
             np.stack([tank_section * scale + [position, 0.0, tank_centre] for position, scale in tank_sections]),
             material=PAINT,
         )
-        parts.append(sided(tank, "cargo"))
+        parts.append(assign_side_panels(tank, "cargo"))
         panels += side_charts("cargo", (rear_x, -half_width, deck_height - 0.1), (front_x, half_width, height))
         parts.append(crate((rear_x + 1.0, -0.28, height - 0.12), (front_x - 1.0, 0.28, height), STEEL))
     parts += _rear_fittings(rear_x, half_width, deck_height - 0.25, detail)

@@ -17,12 +17,12 @@ from ssad.rendering.bodies.parts import (
     STEEL,
     TAIL,
     TRIM,
+    assign_side_panels,
     both_sides,
     crate,
     crates,
     finish,
     side_charts,
-    sided,
     wheels,
 )
 from ssad.rendering.meshes.mesh import Material, Mesh, Point, lathe, merge, prism, tube
@@ -117,7 +117,7 @@ def _excavator(machine: Material, reach: float, detail: int) -> list[Mesh]:
         parts.append(crate((-1.4, -0.6, 2.05), (-1.2, -0.45, 2.45), TRIM))
         parts.append(crate((-1.1, -1.19, 1.35), (0.0, -1.15, 1.85), TRIM))
         parts.append(crate((1.0, -0.9, 1.45), (1.1, -0.7, 1.6), HEAD))
-    parts.append(sided(merge(painted), "body"))
+    parts.append(assign_side_panels(merge(painted), "body"))
     return parts
 
 
@@ -147,5 +147,5 @@ def _loader(machine: Material, reach: float, detail: int) -> list[Mesh]:
         parts.append(crates((-2.72, 0.45, 1.2), (-2.68, 0.65, 1.35), TAIL))
         parts.append(crates((1.55, 0.5, 1.56), (1.65, 0.75, 1.78), HEAD))
         parts.append(crate((-2.73, -0.4, 0.8), (-2.69, 0.4, 1.4), TRIM))
-    parts.append(sided(merge(painted), "body"))
+    parts.append(assign_side_panels(merge(painted), "body"))
     return parts

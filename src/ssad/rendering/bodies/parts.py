@@ -181,7 +181,7 @@ def finish(parts: Sequence[Mesh], charts: Sequence[Chart], size: Point) -> Mesh:
     return unwrap(fit(merge(parts), size), charts)
 
 
-def mirrored(mesh: Mesh) -> Mesh:
+def mirror(mesh: Mesh) -> Mesh:
     """Mirror the mesh at the plane y = 0; panels `left…` and `right…` swap names."""
     opposite = {"left": "right", "right": "left"}
     panels = tuple(
@@ -193,7 +193,7 @@ def mirrored(mesh: Mesh) -> Mesh:
 
 def both_sides(mesh: Mesh) -> Mesh:
     """Merge the mesh with its mirror image."""
-    return merge([mesh, mirrored(mesh)])
+    return merge([mesh, mirror(mesh)])
 
 
 def crate(low: Point, high: Point, material: Material, panels: Mapping[str, str] | None = None) -> Mesh:
@@ -230,7 +230,7 @@ def tubes(path: npt.ArrayLike, radius: npt.ArrayLike, material: Material, segmen
 SIDES = ("front", "rear", "left", "right", "top")
 
 
-def sided(mesh: Mesh, prefix: str) -> Mesh:
+def assign_side_panels(mesh: Mesh, prefix: str) -> Mesh:
     """Assign faces to the panels `prefix_front`, `_rear`, `_left`, `_right` and `_top` by their direction."""
     corners = mesh.corners()
     normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -243,11 +243,11 @@ def sided(mesh: Mesh, prefix: str) -> Mesh:
 
 
 def side_charts(prefix: str, low: Point, high: Point) -> list[Chart]:
-    """The charts that belong to the panels of `sided` and `crate`: five sides of a box."""
+    """The charts that belong to the panels of `assign_side_panels` and `crate`: five sides of a box."""
     return [Chart(f"{prefix}_{side}", side, low, high) for side in SIDES]
 
 
-def shifted(chart: Chart, x: float = 0.0, z: float = 0.0) -> Chart:
+def shift_chart(chart: Chart, x: float = 0.0, z: float = 0.0) -> Chart:
     """Return the chart of a part that was moved."""
     lower, upper = ((corner[0] + x, corner[1], corner[2] + z) for corner in (chart.low, chart.high))
     return replace(chart, low=lower, high=upper)
@@ -323,13 +323,15 @@ def wheel(
     return merge([tyre, disc])
 
 
-def wheels(places: Sequence[tuple[float, float]], radius: float, width: float, *, detail: int, **look: object) -> Mesh:
+def wheels(
+    positions: Sequence[tuple[float, float]], radius: float, width: float, *, detail: int, **options: object
+) -> Mesh:
     """Pairs of wheels on the ground: for each (x, y of the outer face) one on the left and its mirror image."""
-    wheel_mesh = wheel(radius, width, detail=detail, **look)  # type: ignore[arg-type]
-    return both_sides(merge([wheel_mesh.moved(x, y - 0.5 * width, radius) for x, y in places]))
+    wheel_mesh = wheel(radius, width, detail=detail, **options)  # type: ignore[arg-type]
+    return both_sides(merge([wheel_mesh.moved(x, y - 0.5 * width, radius) for x, y in positions]))
 
 
-def curve(keys: Sequence[tuple[float, float]], at: npt.ArrayLike) -> F64:
+def curve(keys: Sequence[tuple[float, float]], times: npt.ArrayLike) -> F64:
     """Interpolate keys (t, value) smoothly and without overshoot (monotone cubic, Fritsch and Carlson)."""
     key_positions, key_values = (np.array(key, np.float64) for key in zip(*keys, strict=True))
     steps, secants = np.diff(key_positions), np.diff(key_values) / np.diff(key_positions)
@@ -343,7 +345,7 @@ def curve(keys: Sequence[tuple[float, float]], at: npt.ArrayLike) -> F64:
             np.clip(tangents[key], -limit, limit),
             np.clip(tangents[key + 1], -limit, limit),
         )
-    clamped = np.clip(np.asarray(at, np.float64), key_positions[0], key_positions[-1])
+    clamped = np.clip(np.asarray(times, np.float64), key_positions[0], key_positions[-1])
     interval = np.clip(np.searchsorted(key_positions, clamped, side="right") - 1, 0, len(steps) - 1)
     s = (clamped - key_positions[interval]) / steps[interval]
     length = steps[interval]

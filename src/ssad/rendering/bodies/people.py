@@ -38,7 +38,7 @@ LIPS = Material("lips", (0.16, 0.05, 0.045), specular=0.02, gloss=0.2)
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class PersonAppearance:
     """Clothes, skin and hair of a person."""
 
     skin: Material
@@ -61,7 +61,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class BodyPose:
     """Joints of a person, m. Pairs are (left, right)."""
 
     pelvis: F64
@@ -76,9 +76,9 @@ class Pose:
     hands: tuple[F64, F64]
 
 
-def draw_look(
+def draw_appearance(
     generator: np.random.Generator, *, helmet: bool = False, rider: bool = False, visor: bool = False
-) -> Look:
+) -> PersonAppearance:
     """Draw clothes, skin and hair of a random person; a rider wears neither coat nor skirt."""
 
     def cloth(name: str, table: tuple[tuple[float, float, float], ...]) -> Material:
@@ -103,7 +103,7 @@ def draw_look(
     inner_cloth = cloth("inner", CLOTHS)
     if abs(sum(inner_cloth.colour) - sum(shirt.colour)) < 0.3:  # distinct from the jacket
         inner_cloth = replace(inner_cloth, colour=(0.60, 0.60, 0.58) if sum(shirt.colour) < 0.8 else (0.03, 0.03, 0.04))
-    return Look(
+    return PersonAppearance(
         cloth("skin", SKINS),
         cloth("hair", HAIRS),
         shirt,
@@ -124,7 +124,7 @@ def draw_look(
     )
 
 
-def walking(height: float, *, phase: float, swing: float, spread: float, child: bool = False) -> Pose:
+def walking_pose(height: float, *, phase: float, swing: float, spread: float, child: bool = False) -> BodyPose:
     """Return a pose of the walking cycle at a phase (0: the left leg swings through).
 
     `swing` is the largest angle of the hips, `spread` the angle of the arms away from the trunk, rad.
@@ -168,10 +168,10 @@ def walking(height: float, *, phase: float, swing: float, spread: float, child: 
             np.array([np.sin(elbow_angle), 0.0, -np.cos(elbow_angle)]) * np.cos(0.6 * spread) + 0.6 * sideways
         )
         limbs.append((hip, knee, ankle, toe, shoulder_point, elbow, hand))
-    return Pose(pelvis, neck, head, *zip(*limbs, strict=True))
+    return BodyPose(pelvis, neck, head, *zip(*limbs, strict=True))
 
 
-def stooped(pose: Pose, *, angle: float, height: float) -> Pose:
+def stooped_pose(pose: BodyPose, *, angle: float, height: float) -> BodyPose:
     """Return the pose with the trunk bent forward by an angle (rad) at the hips.
 
     The arms still hang and the head looks ahead.
@@ -191,10 +191,12 @@ def stooped(pose: Pose, *, angle: float, height: float) -> Pose:
     return replace(pose, neck=neck, head=head, shoulders=shoulders, elbows=elbows, hands=hands)
 
 
-def holding(pose: Pose, *, left: Point | None = None, right: Point | None = None, height: float) -> Pose:
+def pose_with_hands(
+    pose: BodyPose, *, left_hand: Point | None = None, right_hand: Point | None = None, height: float
+) -> BodyPose:
     """Return the pose with one or both hands at a place (m); the arms bend to reach it."""
     elbows, hands = list(pose.elbows), list(pose.hands)
-    for index, goal in enumerate((left, right)):
+    for index, goal in enumerate((left_hand, right_hand)):
         if goal is not None:
             bend_direction = np.array([-0.5, 0.35 * (1.0 - 2.0 * index), -0.8])
             bone_lengths = 0.172 * height, 0.15 * height
@@ -204,7 +206,7 @@ def holding(pose: Pose, *, left: Point | None = None, right: Point | None = None
     return replace(pose, elbows=(elbows[0], elbows[1]), hands=(hands[0], hands[1]))
 
 
-def seated(
+def seated_pose(
     height: float,
     *,
     pelvis: Point,
@@ -212,7 +214,7 @@ def seated(
     hands: tuple[Point, Point],
     feet: tuple[Point, Point],
     knees_out: float = 0.1,
-) -> Pose:
+) -> BodyPose:
     """Return the pose of a rider whose limbs bend to reach grips and soles.
 
     Args:
@@ -241,7 +243,7 @@ def seated(
         limbs.append(
             (hip, knee, ankle, ankle + np.array([0.10 * stature, 0.0, -0.035 * stature]), shoulder, elbow, wrist)
         )
-    return Pose(seat, neck, head, *zip(*limbs, strict=True))
+    return BodyPose(seat, neck, head, *zip(*limbs, strict=True))
 
 
 def reach(start: F64, goal: F64, first: float, second: float, bend: F64) -> tuple[F64, F64]:
@@ -257,14 +259,14 @@ def reach(start: F64, goal: F64, first: float, second: float, bend: F64) -> tupl
     return joint, start + distance * direction
 
 
-def figure(pose: Pose, look: Look, *, height: float, detail: int, child: bool = False) -> Mesh:
+def figure(pose: BodyPose, appearance: PersonAppearance, *, height: float, detail: int, child: bool = False) -> Mesh:
     """Return a body around the joints of a pose; the shirt is in the panels torso_front and torso_back."""
     stature = height
     segments = (4, 6, 10)[detail]
     trunk_axis = (pose.neck - pose.pelvis) / np.linalg.norm(pose.neck - pose.pelvis)
     forward = cross([0.0, 1.0, 0.0], trunk_axis)
-    parts = [_trunk(pose, look, stature, n=2 * segments if detail else 6, child=child)]
-    leg_material = look.skin if look.skirt else look.trousers
+    parts = [_trunk(pose, appearance, stature, segments=2 * segments if detail else 6, child=child)]
+    leg_material = appearance.skin if appearance.skirt else appearance.trousers
     for index in (0, 1):
         hip, knee, ankle, toe = pose.hips[index], pose.knees[index], pose.ankles[index], pose.toes[index]
         shoulder, elbow, hand = pose.shoulders[index], pose.elbows[index], pose.hands[index]
@@ -274,19 +276,21 @@ def figure(pose: Pose, look: Look, *, height: float, detail: int, child: bool = 
                 tube([hip, knee, sole], np.array([0.052, 0.034, 0.030]) * stature, material=leg_material, segments=4)
             )
             arm_radii = np.array([0.03, 0.025, 0.02]) * stature
-            parts.append(tube([shoulder, elbow, hand], arm_radii, material=look.shirt, segments=4))
+            parts.append(tube([shoulder, elbow, hand], arm_radii, material=appearance.shirt, segments=4))
             continue
         leg_path = [hip + 0.03 * stature * trunk_axis, 0.6 * hip + 0.4 * knee, 0.1 * hip + 0.9 * knee]
         leg_path += [0.9 * knee + 0.1 * ankle, 0.6 * knee + 0.4 * ankle, ankle]
         leg_radii = np.array([0.050, 0.048, 0.038, 0.036, 0.034, 0.024]) * stature
-        if look.shorts:
+        if appearance.shorts:
             parts.append(tube(leg_path[:3], leg_radii[:3] * 1.12, material=leg_material, segments=segments))
-            parts.append(tube(leg_path[2:], leg_radii[2:] * 0.9, material=look.skin, segments=segments))
+            parts.append(tube(leg_path[2:], leg_radii[2:] * 0.9, material=appearance.skin, segments=segments))
         else:
             parts.append(tube(leg_path, leg_radii, material=leg_material, segments=segments))
         heel = ankle - 0.28 * (toe - ankle) * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.018 * stature]
         shoe_path = [heel, 0.5 * (ankle + toe), toe]
-        parts.append(tube(shoe_path, np.array([0.022, 0.030, 0.018]) * stature, material=look.shoes, segments=segments))
+        parts.append(
+            tube(shoe_path, np.array([0.022, 0.030, 0.018]) * stature, material=appearance.shoes, segments=segments)
+        )
         wrist = 0.88 * hand + 0.12 * elbow
         inward = np.array([0.0, -np.sign(shoulder[1] - pose.neck[1]), 0.0])
         sleeve_path = [
@@ -298,25 +302,25 @@ def figure(pose: Pose, look: Look, *, height: float, detail: int, child: bool = 
             tube(
                 sleeve_path,
                 np.array([0.014, 0.031, 0.030, 0.025, 0.019]) * stature,
-                material=look.shirt,
+                material=appearance.shirt,
                 segments=segments,
             )
         )
         hand_radii = (0.020 * stature, 0.014 * stature, 0.030 * stature)
-        parts.append(sphere(hand_radii, material=look.skin, centre=as_point(hand), segments=segments))
-    parts += _head(pose, look, stature, detail, 1.35 if child else 1.0)
+        parts.append(sphere(hand_radii, material=appearance.skin, centre=as_point(hand), segments=segments))
+    parts += _head(pose, appearance, stature, detail, 1.35 if child else 1.0)
     trunk_pose = np.eye(4)
     trunk_pose[:3, :3] = np.stack([forward, [0.0, 1.0, 0.0], trunk_axis], axis=1)
-    if look.pack and detail > 0:
+    if appearance.pack and detail > 0:
         trunk_pose[:3, 3] = pose.pelvis + 0.62 * (pose.neck - pose.pelvis) - 0.10 * stature * forward
         parts.append(
-            _box((0.045 * stature, 0.075 * stature, 0.11 * stature), replace(look.trousers, name="pack")).transformed(
-                trunk_pose
-            )
+            _box(
+                (0.045 * stature, 0.075 * stature, 0.11 * stature), replace(appearance.trousers, name="pack")
+            ).transformed(trunk_pose)
         )
-    if look.bag is not None and detail > 0:  # at the right hip
+    if appearance.bag is not None and detail > 0:  # at the right hip
         trunk_pose[:3, 3] = pose.pelvis + np.array([0.0, -0.125 * stature, 0.0]) - 0.01 * stature * forward
-        parts.append(_box((0.075 * stature, 0.022 * stature, 0.055 * stature), look.bag).transformed(trunk_pose))
+        parts.append(_box((0.075 * stature, 0.022 * stature, 0.055 * stature), appearance.bag).transformed(trunk_pose))
     return merge(parts)
 
 
@@ -325,11 +329,11 @@ def _box(half: Point, material: Material) -> Mesh:
     return crate((-half[0], -half[1], -half[2]), half, material)
 
 
-def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
+def _trunk(pose: BodyPose, appearance: PersonAppearance, height: float, *, segments: int, child: bool) -> Mesh:
     trunk_axis = (pose.neck - pose.pelvis) / np.linalg.norm(pose.neck - pose.pelvis)
     forward = cross([0.0, 1.0, 0.0], trunk_axis)
     length = float(np.linalg.norm(pose.neck - pose.pelvis))
-    is_long = look.coat or look.skirt
+    is_long = appearance.coat or appearance.skirt
     rows = [
         (-0.16, 0.050, 0.070),
         (0.06, 0.066, 0.092),
@@ -342,40 +346,42 @@ def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
         (1.12, 0.026, 0.028),
     ]
     if is_long:  # the hem goes round both thighs
-        stride_share = max(abs(float(knee[0] - pose.pelvis[0])) for knee in pose.knees) / h
+        stride_share = max(abs(float(knee[0] - pose.pelvis[0])) for knee in pose.knees) / height
         rows = [(-0.60, 0.062 + 0.9 * stride_share, 0.118), (0.0, 0.076 + 0.3 * stride_share, 0.118), *rows[2:]]
-    if look.bands is not None:  # the upper band has rows of its own
+    if appearance.bands is not None:  # the upper band has rows of its own
         band_row = next(row_index for row_index, entry in enumerate(rows) if entry[0] > 0.52)
         rows[band_row:band_row] = [(0.42, 0.064, 0.091), (0.52, 0.067, 0.097)]
     if child:
         rows = [(station, 1.12 * half_depth, half_width) for station, half_depth, half_width in rows]
-    angles = np.arange(n) * (2.0 * np.pi / n)
+    angles = np.arange(segments) * (2.0 * np.pi / segments)
     left_axis = np.array([0.0, 1.0, 0.0])
     sections = [
         pose.pelvis
         + station * length * (trunk_axis if station > 0 else np.array([0.0, 0.0, 1.0]))
-        + h * (half_depth * np.cos(angles)[:, None] * forward + half_width * np.sin(angles)[:, None] * left_axis)
+        + height * (half_depth * np.cos(angles)[:, None] * forward + half_width * np.sin(angles)[:, None] * left_axis)
         for station, half_depth, half_width in rows
     ]
-    body = loft(np.array(sections), material=look.shirt, smooth=1.0)
+    body = loft(np.array(sections), material=appearance.shirt, smooth=1.0)
     face_centres = body.corners().mean(axis=1) - pose.pelvis
-    face_rows = np.minimum(np.arange(len(body.faces)) // (2 * n), len(rows))  # caps come last
-    first_shirt_row = 0 if look.coat else 2 - int(is_long)
+    face_rows = np.minimum(np.arange(len(body.faces)) // (2 * segments), len(rows))  # caps come last
+    first_shirt_row = 0 if appearance.coat else 2 - int(is_long)
     is_front = face_centres @ forward >= 0.0
     is_neck = face_rows >= len(rows) - 2
     is_shirt = (face_rows >= first_shirt_row) & (face_rows < len(rows) - 1)
     material = np.where(is_neck, 2, np.where(is_shirt, 0, 1))
-    materials = [look.shirt, look.trousers, look.skin]
+    materials = [appearance.shirt, appearance.trousers, appearance.skin]
     is_jacket = is_shirt & ~is_neck
-    if look.bands is not None:
+    if appearance.bands is not None:
         band_rows = [row_index for row_index, entry in enumerate(rows) if entry[0] in (0.06, 0.42)]
         material[is_jacket & np.isin(face_rows, band_rows)] = len(materials)
-        materials.append(look.bands)
-    if look.inner is not None and n > 6:  # a strip down the middle of the chest, 30 degrees to either side at most
-        face_columns = np.arange(len(body.faces)) // 2 % n
-        is_middle = np.minimum(face_columns, n - 1 - face_columns) == 0
+        materials.append(appearance.bands)
+    if (
+        appearance.inner is not None and segments > 6
+    ):  # a strip down the middle of the chest, 30 degrees to either side at most
+        face_columns = np.arange(len(body.faces)) // 2 % segments
+        is_middle = np.minimum(face_columns, segments - 1 - face_columns) == 0
         material[is_jacket & is_middle & (face_rows < len(rows))] = len(materials)
-        materials.append(look.inner)
+        materials.append(appearance.inner)
     panel = np.where(is_shirt & ~is_neck, np.where(is_front, 0, 1), -1).astype(np.int32)
     return replace(
         body,
@@ -386,10 +392,10 @@ def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
     )
 
 
-def _head(pose: Pose, look: Look, h: float, detail: int, big: float) -> list[Mesh]:
+def _head(pose: BodyPose, appearance: PersonAppearance, height: float, detail: int, big: float) -> list[Mesh]:
     x, y, z = (float(value) for value in pose.head)
     default_segments = (6, 8, 14)[detail]
-    scale = big * h
+    scale = big * height
 
     def ellipsoid(
         half_axes: Point, material: Material, ahead: float = 0.0, up: float = 0.0, segments: int = default_segments
@@ -404,72 +410,74 @@ def _head(pose: Pose, look: Look, h: float, detail: int, big: float) -> list[Mes
             segments=segments,
         )
 
-    parts = [ellipsoid((0.050, 0.042, 0.064), look.skin)]
-    if look.helmet is not None and look.visor:
-        parts.append(ellipsoid((0.068, 0.060, 0.066), look.helmet, -0.006, 0.012))
+    parts = [ellipsoid((0.050, 0.042, 0.064), appearance.skin)]
+    if appearance.helmet is not None and appearance.visor:
+        parts.append(ellipsoid((0.068, 0.060, 0.066), appearance.helmet, -0.006, 0.012))
         if detail > 0:
             parts.append(ellipsoid((0.030, 0.050, 0.020), VISOR, 0.038, 0.012, segments=8))
-    elif look.helmet is not None:  # the rim lies above the eyes
-        parts.append(ellipsoid((0.050, 0.048, 0.050), look.hair, -0.018, 0.004))
-        parts.append(ellipsoid((0.066, 0.058, 0.044), look.helmet, -0.006, 0.044))
-        if look.cap is not None and detail > 0:  # the peak of a safety helmet
-            parts.append(ellipsoid((0.036, 0.044, 0.008), look.cap, 0.054, 0.032, segments=6))
+    elif appearance.helmet is not None:  # the rim lies above the eyes
+        parts.append(ellipsoid((0.050, 0.048, 0.050), appearance.hair, -0.018, 0.004))
+        parts.append(ellipsoid((0.066, 0.058, 0.044), appearance.helmet, -0.006, 0.044))
+        if appearance.cap is not None and detail > 0:  # the peak of a safety helmet
+            parts.append(ellipsoid((0.036, 0.044, 0.008), appearance.cap, 0.054, 0.032, segments=6))
     else:
-        parts.append(ellipsoid((0.050, 0.048, 0.056), look.hair, -0.016, 0.016))
-        if look.long_hair and detail > 0:
-            parts.append(ellipsoid((0.030, 0.042, 0.070), look.hair, -0.030, -0.035))
-        if look.cap is not None:  # the peak points ahead
-            parts.append(ellipsoid((0.056, 0.051, 0.042), look.cap, -0.006, 0.034))
+        parts.append(ellipsoid((0.050, 0.048, 0.056), appearance.hair, -0.016, 0.016))
+        if appearance.long_hair and detail > 0:
+            parts.append(ellipsoid((0.030, 0.042, 0.070), appearance.hair, -0.030, -0.035))
+        if appearance.cap is not None:  # the peak points ahead
+            parts.append(ellipsoid((0.056, 0.051, 0.042), appearance.cap, -0.006, 0.034))
             if detail > 0:
-                parts.append(ellipsoid((0.040, 0.040, 0.008), look.cap, 0.058, 0.026, segments=6))
+                parts.append(ellipsoid((0.040, 0.040, 0.008), appearance.cap, 0.058, 0.026, segments=6))
     if detail > 0:  # the face: eyes under their brows, nose, mouth or beard
         parts.append(ellipsoid((0.016, 0.030, 0.008), EYES, 0.038, 0.008, segments=6))
-        parts.append(ellipsoid((0.014, 0.009, 0.014), look.skin, 0.049, -0.009, segments=6))
-        if look.beard:
-            parts.append(ellipsoid((0.026, 0.034, 0.026), look.hair, 0.022, -0.042, segments=6))
+        parts.append(ellipsoid((0.014, 0.009, 0.014), appearance.skin, 0.049, -0.009, segments=6))
+        if appearance.beard:
+            parts.append(ellipsoid((0.026, 0.034, 0.026), appearance.hair, 0.022, -0.042, segments=6))
         elif detail == 2:
             parts.append(ellipsoid((0.012, 0.016, 0.005), LIPS, 0.036, -0.031, segments=6))
     if detail == 2:
-        neck = [pose.neck - np.array([0.0, 0.0, 0.02 * h]), pose.head - [0.01 * h, 0.0, 0.02 * h]]
-        parts.append(tube(neck, 0.030 * h, material=look.skin, segments=8))
+        neck = [pose.neck - np.array([0.0, 0.0, 0.02 * height]), pose.head - [0.01 * height, 0.0, 0.02 * height]]
+        parts.append(tube(neck, 0.030 * height, material=appearance.skin, segments=8))
     return parts
 
 
-def _sole(pose: Pose, h: float) -> float:
+def _sole(pose: BodyPose, height: float) -> float:
     """Height of the lowest sole of a pose, m."""
-    return float(min(joint[2] for joint in (*pose.toes, *pose.ankles))) - 0.018 * h
+    return float(min(joint[2] for joint in (*pose.toes, *pose.ankles))) - 0.018 * height
 
 
-def _stick(pose: Pose, h: float) -> F64:
+def _stick(pose: BodyPose, height: float) -> F64:
     """Top and tip [2, 3] of a walking stick in the right hand, m."""
     x, y, z = as_point(pose.hands[1])
-    return np.array([(x, y, z + 0.012 * h), (x + 0.03 * h, y, _sole(pose, h) + 0.012 * h)])
+    return np.array([(x, y, z + 0.012 * height), (x + 0.03 * height, y, _sole(pose, height) + 0.012 * height)])
 
 
-def _extent(pose: Pose, h: float) -> F64:
+def _extent(pose: BodyPose, height: float) -> F64:
     """Corners [2, 3] of a box about a pose whose lowest sole is at 0, m: joints and the flesh around them."""
     joints = np.array([*pose.toes, *pose.ankles, *pose.knees, *pose.elbows, *pose.hands, *pose.shoulders, pose.head])
-    flesh = h * np.array([0.004] * 2 + [0.026] * 2 + [0.036] * 2 + [0.025] * 2 + [0.016] * 2 + [0.031] * 2 + [0.064])
+    flesh = height * np.array(
+        [0.004] * 2 + [0.026] * 2 + [0.036] * 2 + [0.025] * 2 + [0.016] * 2 + [0.031] * 2 + [0.064]
+    )
     # Heights are relative to the lowest sole, which stands on the ground.
-    floor = _sole(pose, h)
+    floor = _sole(pose, height)
     lower = np.minimum(
-        (joints - flesh[:, None]).min(axis=0), np.array(pose.ankles).min(axis=0) - np.array([0.028 * h, 0.0, 0.0])
+        (joints - flesh[:, None]).min(axis=0), np.array(pose.ankles).min(axis=0) - np.array([0.028 * height, 0.0, 0.0])
     )
     upper = (joints + flesh[:, None]).max(axis=0)
-    return np.array([[lower[0], lower[1], 0.0], [upper[0], upper[1], upper[2] - floor + 0.008 * h]])
+    return np.array([[lower[0], lower[1], 0.0], [upper[0], upper[1], upper[2] - floor + 0.008 * height]])
 
 
-def _pose(style: str, height: float, phase: float, swing: float, spread: float) -> Pose:
-    """Return one moment of the walking cycle of a style (see `walking`)."""
-    walker = walking(height, phase=phase, swing=swing, spread=spread, child=style == "child")
+def _pose(style: str, height: float, phase: float, swing: float, spread: float) -> BodyPose:
+    """Return one moment of the walking cycle of a style (see `walking_pose`)."""
+    walker = walking_pose(height, phase=phase, swing=swing, spread=spread, child=style == "child")
     if style == "elderly":
-        walker = stooped(walker, angle=0.32, height=height)
+        walker = stooped_pose(walker, angle=0.32, height=height)
         shoulder = walker.shoulders[1]
         stick_grip = shoulder[0] + (0.10 + 0.05 * np.sin(phase)) * height, shoulder[1] - 0.02 * height, 0.47 * height
-        return holding(walker, right=as_point(stick_grip), height=height)
+        return pose_with_hands(walker, right_hand=as_point(stick_grip), height=height)
     if style == "stroller":
         left_hand, right_hand = ((0.235 * height, side * 0.115 * height, 0.58 * height) for side in (1.0, -1.0))
-        return holding(walker, left=left_hand, right=right_hand, height=height)
+        return pose_with_hands(walker, left_hand=left_hand, right_hand=right_hand, height=height)
     return walker
 
 
@@ -481,18 +489,22 @@ def _cycle_extent(style: str, height: float, swing: float, spread: float) -> tup
     return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
 
 
-def _dressed(look: Look, style: str, own: float) -> Look:
-    """The clothes that belong to a style; `own` in [0, 1) is drawn for the person."""
+def _dress(appearance: PersonAppearance, style: str, share: float) -> PersonAppearance:
+    """The clothes that belong to a style; `share` in [0, 1) is drawn for the person."""
     if style == "elderly":
-        shade = 0.30 + 0.35 * own
-        grey_hair = replace(look.hair, colour=(shade, shade, 0.97 * shade))
-        return replace(look, hair=grey_hair, pack=False, shorts=False, long_hair=look.long_hair and own < 0.4)
-    if style == "worker":
-        vest_material = replace(look.shirt, colour=HIVIS if own < 0.6 else ORANGE)
-        safety_helmet = Material("helmet", ((0.75, 0.75, 0.72), (0.80, 0.52, 0.02), ORANGE)[int(3.0 * own)], gloss=0.6)
-        work_trousers = replace(look.trousers, colour=(0.03, 0.04, 0.08) if own < 0.7 else ORANGE)
+        shade = 0.30 + 0.35 * share
+        grey_hair = replace(appearance.hair, colour=(shade, shade, 0.97 * shade))
         return replace(
-            look,
+            appearance, hair=grey_hair, pack=False, shorts=False, long_hair=appearance.long_hair and share < 0.4
+        )
+    if style == "worker":
+        vest_material = replace(appearance.shirt, colour=HIVIS if share < 0.6 else ORANGE)
+        safety_helmet = Material(
+            "helmet", ((0.75, 0.75, 0.72), (0.80, 0.52, 0.02), ORANGE)[int(3.0 * share)], gloss=0.6
+        )
+        work_trousers = replace(appearance.trousers, colour=(0.03, 0.04, 0.08) if share < 0.7 else ORANGE)
+        return replace(
+            appearance,
             shirt=vest_material,
             trousers=work_trousers,
             helmet=safety_helmet,
@@ -505,8 +517,8 @@ def _dressed(look: Look, style: str, own: float) -> Look:
             bag=None,
         )
     if style == "stroller":
-        return replace(look, bag=None)
-    return look
+        return replace(appearance, bag=None)
+    return appearance
 
 
 def torso_charts(low: Point, high: Point) -> list[Chart]:
@@ -523,9 +535,9 @@ def pedestrian(
     every frame.
     """
     length, width, height = size
-    look = draw_look(generator)
+    look = draw_appearance(generator)
     random_phase, variation = float(generator.uniform(0.0, 2.0 * np.pi)), float(generator.random())
-    look = _dressed(look, style, variation)
+    look = _dress(look, style, variation)
     is_child, is_still = style == "child", style == "standing" or (style == "worker" and length < 0.32 * height)
     swing = float(np.arcsin(np.clip((length - 0.16 * height) / height, 0.06, 0.16 if is_still else 0.6)))
     spread = float(np.arcsin(np.clip((0.5 * width - 0.145 * height) / (0.27 * height), 0.03, 0.5)))

@@ -211,7 +211,7 @@ def skin(shell: Shell, size: Point, *, detail: int) -> Mesh:
                 (first_vertex, next_vertex + count, next_vertex),
             ]
             surfaces += [
-                _dress(
+                _band_panel(
                     shell,
                     middle_t,
                     min(point_names[column], point_names[next_column]),
@@ -219,50 +219,50 @@ def skin(shell: Shell, size: Point, *, detail: int) -> Mesh:
                     side,
                 )
             ] * 2
-    body_mesh = dressed(outlines.reshape(-1, 3), faces, surfaces)
+    body_mesh = mesh_with_panels(outlines.reshape(-1, 3), faces, surfaces)
     return merge(
         [body_mesh, *(_end(shell, size, half_sections, point_indices, front=front) for front in (True, False))]
     )
 
 
-def dressed(
-    vertices: npt.ArrayLike, faces: Sequence[tuple[int, int, int]], looks: Sequence[tuple[Material, str | None]]
+def mesh_with_panels(
+    vertices: npt.ArrayLike, faces: Sequence[tuple[int, int, int]], appearances: Sequence[tuple[Material, str | None]]
 ) -> Mesh:
     """A mesh of faces with a material and a panel (or None) for each."""
-    materials = list(dict.fromkeys(surface_material for surface_material, _ in looks))
-    panels = list(dict.fromkeys(panel_name for _, panel_name in looks if panel_name is not None))
-    material = [materials.index(surface_material) for surface_material, _ in looks]
-    panel = [-1 if panel_name is None else panels.index(panel_name) for _, panel_name in looks]
+    materials = list(dict.fromkeys(surface_material for surface_material, _ in appearances))
+    panels = list(dict.fromkeys(panel_name for _, panel_name in appearances if panel_name is not None))
+    material = [materials.index(surface_material) for surface_material, _ in appearances]
+    panel = [-1 if panel_name is None else panels.index(panel_name) for _, panel_name in appearances]
     return build(vertices, faces, materials=materials, material=material, panel=panel, panels=panels)
 
 
-def _dress(shell: Shell, t: float, low: int, high: int, side: str) -> tuple[Material, str | None]:
+def _band_panel(shell: Shell, position: float, low: int, high: int, side: str) -> tuple[Material, str | None]:
     """Return material and panel of the band between points `low` and `high` of the section, at t along."""
     if high <= B3:
         return DARK, None
-    part = next(name for name, _, end in side_parts(shell) if t < end)
+    part = next(name for name, _, end in side_parts(shell) if position < end)
     side_surface: tuple[Material, str | None] = (PAINT, f"{side}_side/{part}")
-    is_cabin = shell.cowl < t < shell.deck
-    top_surface: tuple[Material, str | None] = (PAINT, "hood" if t <= shell.cowl else shell.trunk)
+    is_cabin = shell.cowl < position < shell.deck
+    top_surface: tuple[Material, str | None] = (PAINT, "hood" if position <= shell.cowl else shell.trunk)
     if low < U0:
-        return _flank(shell, t, low, high, side_surface)
+        return _flank(shell, position, low, high, side_surface)
     if low >= T1 or low == high:
-        if shell.bed and shell.bed[0] < t < shell.bed[1]:
+        if shell.bed and shell.bed[0] < position < shell.bed[1]:
             return DARK, None
-        if shell.cowl - 0.012 < t < shell.screen and is_cabin:
+        if shell.cowl - 0.012 < position < shell.screen and is_cabin:
             return GLASS, None
-        if shell.roof < t < shell.deck and shell.deck < 0.97:
+        if shell.roof < position < shell.deck and shell.deck < 0.97:
             return GLASS, None
         return (PAINT, "roof") if is_cabin else top_surface
     if not is_cabin:
         return top_surface
-    is_window = any(start <= t < end for start, end in shell.windows)
-    has_windows = shell.windows[0][0] <= t < shell.windows[-1][1]
+    is_window = any(start <= position < end for start, end in shell.windows)
+    has_windows = shell.windows[0][0] <= position < shell.windows[-1][1]
     if low == U0 and high == U1:
         return (TRIM, None) if has_windows else side_surface
     if low == U1 or (low == U0 and high in (U2, U3)):
         return (GLASS, None) if is_window else (TRIM, None) if has_windows else side_surface
-    return (PAINT, "roof") if low == U3 and shell.screen < t < shell.roof else side_surface
+    return (PAINT, "roof") if low == U3 and shell.screen < position < shell.roof else side_surface
 
 
 def _flank(
@@ -282,22 +282,24 @@ def _flank(
     return beside
 
 
-def _end(shell: Shell, size: Point, half: F64, kept: Sequence[int], *, front: bool) -> Mesh:
+def _end(shell: Shell, size: Point, half: F64, kept_rows: Sequence[int], *, front: bool) -> Mesh:
     """The front or the rear: a grid of points over the first or last section, bulging outwards."""
     section = half[0 if front else -1]
-    rows = [row for row, point in enumerate(kept) if B3 <= point <= U3]
-    rim_rows = [row for row, point in enumerate(kept) if point > kept[rows[-1]]]
+    rows = [row for row, point in enumerate(kept_rows) if B3 <= point <= U3]
+    rim_rows = [row for row, point in enumerate(kept_rows) if point > kept_rows[rows[-1]]]
     top_edge = section[[rows[-1], *rim_rows]]
     if top_edge[-1, 1] > 1e-9:
         top_edge = np.concatenate([top_edge, [[top_edge[-1, 0], 0.0, top_edge[-1, 2]]]])
     full_width = top_edge[0, 1]
     lamp_share = shell.lamp_from if front else shell.tail_from
-    shares = np.unique([0.0, 1.0, *(top_edge[1:, 1] / full_width), *([0.2, lamp_share] if len(kept) > 3 else [])])[::-1]
+    shares = np.unique([0.0, 1.0, *(top_edge[1:, 1] / full_width), *([0.2, lamp_share] if len(kept_rows) > 3 else [])])[
+        ::-1
+    ]
     depth = (shell.nose if front else -shell.tail) * size[0]
     point_rows: list[F64] = []
-    point_names = [kept[row] for row in rows]
+    point_names = [kept_rows[row] for row in rows]
     # At detail 0 the end is one flat band.
-    if len(kept) == 3:
+    if len(kept_rows) == 3:
         shares = np.array([1.0])
     for row in rows:
         row_points = np.repeat(section[row][None], len(shares), axis=0)
@@ -338,7 +340,7 @@ def _end(shell: Shell, size: Point, half: F64, kept: Sequence[int], *, front: bo
                     front=front,
                 )
             ] * 2
-    return dressed(points.reshape(-1, 3), faces, surfaces)
+    return mesh_with_panels(points.reshape(-1, 3), faces, surfaces)
 
 
 def _bulge(shell: Shell, z: float, section: F64, *, front: bool) -> float:

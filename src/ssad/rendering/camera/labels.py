@@ -18,15 +18,15 @@ from ssad.core.errors import ConfigError
 from ssad.core.types import F64, I32
 from ssad.rendering.camera.kernels import raster
 from ssad.rendering.camera.kernels.labels import cover
-from ssad.rendering.camera.render import FACE_LANES, NEAR, Picture, View
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.render import FACE_LANES, NEAR, Rendering, View
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 
 CROP = 64  # pixels a side of a crop
 BEYOND = 2.0  # parts further outside than this many widths or heights of the image do not count
 BATCH = 256  # crops at a time
 
 _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
-_bounds: WeakKeyDictionary[Scene, dict[int, tuple[F64, F64]]] = WeakKeyDictionary()
+_bounds: WeakKeyDictionary[RenderScene, dict[int, tuple[F64, F64]]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,40 +51,42 @@ class Labels:
         return len(self.tag)
 
 
-def label_picture(stage: Scene, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> Labels:
+def label_picture(stage: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2) -> Labels:
     """Labels of a picture. Things with tags below 1 get none; things that share a tag count as one.
 
     Args:
         stage: The scene.
         view: The view that was rendered.
-        picture: The rendered pictures.
+        rendering: The rendered pictures.
         index: Which of them.
         scale: Samples along each side of a pixel that it was rendered with.
 
     Raises:
         ConfigError: The picture shows another view.
     """
-    tags, boxes, pixels = extents(_tags(view, picture, index))
+    tags, boxes, pixels = extents(_tags(view, rendering, index))
     unoccluded, inside = _amodal(stage, view, tags, scale=scale)
     shares = np.clip(pixels / np.maximum(unoccluded, 1e-9), 0.0, 1.0)
     return Labels(tags, boxes, pixels, shares, inside)
 
 
-def visible_share(stage: Scene, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> dict[int, float]:
+def visible_share(
+    stage: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2
+) -> dict[int, float]:
     """Visible share (0 to 1) of each thing of a view, by its tag (1 and above); 0 for what is not seen.
 
     Args:
         stage: See `label_picture`.
         view: See `label_picture`.
-        picture: See `label_picture`.
+        rendering: See `label_picture`.
         index: See `label_picture`.
         scale: See `label_picture`.
 
     Raises:
         ConfigError: The picture shows another view.
     """
-    labels = label_picture(stage, view, picture, index, scale=scale)
-    shares = dict.fromkeys(sorted({entry.tag for entry in view.things if entry.tag > 0}), 0.0)
+    labels = label_picture(stage, view, rendering, index, scale=scale)
+    shares = dict.fromkeys(sorted({entry.tag for entry in view.objects if entry.tag > 0}), 0.0)
     return shares | dict(zip(labels.tag.tolist(), labels.share.tolist(), strict=True))
 
 
@@ -113,17 +115,17 @@ def extents(tags: I32) -> tuple[I32, F64, I32]:
     return unique_tags.astype(np.int32), boxes, np.bincount(box_index, run_lengths, len(unique_tags)).astype(np.int32)
 
 
-def _tags(view: View, picture: Picture, index: int) -> I32:
-    count, height, width = picture.tag.shape
+def _tags(view: View, rendering: Rendering, index: int) -> I32:
+    count, height, width = rendering.tag.shape
     if not 0 <= index < count:
         raise ConfigError(f"label_picture: no picture {index}, there are {count}")
     if (height, width) != (view.camera.height, view.camera.width):
         size = f"{view.camera.width} x {view.camera.height}"
         raise ConfigError(f"label_picture: picture {index} is {width} x {height}, its view {size}; give its own view")
-    return np.asarray(picture.tag[index], np.int32)
+    return np.asarray(rendering.tag[index], np.int32)
 
 
-def bounds(stage: Scene, mesh: int) -> tuple[F64, F64]:
+def bounds(stage: RenderScene, mesh: int) -> tuple[F64, F64]:
     """Return the smallest and largest corner of a mesh of a scene in its own frame, [3] each, m."""
     cached_bounds = _bounds.setdefault(stage, {})
     if mesh not in cached_bounds:
@@ -133,12 +135,12 @@ def bounds(stage: Scene, mesh: int) -> tuple[F64, F64]:
     return cached_bounds[mesh]
 
 
-def _projected(stage: Scene, view: View, things: Sequence[Thing], inverse: F64) -> F64:
+def _projected(stage: RenderScene, view: View, objects: Sequence[SceneObject], inverse: F64) -> F64:
     """x0, y0, x1, y1 at pixel edges [T, 4] of the boxes around things, cut at the near plane; NaN behind it."""
-    box_bounds = np.array([bounds(stage, entry.mesh) for entry in things])
+    box_bounds = np.array([bounds(stage, entry.mesh) for entry in objects])
     corner_bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
     points = np.where(corner_bits[None] == 1, box_bounds[:, 1, None], box_bounds[:, 0, None])
-    to_camera = inverse @ np.array([entry.pose for entry in things])
+    to_camera = inverse @ np.array([entry.pose for entry in objects])
     points = np.einsum("tij,tpj->tpi", to_camera[:, :3, :3], points) + to_camera[:, None, :3, 3]
     starts, ends = points[:, _EDGES[:, 0]], points[:, _EDGES[:, 1]]
     # Boxes may reach behind the camera: add the points where their edges cut the near plane.
@@ -154,12 +156,12 @@ def _projected(stage: Scene, view: View, things: Sequence[Thing], inverse: F64) 
     return np.concatenate([lower, upper], 1)
 
 
-def _amodal(stage: Scene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
+def _amodal(stage: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
     """Return the unoccluded pixels of each tag in the image [N], and the share of its area inside the image [N]."""
     if not len(tags):
         return np.zeros(0), np.zeros(0)
     row_of_tag = {int(tag): tag_index for tag_index, tag in enumerate(tags)}
-    objects = [entry for entry in view.things if entry.tag in row_of_tag]
+    objects = [entry for entry in view.objects if entry.tag in row_of_tag]
     owners = np.array([row_of_tag[entry.tag] for entry in objects], np.int64)
     if len(np.unique(owners)) < len(tags):
         missing = int(np.setdiff1d(tags, [entry.tag for entry in objects])[0])
@@ -184,7 +186,9 @@ def _amodal(stage: Scene, view: View, tags: I32, *, scale: int) -> tuple[F64, F6
     for batch_start in range(0, len(crops), BATCH):
         batch = slice(batch_start, batch_start + BATCH)
         batch_objects = [objects_of_tag[tag_index] for tag_index in crop_tags[batch]]
-        crop_pixels[batch], crop_areas[batch] = _alone(stage, view, (objects, batch_objects), crops[batch], scale=scale)
+        crop_pixels[batch], crop_areas[batch] = _standalone_pixels(
+            stage, view, (objects, batch_objects), crops[batch], scale=scale
+        )
     inside = np.ones(len(tags))
     inside[truncated] = crop_areas[truncated] / np.maximum(
         np.maximum(crop_areas[len(tags) :], crop_areas[truncated]), 1e-9
@@ -192,8 +196,8 @@ def _amodal(stage: Scene, view: View, tags: I32, *, scale: int) -> tuple[F64, F6
     return crop_pixels[: len(tags)], inside
 
 
-def _alone(
-    stage: Scene, view: View, group: tuple[Sequence[Thing], Sequence[I32]], crops: F64, *, scale: int
+def _standalone_pixels(
+    stage: RenderScene, view: View, group: tuple[Sequence[SceneObject], Sequence[I32]], crops: F64, *, scale: int
 ) -> tuple[F64, F64]:
     """Return the pixels that objects cover alone in crops [M, 4], by the image's rule and by area [M each]."""
     objects, members = group

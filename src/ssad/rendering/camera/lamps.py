@@ -20,8 +20,8 @@ from ssad.core.types import F64, I32
 from ssad.rendering.camera.kernels import light as kernels
 
 if TYPE_CHECKING:
-    from ssad.rendering.camera.render import View, Weather
-    from ssad.rendering.camera.scene import Bodies, Scene
+    from ssad.rendering.camera.render import SceneWeather, View
+    from ssad.rendering.camera.scene import ObjectTable, RenderScene
 
 LAMP_SHADOWS = 512  # texels a side of a lamp's shadow map
 LAMP_NEAR = 0.05  # m: nearer surfaces cast no shadow (the lamp's own housing)
@@ -36,7 +36,7 @@ AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  
 
 
 @dataclass(frozen=True, slots=True)
-class Lamp:
+class SceneLamp:
     """Lamp with a pose, a power and the area that it lights.
 
     Attributes:
@@ -76,14 +76,14 @@ class Lamp:
         return self.square or self.texture >= 0
 
     def area(self) -> float:
-        """What it lights of a plane 1 m ahead, m^2; where it fades, as much as it is lit."""
+        """Lit area of a plane 1 m ahead, m^2; where the light fades, weighted by it."""
         across, down = self.spread
         if self.is_square:
             return 4.0 * across * down
         return float(np.pi * across * down * (1.0 + (1.0 - self.soft) ** 2) / 2.0)
 
 
-def own_lamps(vehicle: F64, weather: Weather) -> tuple[Lamp, ...]:
+def own_lamps(vehicle: F64, weather: SceneWeather) -> tuple[SceneLamp, ...]:
     """Return the low beam of the vehicle that carries the camera, which is not drawn itself; none by day.
 
     Args:
@@ -99,7 +99,9 @@ def lamp_strength(sun_height: float) -> float:
     return float(np.clip((0.08 - sun_height) / 0.15, 0, 1))
 
 
-def near_of(scene: Scene, views: Sequence[View], bodies: Bodies, *, lamps: bool = True, contact: bool = True) -> Any:
+def nearby_lights(
+    scene: RenderScene, views: Sequence[View], bodies: ObjectTable, *, lamps: bool = True, contact: bool = True
+) -> Any:
     """Build lamps and occluders of B views with their grids for the kernels, without shadow maps.
 
     Args:
@@ -112,7 +114,10 @@ def near_of(scene: Scene, views: Sequence[View], bodies: Bodies, *, lamps: bool 
     light_tables = kernels.Near()
     tables = {
         "lamp": (kernels.Lamp, _lamps(scene, views, bodies) if lamps else _own_lamps(views)),
-        "occluder": (kernels.Occluder, _occluders(scene, views, bodies) if contact else _nothing(kernels.Occluder)),
+        "occluder": (
+            kernels.Occluder,
+            _occluders(scene, views, bodies) if contact else _empty_struct(kernels.Occluder),
+        ),
     }
     for name, (kernel_struct, (rows, circles)) in tables.items():
         starts, indices = _grid(circles, len(views))
@@ -127,7 +132,7 @@ Rows = tuple[Any, F64]
 """Rows of a kernel's struct, and where on the map they matter [N, 4]: view, x and y from its eye, radius, m."""
 
 
-def _nothing(struct: Any) -> Rows:
+def _empty_struct(struct: Any) -> Rows:
     return np.zeros(0, struct.numpy_dtype()), np.zeros((0, 4))
 
 
@@ -145,14 +150,14 @@ def _own_lamps(views: Sequence[View]) -> Rows:
     return np.array(rows, kernels.Lamp.numpy_dtype()), np.array(places, np.float64).reshape(-1, 4)  # type: ignore[attr-defined]
 
 
-def _lamps(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
+def _lamps(scene: RenderScene, views: Sequence[View], bodies: ObjectTable) -> Rows:
     """Return the lamps of views, and at dusk and night the lit lamps of the street and of bodies."""
     tables = [_own_lamps(views)]
     strength = np.array([lamp_strength(view_index.weather.sun_height) for view_index in views])
     eye_positions = np.array([view_index.pose[:2, 3] for view_index in views])
     dark_views = np.flatnonzero(strength > 0.0)
     if len(dark_views):
-        street_rows, circles = scene.kept("street lamps", lambda: _fixed(_street_lamps(scene)))
+        street_rows, circles = scene.cached("street lamps", lambda: _fixed_lamps(_street_lamps(scene)))
         offsets = circles[None, :, :2] - eye_positions[dark_views, None]
         dark_index, lamp_index = np.nonzero(np.hypot(*np.moveaxis(offsets, -1, 0)) < LIT_UP_TO)
         rows = street_rows[lamp_index]
@@ -163,7 +168,7 @@ def _lamps(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
     is_shining = bodies.lit & (strength[bodies.view] > 0.0)
     is_shining &= np.hypot(*(bodies.pose[:, :2, 3] - eye_positions[bodies.view]).T) < LIT_UP_TO
     view_index, pose = bodies.view[is_shining], bodies.pose[is_shining]
-    mesh_tables, row_index, owner = _of_meshes(bodies.mesh[is_shining], lambda mesh: _kept_beams(scene, mesh))
+    mesh_tables, row_index, owner = _rows_of_meshes(bodies.mesh[is_shining], lambda mesh: _cached_beams(scene, mesh))
     if len(row_index):
         rows, circles = (
             np.concatenate([mesh_table[column] for mesh_table in mesh_tables])[row_index] for column in (0, 1)
@@ -179,8 +184,8 @@ def _lamps(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
     return np.concatenate([rows for rows, _ in tables]), np.concatenate([places for _, places in tables])
 
 
-def _of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows], Any, Any]:
-    """What belongs to the bodies of meshes [N].
+def _rows_of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows], Any, Any]:
+    """Return the rows of the bodies of meshes [N].
 
     Returns:
         Rows of each mesh that occurs, one after the other; for each row of each body, its place among them; and the
@@ -195,29 +200,29 @@ def _of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows], Any,
     return tables, first_rows + np.arange(len(owners)) - (np.cumsum(row_counts) - row_counts)[owners], owners
 
 
-def _kept_beams(scene: Scene, mesh: int) -> Rows:
+def _cached_beams(scene: RenderScene, mesh: int) -> Rows:
     """Return the lamps of a body in its own frame, with their circles; cached."""
-    return scene.kept(("lamps", mesh), lambda: _fixed(_beams(scene, mesh)))  # type: ignore[no-any-return]
+    return scene.cached(("lamps", mesh), lambda: _fixed_lamps(_beams(scene, mesh)))  # type: ignore[no-any-return]
 
 
-def _fixed(lamps: Sequence[Lamp]) -> Rows:
+def _fixed_lamps(lamps: Sequence[SceneLamp]) -> Rows:
     """Return rows of lamps without shadow maps, and the circles [N, 3] (x, y, radius) that contain their light."""
     circles = [(*centre, radius) for centre, radius in map(lit_circle, lamps)]
     rows = np.array([_lamp_row(lamp, -1) for lamp in lamps], kernels.Lamp.numpy_dtype())  # type: ignore[attr-defined]
     return rows, np.array(circles, np.float64).reshape(-1, 3)
 
 
-def _street_lamps(scene: Scene) -> list[Lamp]:
+def _street_lamps(scene: RenderScene) -> list[SceneLamp]:
     """Return the lamps of the street."""
     power, spread, colour, reach = STREET_LAMP
     street_lamps = []
     for x, y, z, heading in [] if scene.street is None else scene.street.lamps.astype(np.float64).tolist():
         pose = upright_pose(x, y, heading, z - 0.05) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        street_lamps.append(Lamp(pose, power, spread, colour, 0.5, False, reach, False))
+        street_lamps.append(SceneLamp(pose, power, spread, colour, 0.5, False, reach, False))
     return street_lamps
 
 
-def _beams(scene: Scene, mesh: int) -> list[Lamp]:
+def _beams(scene: RenderScene, mesh: int) -> list[SceneLamp]:
     """Return the head and tail lamps of a body, in its own frame."""
     body_lamps = []
     for name, (position, area) in scene.lights(mesh).items():
@@ -230,9 +235,9 @@ def _beams(scene: Scene, mesh: int) -> list[Lamp]:
     return body_lamps
 
 
-def _occluders(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
+def _occluders(scene: RenderScene, views: Sequence[View], bodies: ObjectTable) -> Rows:
     """Return the bodies of views that occlude the sky from the ground."""
-    rows, places = _nothing(kernels.Occluder)
+    rows, places = _empty_struct(kernels.Occluder)
     eye_positions = np.array([entry.pose[:2, 3] for entry in views])[bodies.view]
     # The model of an occluder is a level rectangle: tilted bodies are left out.
     is_near = (np.hypot(*(bodies.pose[:, :2, 3] - eye_positions).T) < SHADED_UP_TO) & (bodies.pose[:, 2, 2] > 0.9)
@@ -254,9 +259,9 @@ def _occluders(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
     return rows, np.column_stack([view_index, rows["place"][:, :2] - eye_positions, rows["reach"]])
 
 
-def struct_array(struct: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
+def struct_array(row_type: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
     """Rows as an array of a kernel's struct; one row of zeros where there is none."""
-    dtype = struct.numpy_dtype()
+    dtype = row_type.numpy_dtype()
     return np.array(rows, dtype) if rows else np.zeros(1, dtype)
 
 
@@ -293,7 +298,7 @@ def _grid(places: F64, views: int) -> tuple[I32, I32]:
     )
 
 
-def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
+def _lamp_row(lamp: SceneLamp, layer: int) -> tuple[Any, ...]:
     """Return the row of a lamp for the kernels."""
     across, down = lamp.spread
     rotation, position = lamp.pose[:3, :3], lamp.pose[:3, 3]
@@ -314,7 +319,7 @@ def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
     )
 
 
-def lit_circle(lamp: Lamp) -> tuple[F64, float]:
+def lit_circle(lamp: SceneLamp) -> tuple[F64, float]:
     """Return a circle on the map that contains everything a lamp lights.
 
     It is the circle of the smallest ball around the sector that the lamp's spread and reach bound.
@@ -330,21 +335,21 @@ def lit_circle(lamp: Lamp) -> tuple[F64, float]:
     return lamp.pose[:2, 3] + lamp.pose[:2, 2] * (lamp.reach * centre_share), lamp.reach * radius_share
 
 
-def _beam(pose: F64, kind: tuple[Any, ...], strength: float) -> Lamp:
+def _beam(pose: F64, kind: tuple[Any, ...], strength: float) -> SceneLamp:
     """A lamp of a vehicle, at the origin of a frame that looks along x."""
     power, spread, colour, reach, tilt = kind
     lamp_pose = pose @ AHEAD
-    lamp_pose[:3, :3] = lamp_pose[:3, :3] @ _tilted(tilt)
-    return Lamp(lamp_pose, power * strength, spread, colour, 0.6, False, reach, False)
+    lamp_pose[:3, :3] = lamp_pose[:3, :3] @ _downward_rotation(tilt)
+    return SceneLamp(lamp_pose, power * strength, spread, colour, 0.6, False, reach, False)
 
 
-def lamp_lens(lamp: Lamp) -> tuple[float, float, float, float]:
+def lamp_lens(lamp: SceneLamp) -> tuple[float, float, float, float]:
     """Return the intrinsics of the camera that takes the shadow map of a lamp, texels: fx, fy, cx, cy."""
     half = LAMP_SHADOWS / 2
     return half / lamp.spread[0], half / lamp.spread[1], half - 0.5, half - 0.5
 
 
-def _tilted(angle: float) -> F64:
+def _downward_rotation(angle: float) -> F64:
     """Return a rotation of the axis downwards (camera frame)."""
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ssad.rendering.camera.render import Weather, light_of
+from ssad.rendering.camera.render import SceneWeather, scene_light
 
 NIGHT_LUX = 1.0 / 60.0  # irradiance over pi of one lux at night; basis of the lamps of street and vehicles
 # lowest altitude of the sun in degrees -> coefficients of the logarithm of its illuminance
@@ -40,7 +40,7 @@ def illuminance(sun_height: float) -> float:
     return float(10.0 ** np.polynomial.polynomial.polyval(degrees / 90.0, np.array(terms)))
 
 
-def per_lux(weather: Weather) -> float:
+def per_lux(weather: SceneWeather) -> float:
     """Return the irradiance over pi of one lux in an image.
 
     Args:
@@ -51,7 +51,7 @@ def per_lux(weather: Weather) -> float:
 
 @lru_cache(maxsize=64)
 def _per_lux(sun_height: float) -> float:
-    (sun, colour, zenith, horizon, *_), _ = light_of(Weather(sun_height, clouds=0.0))
+    (sun, colour, zenith, horizon, *_), _ = scene_light(SceneWeather(sun_height, clouds=0.0))
     # The same weights of zenith and horizon as in the shading of level ground.
     level = np.mean(colour) * max(sun[2], 0.0) + 0.65 * np.mean(zenith) + 0.35 * np.mean(horizon)
     return min(float(level) / illuminance(sun_height), NIGHT_LUX)

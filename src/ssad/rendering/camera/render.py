@@ -16,9 +16,33 @@ from ssad.core.types import F32, F64, I32, U8
 from ssad.rendering.camera.kernels import layers as layer_kernels
 from ssad.rendering.camera.kernels import raster, shade, sky
 from ssad.rendering.camera.kernels import sensor as sensing
-from ssad.rendering.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, near_of, struct_array
-from ssad.rendering.camera.scene import Bodies, Decal, Draws, Layer, Scene, Thing, collect
-from ssad.rendering.camera.sensor import BRIGHTEST, DEFAULT_SENSOR, KNEE, SHOULDER, Sensor, noise_levels, point_spread
+from ssad.rendering.camera.lamps import (
+    LAMP_NEAR,
+    LAMP_SHADOWS,
+    SceneLamp,
+    lamp_lens,
+    lamp_strength,
+    nearby_lights,
+    struct_array,
+)
+from ssad.rendering.camera.scene import (
+    DrawCalls,
+    ObjectTable,
+    RenderScene,
+    SceneObject,
+    TextureDecal,
+    TextureLayer,
+    collect,
+)
+from ssad.rendering.camera.sensor import (
+    BRIGHTEST,
+    DEFAULT_SENSOR,
+    KNEE,
+    SHOULDER,
+    SensorModel,
+    noise_levels,
+    point_spread,
+)
 
 NEAR = 0.15  # m
 FAR = 500.0
@@ -29,7 +53,7 @@ FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before
 
 
 @dataclass(frozen=True, slots=True)
-class Weather:
+class SceneWeather:
     """Time of day and weather.
 
     Attributes:
@@ -58,7 +82,7 @@ class View:
     Attributes:
         camera: Size and intrinsics.
         pose: Camera to world [4, 4].
-        things: Objects in the scene besides the street.
+        objects: Objects in the scene besides the street.
         weather: Time of day and weather.
         sensor: Lens, mosaic, noise and full photosites.
         seed: Seed of the noise; equal seeds give equal noise.
@@ -69,17 +93,17 @@ class View:
 
     camera: Camera
     pose: F64
-    things: tuple[Thing, ...] = ()
-    weather: Weather = Weather()
-    sensor: Sensor = DEFAULT_SENSOR
+    objects: tuple[SceneObject, ...] = ()
+    weather: SceneWeather = SceneWeather()
+    sensor: SensorModel = DEFAULT_SENSOR
     seed: int = 0
-    lamps: tuple[Lamp, ...] = ()
+    lamps: tuple[SceneLamp, ...] = ()
     focus: tuple[float, float] | None = None
-    decals: tuple[Decal, ...] = ()
+    decals: tuple[TextureDecal, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Quality:
+class RenderQuality:
     """Effects of light that are rendered.
 
     Attributes:
@@ -95,11 +119,11 @@ class Quality:
     lamps: bool = True
 
 
-PLAIN = Quality(shadows=False, fine=False, contact=False, lamps=False)
+PLAIN = RenderQuality(shadows=False, fine=False, contact=False, lamps=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class SurfaceMap:
     """Surface that covers most of each pixel, [B, H, W, 3] each; zero for sky.
 
     Attributes:
@@ -118,7 +142,7 @@ class Surface:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class Rendering:
     """Result of rendering B views.
 
     Attributes:
@@ -138,11 +162,11 @@ class Picture:
     depth: F32
     exposure: F64
     fragments: Any
-    surface: Surface | None = None
+    surface: SurfaceMap | None = None
 
 
 @lru_cache(maxsize=256)
-def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
+def scene_light(weather: SceneWeather) -> tuple[tuple[Any, ...], float]:
     """Return the light of a view for the kernels, and the exposure that suits it.
 
     Day, dusk and night follow from the elevation of the sun.
@@ -213,13 +237,13 @@ def response() -> U8:
     return np.asarray(np.rint(encoded * 255), np.uint8)
 
 
-class _Pass:
+class _VisibilityPass:
     """Visibility pass over all views: draws, slots and samples."""
 
     def __init__(
         self,
-        stage: Scene,
-        draws: Draws,
+        stage: RenderScene,
+        draws: DrawCalls,
         lens: F32,
         *,
         ortho: bool,
@@ -276,15 +300,15 @@ class _Pass:
 
 
 def render(
-    stage: Scene,
+    stage: RenderScene,
     views: Sequence[View],
     *,
     scale: int = 2,
-    quality: Quality = Quality(),
+    quality: RenderQuality = RenderQuality(),
     download: bool = True,
     linear: bool = True,
     surface: bool = False,
-) -> Picture:
+) -> Rendering:
     """Render views of one size.
 
     Args:
@@ -315,11 +339,11 @@ def render(
         ):
             raise ConfigError(f"view {view_index}: a camera needs a finite pose and a positive focal length")
         lens.append(kernel_lens(intrinsic))
-        view_light, exposure = light_of(view.weather)
+        view_light, exposure = scene_light(view.weather)
         lights.append(view_light)
         exposures.append(exposure)
     poses = np.array([entry.pose for entry in views], np.float64)
-    bodies = collect([entry.things for entry in views])
+    bodies = collect([entry.objects for entry in views])
     # Beyond six extinction lengths fog hides everything.
     far_limits = np.array([min(FAR, 6.0 / entry.weather.fog) if entry.weather.fog > 0 else FAR for entry in views])
     draws = stage.gather(
@@ -330,7 +354,7 @@ def render(
         reach=(70.0, 180.0),
         far=far_limits,
     )
-    visible = _Pass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
+    visible = _VisibilityPass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
     shadows = _sun_shadows(stage, views, bodies, [view_light[0] for view_light in lights], quality)
     nearby_light = _near(stage, views, bodies, quality)
     device, shape = stage.device, (len(views), *size)
@@ -379,13 +403,13 @@ def render(
     if download:
         arrays = tuple(array.numpy() if linear or array is not output.radiance else array for array in arrays)
     exported = _surface(output, np.array(lens), poses) if surface else None
-    return Picture(*arrays, np.array(exposures), fragments, exported)
+    return Rendering(*arrays, np.array(exposures), fragments, exported)
 
 
 SURFACE = ("albedo", "normal", "irradiance", "gain")
 
 
-def _surface(out: Any, lens: F64, poses: F64) -> Surface:
+def _surface(out: Any, lens: F64, poses: F64) -> SurfaceMap:
     """The exported surfaces, with positions from depth."""
     exported = {name: getattr(out, name).numpy() for name in SURFACE}
     depth = out.depth.numpy()
@@ -401,11 +425,15 @@ def _surface(out: Any, lens: F64, poses: F64) -> Surface:
     is_solid = np.isfinite(depth)
     camera_points = rays * np.where(is_solid, depth, 0.0)[..., None]
     position = np.einsum("bij,bhwj->bhwi", poses[:, :3, :3], camera_points) + poses[:, None, None, :3, 3]
-    return Surface(position=(position * is_solid[..., None]).astype(np.float32), **exported)
+    return SurfaceMap(position=(position * is_solid[..., None]).astype(np.float32), **exported)
 
 
 def _sun_shadows(
-    stage: Scene, views: Sequence[View], bodies: Bodies, suns: Sequence[tuple[float, ...]], quality: Quality
+    stage: RenderScene,
+    views: Sequence[View],
+    bodies: ObjectTable,
+    suns: Sequence[tuple[float, ...]],
+    quality: RenderQuality,
 ) -> Any:
     """Render the shadow maps of the sun: a wide one, and a fine one around each view's focus."""
     poses = np.array([entry.pose for entry in views], np.float64)
@@ -428,7 +456,7 @@ def _sun_shadows(
 
 
 def _sun_map(  # noqa: PLR0917
-    stage: Scene, bodies: Bodies, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
+    stage: RenderScene, bodies: ObjectTable, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
 ) -> tuple[Any, Any, float]:
     """Render a shadow map [B, size, size] around each middle.
 
@@ -455,20 +483,20 @@ def _sun_map(  # noqa: PLR0917
         reach=(0.4 * reach, far_limit),
         far=np.full(len(middles), far_limit),
         horizon=False,
-        casting=True,
+        casts_shadows=True,
     )
-    return _Pass(stage, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples, matrices, texel
+    return _VisibilityPass(stage, draws, intrinsics, ortho=True, size=(size, size), scale=1).samples, matrices, texel
 
 
-def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
+def _layers(draws: DrawCalls, views: Sequence[View], device: str) -> Any:
     """Build the layer and decal tables of the kernels."""
     masks: list[F32] = []
 
-    def mask_of(wanted: Layer | Decal) -> tuple[int, int, int]:
-        if wanted.mask is None:
+    def mask_of(layer: TextureLayer | TextureDecal) -> tuple[int, int, int]:
+        if layer.mask is None:
             return -1, 0, 0
         start = sum(mask.size for mask in masks)
-        masks.append(np.asarray(wanted.mask, np.float32))
+        masks.append(np.asarray(layer.mask, np.float32))
         return start, masks[-1].shape[1], masks[-1].shape[0]
 
     layers = [
@@ -508,15 +536,15 @@ def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
     return table
 
 
-def _near(stage: Scene, views: Sequence[View], bodies: Bodies, quality: Quality) -> Any:
+def _near(stage: RenderScene, views: Sequence[View], bodies: ObjectTable, quality: RenderQuality) -> Any:
     """Build lamps with their shadow maps, and the bodies that occlude the sky from the ground."""
-    near_light = near_of(stage, views, bodies, lamps=quality.lamps, contact=quality.contact)
+    near_light = nearby_lights(stage, views, bodies, lamps=quality.lamps, contact=quality.contact)
     shadow_lamps = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
     if not shadow_lamps:
         near_light.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
         return near_light
     poses = np.array([lamp.pose for _, lamp in shadow_lamps], np.float64)
-    bodies_of_lamps = collect([view.things for view, _ in shadow_lamps])
+    bodies_of_lamps = collect([view.objects for view, _ in shadow_lamps])
     draws = stage.gather(
         np.asarray(np.linalg.inv(poses), np.float64),
         bodies_of_lamps,
@@ -525,11 +553,11 @@ def _near(stage: Scene, views: Sequence[View], bodies: Bodies, quality: Quality)
         reach=(70.0, 180.0),
         far=np.array([lamp.reach for _, lamp in shadow_lamps]),
         horizon=False,
-        casting=True,
+        casts_shadows=True,
     )
     lens = np.array([lamp_lens(lamp) for _, lamp in shadow_lamps], np.float32)
     size = (LAMP_SHADOWS, LAMP_SHADOWS)
-    near_light.shadows = _Pass(stage, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
+    near_light.shadows = _VisibilityPass(stage, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
     return near_light
 
 

@@ -51,7 +51,7 @@ PATTERNS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
+class TextureLayer:
     """Texture on an object.
 
     Attributes:
@@ -74,7 +74,7 @@ class Layer:
 
 
 @dataclass(frozen=True, slots=True)
-class Decal:
+class TextureDecal:
     """Texture on all surfaces in a box in the world that face it: a road, a wall, a sign, a jacket.
 
     Attributes:
@@ -115,7 +115,7 @@ def check_opacity(texture: int, opacity: float, mask: F32 | None) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class SceneObject:
     """Body in a view.
 
     Attributes:
@@ -133,13 +133,13 @@ class Thing:
     pose: F64
     paint: tuple[float, float, float] = (0.5, 0.5, 0.5)
     tag: int = 0
-    layers: tuple[Layer, ...] = ()
+    layers: tuple[TextureLayer, ...] = ()
     lit: bool = True
     hidden: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Draws:
+class DrawCalls:
     """N ranges of listed faces, each under one matrix (object to camera) in one view."""
 
     firsts: I32
@@ -149,15 +149,15 @@ class Draws:
     paints: F32
     tags: I32
     lit: I32
-    layers: tuple[tuple[Layer, ...], ...]
+    layers: tuple[tuple[TextureLayer, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Bodies:
+class ObjectTable:
     """The N objects of B views as arrays, view by view.
 
     Attributes:
-        things: The objects themselves.
+        objects: The objects themselves.
         view: View of each [N].
         mesh: Index of its mesh in the scene [N].
         pose: Object to world [N, 4, 4].
@@ -167,7 +167,7 @@ class Bodies:
         hidden: Whether it only casts a shadow [N].
     """
 
-    things: tuple[Thing, ...]
+    objects: tuple[SceneObject, ...]
     view: I32
     mesh: I32
     pose: F64
@@ -177,16 +177,18 @@ class Bodies:
     hidden: Bool
 
 
-def collect(things: Sequence[Sequence[Thing]]) -> Bodies:
+def collect(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectTable:
     """The things of B views in arrays.
 
     Args:
-        things: Those of each view.
+        objects_by_view: Those of each view.
     """
-    flat_objects = tuple(scene_object for view_objects in things for scene_object in view_objects)
-    return Bodies(
+    flat_objects = tuple(scene_object for view_objects in objects_by_view for scene_object in view_objects)
+    return ObjectTable(
         flat_objects,
-        np.repeat(np.arange(len(things), dtype=np.int32), [len(view_objects) for view_objects in things]),
+        np.repeat(
+            np.arange(len(objects_by_view), dtype=np.int32), [len(view_objects) for view_objects in objects_by_view]
+        ),
         np.array([entry.mesh for entry in flat_objects], np.int32),
         np.array([entry.pose for entry in flat_objects], np.float64).reshape(-1, 4, 4),
         np.array([entry.paint for entry in flat_objects], np.float32).reshape(-1, 3),
@@ -207,7 +209,7 @@ NIGHT = {  # added to the emission of a material at night, while lamps are on
 }
 
 
-class Scene:
+class RenderScene:
     """Triangles of a street (or none) and of meshes, on a device."""
 
     def __init__(self, street: Street | None, meshes: Sequence[Mesh], *, device: str = "cpu") -> None:
@@ -267,7 +269,7 @@ class Scene:
         ]
         self.wearable = to_device(np.concatenate(has_panel).astype(np.int32), wp.int32)
         self.meshes = tuple(meshes)
-        self._kept: dict[Any, Any] = {}
+        self._cache: dict[Any, Any] = {}
         surface_rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
         self.surfaces = to_device(surface_rows, matter.Surface)
         self.listed = to_device(np.concatenate(listed), wp.int32)
@@ -275,11 +277,11 @@ class Scene:
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
             setattr(self.geometry, name, getattr(self, name))
 
-    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+    def cached(self, key: Any, make: Callable[[], Any]) -> Any:
         """Return a value that is computed once for this scene, under a key."""
-        if key not in self._kept:
-            self._kept[key] = make()
-        return self._kept[key]
+        if key not in self._cache:
+            self._cache[key] = make()
+        return self._cache[key]
 
     def lights(self, mesh: int) -> dict[str, tuple[F64, float]]:
         """Return middle [3] (object frame, m) and area (m^2) of the head lamps and tail lamps of a mesh."""
@@ -312,7 +314,7 @@ class Scene:
             Middle [2]; half length and half width of the covered area [2]; height of its underside; and height of
             its top, all in the object frame, m.
         """
-        return self.kept(("standing", mesh), lambda: _standing(self.meshes[mesh]))  # type: ignore[no-any-return]
+        return self.cached(("standing", mesh), lambda: _standing(self.meshes[mesh]))  # type: ignore[no-any-return]
 
     def tiles(
         self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
@@ -361,16 +363,16 @@ class Scene:
     def gather(
         self,
         inverses: F64,
-        bodies: Bodies,
+        bodies: ObjectTable,
         *,
         eyes: F64,
         axes: F64 | None,
         reach: tuple[float, float],
         far: F64,
         horizon: bool = True,
-        casting: bool = False,
-    ) -> Draws:
-        """What B views need: tiles of the street, and things that are neither wholly behind them nor too far away.
+        casts_shadows: bool = False,
+    ) -> DrawCalls:
+        """Return what B views draw: tiles of the street, and objects neither wholly behind them nor too far away.
 
         Args:
             inverses: World to camera [B, 4, 4].
@@ -380,12 +382,12 @@ class Scene:
             reach: See `tiles`.
             far: Distance beyond which nothing is drawn [B], m.
             horizon: See `tiles`.
-            casting: Whether hidden things are needed too.
+            casts_shadows: Whether hidden things are needed too.
         """
         firsts, counts, views = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
         tile_count = len(firsts)
         matrices = inverses[views]
-        visible = np.arange(len(bodies.things)) if casting else np.flatnonzero(~bodies.hidden)
+        visible = np.arange(len(bodies.objects)) if casts_shadows else np.flatnonzero(~bodies.hidden)
         if len(visible):
             meshes, owners = bodies.mesh[visible], bodies.view[visible]
             to_camera = inverses[owners] @ bodies.pose[visible]
@@ -415,8 +417,8 @@ class Scene:
             bodies.tag[visible],
             bodies.lit[visible],
         )
-        layers = ((),) * tile_count + tuple(bodies.things[object_index].layers for object_index in visible.tolist())
-        return Draws(firsts, counts, views, matrices.astype(np.float32), paints, tags, lit, layers)
+        layers = ((),) * tile_count + tuple(bodies.objects[object_index].layers for object_index in visible.tolist())
+        return DrawCalls(firsts, counts, views, matrices.astype(np.float32), paints, tags, lit, layers)
 
 
 def surface(material: Material) -> tuple[Any, ...]:
@@ -436,7 +438,7 @@ def surface(material: Material) -> tuple[Any, ...]:
 
 
 def _standing(body: Mesh) -> tuple[F64, F64, float, float]:
-    """See `Scene.standing`."""
+    """See `RenderScene.standing`."""
     lower, upper = body.bounds()
     corners = body.corners()
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

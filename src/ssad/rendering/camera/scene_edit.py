@@ -11,10 +11,10 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64, Bool
-from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.photometry import per_lux
-from ssad.rendering.camera.render import Picture, View, develop_radiance, light_of, render
-from ssad.rendering.camera.scene import Decal, Layer, Scene, Thing
+from ssad.rendering.camera.render import Rendering, View, develop_radiance, render, scene_light
+from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureDecal, TextureLayer
 from ssad.rendering.meshes.mesh import Material, Mesh, build, merge
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ LIFT = 1.0  # m: height of a card in its own frame, because the shadow pass skip
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
+class ShadowCard:
     """Invisible flat object that blocks the sun; it hangs between the sun and its shadow.
 
     Attributes:
@@ -65,10 +65,10 @@ class SceneEdit:
         masks: Texels of a texture [H, W] that are somewhere on the target; all where no mask is given.
     """
 
-    layers: tuple[Layer, ...] = ()
-    lamps: tuple[Lamp, ...] = ()
-    decals: tuple[Decal, ...] = ()
-    cards: tuple[Card, ...] = ()
+    layers: tuple[TextureLayer, ...] = ()
+    lamps: tuple[SceneLamp, ...] = ()
+    decals: tuple[TextureDecal, ...] = ()
+    cards: tuple[ShadowCard, ...] = ()
     textures: Mapping[int, Tensor] = field(default_factory=dict)
     masks: Mapping[int, Bool] = field(default_factory=dict)
 
@@ -93,40 +93,40 @@ class SceneEdit:
         Raises:
             ConfigError: The scene lacks cards of the edit.
         """
-        target_index = next((index for index, scene_object in enumerate(view.things) if scene_object.tag == tag), None)
+        target_index = next((index for index, scene_object in enumerate(view.objects) if scene_object.tag == tag), None)
         if target_index is None:
             return view
         if len(cards) != len(self.cards):
             raise ConfigError(f"the scene has {len(cards)} of the {len(self.cards)} cards of the edit")
-        target = view.things[target_index]
-        sun = np.array(light_of(view.weather)[0][0])
+        target = view.objects[target_index]
+        sun = np.array(scene_light(view.weather)[0][0])
         hung_cards = []
         # Below the horizon there is no sun to block.
         for card, mesh in zip(self.cards, cards, strict=True) if sun[2] > 0.0 else ():
             pose = target.pose.copy()
             pose[:3, 3] += card.away * sun - LIFT * target.pose[:3, 2]
-            hung_cards.append(Thing(mesh, pose, tag=0, hidden=True))
+            hung_cards.append(SceneObject(mesh, pose, tag=0, hidden=True))
         scale = per_lux(view.weather)
         lamps = (replace(entry, pose=target.pose @ entry.pose, power=entry.power * scale) for entry in self.lamps)
         decals = (
             replace(entry, pose=target.pose @ entry.pose, tag=tag if entry.tag > 0 else entry.tag)
             for entry in self.decals
         )
-        objects = [*view.things, *hung_cards]
+        objects = [*view.objects, *hung_cards]
         objects[target_index] = replace(target, layers=(*target.layers, *self.layers))
-        return replace(view, things=tuple(objects), lamps=(*view.lamps, *lamps), decals=(*view.decals, *decals))
+        return replace(view, objects=tuple(objects), lamps=(*view.lamps, *lamps), decals=(*view.decals, *decals))
 
 
 NO_EDIT = SceneEdit()
 
 
 def render_with(
-    scene: Scene,
+    scene: RenderScene,
     views: Sequence[View],
     textures: Mapping[int, Tensor],
     masks: Mapping[int, Bool] | None = None,
     **options: Any,
-) -> Picture:
+) -> Rendering:
     """Render views with textures on the surfaces that show them; without such surfaces the result equals `render`.
 
     Args:
@@ -151,12 +151,12 @@ def render_with(
         raise ConfigError(f"no texture {min(set(texture_indices) - set(textures))}, which a view shows")
     import torch  # only needed for scenes with textures
 
-    from ssad.rendering.camera.texture import retexture, taps_of
+    from ssad.rendering.camera.texture import retexture, texture_taps
 
     radiance = torch.from_numpy(np.array(rendering.radiance))
     for texture_index in texture_indices:
         texture = textures[texture_index].detach().cpu().float()
-        taps = taps_of(
+        taps = texture_taps(
             rendering,
             (texture.shape[1], texture.shape[2]),
             texture=texture_index,

@@ -31,7 +31,7 @@ SMALLEST: Final = 4  # px along a side, so that borders can be mirrored
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class SensorModel:
     """Conversion of light into codes by a camera.
 
     Attributes:
@@ -81,8 +81,8 @@ class Sensor:
             )
 
 
-DEFAULT_SENSOR: Final = Sensor()
-PINHOLE: Final = Sensor(blur=0.0, mosaic=False)  # its image is the curve of the light
+DEFAULT_SENSOR: Final = SensorModel()
+PINHOLE: Final = SensorModel(blur=0.0, mosaic=False)  # its image is the curve of the light
 
 
 def point_spread(blur: float) -> tuple[float, float]:
@@ -142,5 +142,5 @@ OPPOSITE: Final[Taps] = (  # red at blue, blue at red
 )
 
 
-SENSOR: Final = Sensor(noise=0.012)
+SENSOR: Final = SensorModel(noise=0.012)
 """The sensor of recorded datasets and of cameras in the loop."""

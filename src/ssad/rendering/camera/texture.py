@@ -91,7 +91,7 @@ def paint_mask(mesh: Mesh, size: tuple[int, int], rectangle: Rectangle = (0.0, 0
     return np.asarray(quarter_texels.reshape(height, 4, width, 4).max((1, 3)) > 0)
 
 
-class Seen(Protocol):
+class TexturedRendering(Protocol):
     """Result with fragments of textured surfaces."""
 
     @property
@@ -99,8 +99,8 @@ class Seen(Protocol):
         """As `Picture.fragments`."""
 
 
-def taps_of(
-    picture: Seen,
+def texture_taps(
+    rendering: TexturedRendering,
     size: int | tuple[int, int],
     *,
     texture: int = 0,
@@ -110,7 +110,7 @@ def taps_of(
     """The taps of one texture in a picture.
 
     Args:
-        picture: A `Picture`, or a part of one, rendered with things, decals or lamps that show the texture.
+        rendering: A `Picture`, or a part of one, rendered with things, decals or lamps that show the texture.
         size: Height and width of the texture, or one side of a square, texels.
         texture: Its number.
         mask: Which texels [H, W] are somewhere on the surface (see `paint_mask`); None for all.
@@ -123,14 +123,14 @@ def taps_of(
     levels = levels_of(shape)
     if mask is not None and (mask.shape != shape or not mask.any()):
         raise ConfigError(f"a mask of {list(mask.shape)} texels, some of them set, for a texture of {list(shape)}")
-    fragments = picture.fragments[picture.fragments["texture"] == texture]
+    fragments = rendering.fragments[rendering.fragments["texture"] == texture]
     u, v = fragments["u"].astype(np.float64), fragments["v"].astype(np.float64)
     area = fragments["area"].astype(np.float64) * shape[0] * shape[1]
     # The level at which a texel is about as large as the pixel's footprint.
     level = np.clip(0.5 * np.log2(np.maximum(area, 1.0)), 0, len(levels) - 1)
     lower_level = np.minimum(np.floor(level).astype(int), len(levels) - 1)
     upper_level = np.minimum(lower_level + 1, len(levels) - 1)
-    coverage = _covered(mask, levels)
+    coverage = _covered_rows(mask, levels)
     index, weight = np.zeros((len(fragments), 8), np.int64), np.zeros((len(fragments), 8))
     for level_slot, (level_index, share) in enumerate(
         ((lower_level, 1 - (level - lower_level)), (upper_level, level - lower_level))
@@ -163,7 +163,7 @@ def _corners(u: F64, v: F64, chosen: F64, levels: list[tuple[int, int]]) -> tupl
     return index, weight
 
 
-def _covered(mask: Bool | None, levels: list[tuple[int, int]]) -> F64 | None:
+def _covered_rows(mask: Bool | None, levels: list[tuple[int, int]]) -> F64 | None:
     """Return 1 for each row of the pyramid [N] that contains a texel of the mask, else 0; None without a mask."""
     if mask is None:
         return None
@@ -206,7 +206,7 @@ def pyramid(texture: Tensor, mask: Tensor | None = None) -> Tensor:
     return torch.cat(rows, -1).mT.reshape(-1, 3)
 
 
-def joined(taps: Sequence[Taps], corners: Sequence[tuple[int, int]], width: int, part: tuple[int, int]) -> Taps:
+def combine_taps(taps: Sequence[Taps], corners: Sequence[tuple[int, int]], width: int, part: tuple[int, int]) -> Taps:
     """Combine the taps of several images into those of a batch of crops, each with a texture of its own.
 
     Args:
@@ -230,29 +230,29 @@ def joined(taps: Sequence[Taps], corners: Sequence[tuple[int, int]], width: int,
     return Taps(taps[0].size, taps[0].mask, pixel, light, index + shift[:, 1:], weight)
 
 
-def retexture(taps: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
+def retexture(lookups: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
     """A picture with a texture on: base plus what the texture adds; differentiable in both.
 
     Args:
-        taps: What pixels see of it.
-        texture: Linear albedo [3, H, W], 0 to 1 (see `printable`); of each of several pictures (see `joined`)
+        lookups: What pixels see of it.
+        texture: Linear albedo [3, H, W], 0 to 1 (see `printable`); of each of several pictures (see `combine_taps`)
             [B, 3, H, W].
         radiance: Of the picture whose taps these are [B, H, W, 3], without the texture.
 
     Raises:
         ConfigError: A texture of another size, or with albedo beyond 0 to 1.
     """
-    if tuple(texture.shape[-2:]) != taps.size:
-        raise ConfigError(f"these taps are of a texture of {list(taps.size)} texels, not {list(texture.shape[-2:])}")
+    if tuple(texture.shape[-2:]) != lookups.size:
+        raise ConfigError(f"these taps are of a texture of {list(lookups.size)} texels, not {list(texture.shape[-2:])}")
     # One transfer from the GPU for both numbers.
     lowest, highest = torch.stack(texture.detach().aminmax()).tolist()
     if not (lowest >= 0.0 and highest <= 1.0):
         raise ConfigError(f"an albedo of {lowest:.3g} to {highest:.3g}: it lies in 0 to 1")
-    pyramid_rows = pyramid(texture, taps.mask)
-    samples = pyramid_rows.index_select(0, taps.index.flatten()).reshape(*taps.index.shape, 3)
-    colour = (samples * taps.weight[..., None]).sum(1) * taps.light
+    pyramid_rows = pyramid(texture, lookups.mask)
+    samples = pyramid_rows.index_select(0, lookups.index.flatten()).reshape(*lookups.index.shape, 3)
+    colour = (samples * lookups.weight[..., None]).sum(1) * lookups.light
     base_pixels = radiance.reshape(-1, 3)
-    return base_pixels.index_add(0, taps.pixel, colour.to(base_pixels.dtype)).reshape(radiance.shape)
+    return base_pixels.index_add(0, lookups.pixel, colour.to(base_pixels.dtype)).reshape(radiance.shape)
 
 
 def printable(colour: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ def quantisation(quality: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pass:
+class _CosinePass:
     """One-dimensional integer DCT of libjpeg, applied exactly to columns [8, N] of whole numbers.
 
     Attributes:
@@ -101,19 +101,19 @@ class _Pass:
 
     inner: Tensor
     direct: Tensor
-    taken: Tensor
+    input_rows: Tensor
     bias: Tensor
 
     def __call__(self, columns: Tensor) -> Tensor:
         """Return the frequencies [8, N]."""
         if not len(self.inner):
             return torch.floor(torch.addmm(self.bias, self.direct, columns))
-        return torch.addmm(self.direct @ columns, self.taken, torch.floor(self.inner @ columns))
+        return torch.addmm(self.direct @ columns, self.input_rows, torch.floor(self.inner @ columns))
 
 
 @dataclass(frozen=True, slots=True)
 class _Code:
-    """How blocks become steps and pixels again, in `_exact`.
+    """Conversion of blocks to quantisation steps and back to pixels, in `_exact`.
 
     Attributes:
         passes: Along rows and along columns of a block.
@@ -122,14 +122,14 @@ class _Code:
         pixels: From coefficients to the pixels of a block [64, 64].
     """
 
-    passes: tuple[_Pass, _Pass]
+    passes: tuple[_CosinePass, _CosinePass]
     divisors: Tensor
     steps: Tensor
     pixels: Tensor
 
 
 def _fast_pass() -> list[np.ndarray]:
-    """Fast DCT of libjpeg with 8-bit constants, as the matrices of `_Pass`.
+    """Fast DCT of libjpeg with 8-bit constants, as the matrices of `_CosinePass`.
 
     By Arai, Agui and Nakajama. Each frequency comes out scaled by `_fast_divisors`.
     """
@@ -151,7 +151,7 @@ def _fast_divisors(table: np.ndarray) -> np.ndarray:
 
 
 def _accurate_pass(*, first: bool) -> list[np.ndarray]:
-    """Accurate DCT of libjpeg with 13-bit constants, as the matrices of `_Pass`.
+    """Accurate DCT of libjpeg with 13-bit constants, as the matrices of `_CosinePass`.
 
     By Loeffler, Ligtenberg and Moschytz. The first pass keeps two extra bits and the second removes them: the result is
     in eighths.
@@ -208,14 +208,14 @@ def _code(quality: int, device: torch.device, *, fast: bool) -> _Code:
     )  # the orthonormal DCT-II, a row for each frequency
     cosines[0] /= np.sqrt(2)
     with torch.inference_mode(mode=False):
-        row_pass, column_pass = (_Pass(*map(to_device, matrices)) for matrices in passes)
+        row_pass, column_pass = (_CosinePass(*map(to_device, matrices)) for matrices in passes)
         inverse = to_device(np.kron(cosines.T, cosines.T))
         return _Code(
             (row_pass, column_pass), to_device(divisors.reshape(64, 2)), to_device(tables.reshape(64, 2)), inverse
         )
 
 
-def _coded(bright: Tensor, colours: Tensor, quality: int, *, fast: bool) -> tuple[Tensor, Tensor]:
+def _quantise_planes(bright: Tensor, colours: Tensor, quality: int, *, fast: bool) -> tuple[Tensor, Tensor]:
     """Planes [B, C, H, W] of whole codes, in whole blocks of 8 x 8, through quantisation and back; not cut off.
 
     Args:
@@ -268,32 +268,34 @@ def _colour_weights(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, T
         return to_ycbcr, halves.to(device, dtype).reshape(3, 1, 1), torch.tensor(FROM_YCBCR, dtype=dtype, device=device)
 
 
-def _mixed(weights: Tensor, planes: Tensor) -> Tensor:
+def _mix_planes(weights: Tensor, planes: Tensor) -> Tensor:
     """Mix planes [B, 3, H, W] linearly."""
     return torch.einsum("ij,bjhw->bihw", weights, planes)
 
 
 @lru_cache(maxsize=32)
-def _by_turns(first: float, second: float, count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+def _alternating_row(first: float, second: float, count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Return two alternating numbers along a row [W]."""
     with torch.inference_mode(mode=False):
         return torch.tensor([first, second], dtype=dtype, device=device).repeat(-(-count // 2))[:count]
 
 
-def _halved(plane: Tensor) -> Tensor:
+def _halve(plane: Tensor) -> Tensor:
     """Average each 2 x 2 whole codes; halves go down and up alternately along a row, as in libjpeg."""
     mean = avg_pool2d(plane, 2)
-    return torch.floor(mean + _by_turns(0.25, 0.5, mean.shape[-1], plane.device, plane.dtype))
+    return torch.floor(mean + _alternating_row(0.25, 0.5, mean.shape[-1], plane.device, plane.dtype))
 
 
-def _doubled(plane: Tensor) -> Tensor:
+def _double(plane: Tensor) -> Tensor:
     """Double the size by weights 3 : 1 along each side ("fancy upsampling"), with libjpeg's rounding."""
     # Bilinear interpolation has exactly these weights.
-    interpolated = _widened(plane)
-    return torch.floor(interpolated + _by_turns(8 / 16, 7 / 16, interpolated.shape[-1], plane.device, plane.dtype))
+    interpolated = _widen(plane)
+    return torch.floor(
+        interpolated + _alternating_row(8 / 16, 7 / 16, interpolated.shape[-1], plane.device, plane.dtype)
+    )
 
 
-def _widened(plane: Tensor) -> Tensor:
+def _widen(plane: Tensor) -> Tensor:
     return interpolate(plane, scale_factor=2, mode="bilinear", align_corners=False)
 
 
@@ -314,34 +316,32 @@ def block_of(subsampling: str) -> int:
     return 16 if subsampling == "420" else 8
 
 
-def extended(picture: Tensor, height: int, width: int) -> Tensor:
+def extend(image: Tensor, height: int, width: int) -> Tensor:
     """A picture with its last row and column repeated up to a size.
 
     Args:
-        picture: [C, H, W].
+        image: [C, H, W].
         height: At least H.
         width: At least W.
 
     Returns:
         [C, height, width].
     """
-    down, right = height - picture.shape[1], width - picture.shape[2]
-    return pad(picture[None], (0, right, 0, down), mode="replicate")[0] if down or right else picture
+    down, right = height - image.shape[1], width - image.shape[2]
+    return pad(image[None], (0, right, 0, down), mode="replicate")[0] if down or right else image
 
 
-def _repeated(planes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
+def _repeat_border(planes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
     """Replace everything in planes [B, C, H, W] beyond sizes [B] by the last row and column inside."""
     full_size = (int(planes.shape[2]), int(planes.shape[3]))
     if all(size == full_size for size in sizes):
         return planes
     return torch.stack(
-        [extended(plane[:, :height, :width], *full_size) for plane, (height, width) in zip(planes, sizes, strict=True)]
+        [extend(plane[:, :height, :width], *full_size) for plane, (height, width) in zip(planes, sizes, strict=True)]
     )
 
 
-def compressed(
-    image: Tensor, sizes: Sequence[tuple[int, int]], quality: int, subsampling: str, *, fast: bool
-) -> Tensor:
+def compress(image: Tensor, sizes: Sequence[tuple[int, int]], quality: int, subsampling: str, *, fast: bool) -> Tensor:
     """`jpeg` of images that are whole blocks, such as parts of larger ones.
 
     Args:
@@ -365,33 +365,33 @@ def compressed(
         exact_type = _exact(image.device, fast=True)
         to_ycbcr, rounding, _ = _colour_weights(image.device, exact_type)
         codes = torch.floor(image * 255 + (0.5 + TIE)).to(exact_type)
-        planes = torch.floor(_mixed(to_ycbcr, codes) + rounding).to(image.dtype)
+        planes = torch.floor(_mix_planes(to_ycbcr, codes) + rounding).to(image.dtype)
         luminance, chrominance = planes[:, :1], planes[:, 1:]
         if is_subsampled:
             # what is not there repeats the last mean of two rows, and the last column; back from it, both repeat the
             # after decoding.
-            chrominance = _halved(chrominance)
-            chrominance = _repeated(chrominance, [(height, chrominance.shape[3]) for height, _ in half_sizes])
-        luminance, chrominance = _coded(luminance, chrominance, quality, fast=fast)
+            chrominance = _halve(chrominance)
+            chrominance = _repeat_border(chrominance, [(height, chrominance.shape[3]) for height, _ in half_sizes])
+        luminance, chrominance = _quantise_planes(luminance, chrominance, quality, fast=fast)
         unclipped = (luminance > 0) & (luminance < 255), (chrominance > 0) & (chrominance < 255)
         luminance, chrominance = luminance.clamp(0, 255), chrominance.clamp(0, 255)
         if is_subsampled:
-            chrominance = _doubled(_repeated(chrominance, half_sizes))
+            chrominance = _double(_repeat_border(chrominance, half_sizes))
         to_ycbcr, _, from_ycbcr = _colour_weights(image.device, image.dtype)
-        codes = torch.floor(_mixed(from_ycbcr, torch.cat([luminance, chrominance - 128], 1)) + (0.5 + TIE))
+        codes = torch.floor(_mix_planes(from_ycbcr, torch.cat([luminance, chrominance - 128], 1)) + (0.5 + TIE))
         is_unclipped = (codes > 0) & (codes < 255)
         codes = codes.clamp(0, 255) / 255
     if not image.requires_grad:
         return codes
     # Without rounding, coding is the identity: the means of the colours and the clipping remain.
-    planes = _mixed(to_ycbcr, image)
+    planes = _mix_planes(to_ycbcr, image)
     luminance, chrominance = planes[:, :1] * unclipped[0], planes[:, 1:]
     chrominance = (
-        _widened(_repeated(avg_pool2d(chrominance, 2) * unclipped[1], half_sizes))
+        _widen(_repeat_border(avg_pool2d(chrominance, 2) * unclipped[1], half_sizes))
         if is_subsampled
         else chrominance * unclipped[1]
     )
-    return _straight(_mixed(from_ycbcr, torch.cat([luminance, chrominance], 1)) * is_unclipped, codes)
+    return _straight(_mix_planes(from_ycbcr, torch.cat([luminance, chrominance], 1)) * is_unclipped, codes)
 
 
 def jpeg(image: Tensor, quality: int = 92, subsampling: str = "420", *, fast: bool | None = None) -> Tensor:
@@ -417,6 +417,6 @@ def jpeg(image: Tensor, quality: int = 92, subsampling: str = "420", *, fast: bo
     """
     block_pixels, (height, width) = block_of(subsampling), image.shape[2:]
     padded_size = (-(-height // block_pixels) * block_pixels, -(-width // block_pixels) * block_pixels)
-    padded = torch.stack([extended(entry, *padded_size) for entry in image])
+    padded = torch.stack([extend(entry, *padded_size) for entry in image])
     fast = quality < ACCURATE if fast is None else fast
-    return compressed(padded, [(height, width)] * len(image), quality, subsampling, fast=fast)[:, :, :height, :width]
+    return compress(padded, [(height, width)] * len(image), quality, subsampling, fast=fast)[:, :, :height, :width]

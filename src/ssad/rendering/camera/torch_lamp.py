@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ssad.core.errors import ConfigError
-from ssad.rendering.camera.lamps import Lamp
-from ssad.rendering.camera.render import Picture
+from ssad.rendering.camera.lamps import SceneLamp
+from ssad.rendering.camera.render import Rendering
 
 
 def lamp_light(
-    lamp: Lamp,
+    lamp: SceneLamp,
     position: Tensor,
     normal: Tensor,
     *,
@@ -78,12 +78,12 @@ def lamp_light(
     return torch.where(is_lit, irradiance, 0.0)[..., None] * colour * power / area
 
 
-def shine(picture: Picture, light: Tensor) -> Tensor:
-    """What light that is added to the surfaces of a picture adds to its radiance.
+def shine(rendering: Rendering, added_light: Tensor) -> Tensor:
+    """Return the radiance that light added to the surfaces of an image contributes.
 
     Args:
-        picture: Rendered with `surface=True`.
-        light: Irradiance over pi of each pixel [B, H, W, 3], as `lamp_light` gives it for `picture.surface`.
+        rendering: Rendered with `surface=True`.
+        added_light: Irradiance over pi of each pixel [B, H, W, 3], as `lamp_light` gives it for `picture.surface`.
 
     Returns:
         To be added to `picture.radiance` [B, H, W, 3], before `ssad.rendering.camera.torch_sensor.develop`.
@@ -91,10 +91,10 @@ def shine(picture: Picture, light: Tensor) -> Tensor:
     Raises:
         ConfigError: The picture has no surface.
     """
-    surface = picture.surface
+    surface = rendering.surface
     if surface is None:
         raise ConfigError("this picture does not say what it shows: render it with surface=True")
     albedo, gain, irradiance = (
-        light.new_tensor(values) for values in (surface.albedo, surface.gain, surface.irradiance)
+        added_light.new_tensor(values) for values in (surface.albedo, surface.gain, surface.irradiance)
     )
-    return light * albedo * torch.where(irradiance > 0.0, gain / irradiance.clamp_min(1e-12), 0.0)
+    return added_light * albedo * torch.where(irradiance > 0.0, gain / irradiance.clamp_min(1e-12), 0.0)

@@ -1,8 +1,8 @@
 """Sensor of the camera in torch: the chain of `ssad.rendering.camera.render` from light to JPEG, with gradients.
 
 `develop` is the chain of `ssad.rendering.camera.sensor` and equals the renderer's images up to the rounding to 8 bits;
-`ssad.rendering.camera.torch_jpeg.jpeg` follows it. An attack changes few pixels: `Window` develops only those and
-the pixels that depend on them. Light above a full photosite or outside the curve has slope zero, as in the camera.
+`ssad.rendering.camera.torch_jpeg.jpeg` follows it. An attack changes few pixels: `ChangedWindow` develops only those
+and the pixels that depend on them. Light above a full photosite or outside the curve has slope zero, as in the camera.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ssad.rendering.camera.sensor import (
     OPPOSITE,
     SHOULDER,
     SMALLEST,
-    Sensor,
+    SensorModel,
     noise_levels,
     point_spread,
 )
 from ssad.rendering.camera.texture import Taps
-from ssad.rendering.camera.torch_jpeg import ACCURATE, block_of, compressed, extended, quantisation
+from ssad.rendering.camera.torch_jpeg import ACCURATE, block_of, compress, extend, quantisation
 
 TOP = 0.99975 * BRIGHTEST  # light at which the curve is cut off
 TOE = 0.0031308  # light below which sRGB is linear
@@ -56,10 +56,10 @@ def _lens_weights(blur: float, device: torch.device, dtype: torch.dtype) -> tupl
     for site, colour in enumerate((0, 1, 1, 2)):
         y, x = divmod(site, 2)
         square_weights[site, colour, y : y + 3, x : x + 3] = spread
-    return _kept(spread, device, dtype), _kept(square_weights, device, dtype)
+    return _constant(spread, device, dtype), _constant(square_weights, device, dtype)
 
 
-def _kept(values: np.ndarray, device: torch.device, dtype: torch.dtype) -> Tensor:
+def _constant(values: np.ndarray, device: torch.device, dtype: torch.dtype) -> Tensor:
     """Return a constant tensor that is valid in later calls, whatever the mode of this one."""
     # A tensor made in inference mode could not take part in autograd later.
     with torch.inference_mode(mode=False):
@@ -84,17 +84,17 @@ def _demosaic_weights(device: torch.device, dtype: torch.dtype) -> Tensor:
         for site, weights in enumerate(sites):
             y, x = divmod(site, 2)
             square[4 * colour + site, 0, y : y + 5, x : x + 5] = np.array(weights) / 8
-    return _kept(square, device, dtype)
+    return _constant(square, device, dtype)
 
 
-def _squares(picture: Tensor, weights: Tensor, border: int) -> Tensor:
+def _squares(image: Tensor, weights: Tensor, border: int) -> Tensor:
     """A picture [B, C, H, W], mirrored at its borders, in squares of four: [B, C', H, W]."""
-    height, width = picture.shape[2:]
-    padded = pad(picture, (border, border + width % 2, border, border + height % 2), mode="reflect")
+    height, width = image.shape[2:]
+    padded = pad(image, (border, border + width % 2, border, border + height % 2), mode="reflect")
     return pixel_shuffle(conv2d(padded, weights, stride=2), 2)[:, :, :height, :width]
 
 
-def photosites(light: Tensor, sensor: Sensor) -> Tensor:
+def photosites(light: Tensor, sensor: SensorModel) -> Tensor:
     """Return the light on the photosites: the lens's point spread, and one colour for each with a mosaic.
 
     Args:
@@ -118,7 +118,7 @@ def photosites(light: Tensor, sensor: Sensor) -> Tensor:
     return conv2d(pad(colours, (1, 1, 1, 1), mode="reflect"), kernel, groups=3).permute(0, 2, 3, 1)
 
 
-def fill(light: Tensor, exposure: Tensor | float, sensor: Sensor, noise: Tensor | None = None) -> Tensor:
+def fill(light: Tensor, exposure: Tensor | float, sensor: SensorModel, noise: Tensor | None = None) -> Tensor:
     """Return the content of the photosites: light with noise, clipped where they are full, with slope zero there.
 
     Args:
@@ -169,7 +169,7 @@ def curve(light: Tensor) -> Tensor:
     return encoded
 
 
-def _soft(light: Tensor) -> tuple[Tensor, Tensor]:
+def _shoulder(light: Tensor) -> tuple[Tensor, Tensor]:
     """Return light in 0..4 under the shoulder, and the remaining share of a change of it."""
     remaining_slope = torch.exp((KNEE - light.clamp_min(KNEE)) / SHOULDER)
     return light.clamp_max(KNEE) + (1 - KNEE) * (1 - remaining_slope), remaining_slope
@@ -181,7 +181,7 @@ class _Curve(torch.autograd.Function):
     @staticmethod
     def forward(context: Any, light: Tensor) -> Tensor:
         context.save_for_backward(light)
-        shouldered, _ = _soft(light.clamp(0.0, TOP))
+        shouldered, _ = _shoulder(light.clamp(0.0, TOP))
         return torch.where(
             shouldered <= TOE, shouldered * 12.92, 1.055 * shouldered.clamp_min(TOE) ** (1 / 2.4) - 0.055
         )
@@ -189,7 +189,7 @@ class _Curve(torch.autograd.Function):
     @staticmethod
     def backward(context: Any, slope: Tensor) -> Tensor:
         (light,) = context.saved_tensors
-        shouldered, remaining_slope = _soft(light.clamp(0.0, TOP))
+        shouldered, remaining_slope = _shoulder(light.clamp(0.0, TOP))
         encoding_slope = torch.where(
             shouldered <= TOE, 12.92, (1.055 / 2.4) * shouldered.clamp_min(TOE) ** (1 / 2.4 - 1)
         )
@@ -198,7 +198,7 @@ class _Curve(torch.autograd.Function):
         return gradient
 
 
-def draw_noise(shape: Sequence[int], sensor: Sensor, generator: torch.Generator) -> Tensor:
+def draw_noise(shape: Sequence[int], sensor: SensorModel, generator: torch.Generator) -> Tensor:
     """Draw a sample of noise for `develop`: standard normal numbers.
 
     Args:
@@ -235,7 +235,7 @@ def large_draws(generators: Sequence[torch.Generator], device: torch.device) -> 
 def develop(
     radiance: Tensor,
     exposure: Tensor | float,
-    sensor: Sensor = DEFAULT_SENSOR,
+    sensor: SensorModel = DEFAULT_SENSOR,
     noise: Tensor | torch.Generator | None = None,
 ) -> Tensor:
     """Develop radiance into the camera's image, as `ssad.rendering.camera.render` does before it rounds to 8 bits.
@@ -286,24 +286,24 @@ def _rectangles(pixels: Tensor, shape: tuple[int, int, int]) -> list[Rectangle]:
     return list(zip(*spans, strict=True))
 
 
-def _grown(span: Span, margin: int, most: int, step: int = 1) -> Span:
+def _grow_span(span: Span, margin: int, limit: int, step: int = 1) -> Span:
     """A span with a margin, out to multiples of a step, in 0..most; an empty one stays empty."""
     if span[0] == span[1]:
         return span
-    return max((span[0] - margin) // step * step, 0), min(-(-(span[1] + margin) // step) * step, most)
+    return max((span[0] - margin) // step * step, 0), min(-(-(span[1] + margin) // step) * step, limit)
 
 
-def _alike(spans: Sequence[Span], most: int, step: int) -> list[Span]:
+def _equal_spans(spans: Sequence[Span], limit: int, step: int) -> list[Span]:
     """Spans of one length that hold given ones, in 0..most, at multiples of a step."""
     length = max(SMALLEST, *(last - first // step * step for first, last in spans))
     length = -(-length // step) * step
-    length = min(length + (most - length) % step, most)
-    starts = [min(first // step * step, most - length) for first, _ in spans]
+    length = min(length + (limit - length) % step, limit)
+    starts = [min(first // step * step, limit - length) for first, _ in spans]
     return [(start, start + length) for start in starts]
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ChangedWindow:
     """Part of images that changes when a few pixels do, and the part that it is developed from.
 
     All rectangles are spans of rows and of columns, one for each image; read and coded rectangles have one
@@ -320,7 +320,7 @@ class Window:
     """
 
     shape: tuple[int, int, int]
-    sensor: Sensor
+    sensor: SensorModel
     changed: tuple[Rectangle, ...]
     read: tuple[Rectangle, ...]
     coded: tuple[Rectangle, ...]
@@ -331,11 +331,11 @@ class Window:
     def around(
         pixels: Tensor,
         shape: Sequence[int],
-        sensor: Sensor,
+        sensor: SensorModel,
         *,
         quality: int | None = None,
         subsampling: str = "420",
-    ) -> Window:
+    ) -> ChangedWindow:
         """Return the window that changes when the radiance of pixels does.
 
         Args:
@@ -359,21 +359,21 @@ class Window:
         changed = []
         for spans in _rectangles(pixels, (count, height, width)):
             rows, columns = (
-                _grown(_grown(span, sensor.reach, limit, block_side), block_margin, limit)
+                _grow_span(_grow_span(span, sensor.reach, limit, block_side), block_margin, limit)
                 for span, limit in zip(spans, (height, width), strict=True)
             )
             changed.append((rows, columns))
-        return Window.of(changed, shape, sensor, quality=quality, subsampling=subsampling)
+        return ChangedWindow.of(changed, shape, sensor, quality=quality, subsampling=subsampling)
 
     @staticmethod
     def of(
         changed: Sequence[Rectangle],
         shape: Sequence[int],
-        sensor: Sensor,
+        sensor: SensorModel,
         *,
         quality: int | None = None,
         subsampling: str = "420",
-    ) -> Window:
+    ) -> ChangedWindow:
         """Return the window that gives the developed values of rectangles.
 
         Args:
@@ -398,14 +398,14 @@ class Window:
         for axis, limit in enumerate((height, width)):
             padded_limit = -(-limit // block_side) * block_side
             blocks = [
-                _grown(_grown(rectangle[axis], block_margin, limit), 0, padded_limit, block_side)
+                _grow_span(_grow_span(rectangle[axis], block_margin, limit), 0, padded_limit, block_side)
                 for rectangle in changed
             ]
-            blocks = _alike(blocks, padded_limit, block_side)
+            blocks = _equal_spans(blocks, padded_limit, block_side)
             coded.append(blocks)
-            needed = [_grown((first, min(last, limit)), sensor.reach, limit) for first, last in blocks]
-            read.append(_alike(needed, limit, 2 if sensor.mosaic else 1))
-        return Window(
+            needed = [_grow_span((first, min(last, limit)), sensor.reach, limit) for first, last in blocks]
+            read.append(_equal_spans(needed, limit, 2 if sensor.mosaic else 1))
+        return ChangedWindow(
             (count, height, width),
             sensor,
             tuple(changed),
@@ -415,11 +415,11 @@ class Window:
             subsampling,
         )
 
-    def crop(self, picture: Tensor) -> Tensor:
-        """What the window reads of radiance or noise.
+    def crop(self, image: Tensor) -> Tensor:
+        """Return the part of radiance or noise that the window reads.
 
         Args:
-            picture: [B, H, W, ...].
+            image: [B, H, W, ...].
 
         Returns:
             [B, h, w, ...].
@@ -427,9 +427,9 @@ class Window:
         Raises:
             ConfigError: The pictures have another shape.
         """
-        if tuple(picture.shape[:3]) != self.shape:
-            raise ConfigError(f"a window of pictures {list(self.shape)}, not {list(picture.shape[:3])}")
-        return torch.stack([entry[slice(*y), slice(*x)] for entry, (y, x) in zip(picture, self.read, strict=True)])
+        if tuple(image.shape[:3]) != self.shape:
+            raise ConfigError(f"a window of pictures {list(self.shape)}, not {list(image.shape[:3])}")
+        return torch.stack([entry[slice(*y), slice(*x)] for entry, (y, x) in zip(image, self.read, strict=True)])
 
     def taps(self, taps: Taps) -> Taps:
         """Return the taps with pixels relative to the radiance that `crop` returns.
@@ -479,30 +479,28 @@ class Window:
             image = developed[:, :, top : top + part_height, left : left + part_width]
         else:
             for single, (top, left), (part_height, part_width) in zip(developed, corners, sizes, strict=True):
-                extended_parts.append(
-                    extended(single[:, top : top + part_height, left : left + part_width], *coded_size)
-                )
+                extended_parts.append(extend(single[:, top : top + part_height, left : left + part_width], *coded_size))
             image = torch.stack(extended_parts)
         if self.quality is None:
             return image
-        return compressed(image, sizes, self.quality, self.subsampling, fast=self.quality < ACCURATE)
+        return compress(image, sizes, self.quality, self.subsampling, fast=self.quality < ACCURATE)
 
-    def paste(self, developed: Tensor, picture: Tensor) -> Tensor:
+    def paste(self, developed: Tensor, image: Tensor) -> Tensor:
         """Whole pictures with the window's part renewed.
 
         Args:
             developed: What `develop` gives.
-            picture: The pictures before, [B, 3, H, W]; uint8 as codes.
+            image: The pictures before, [B, 3, H, W]; uint8 as codes.
 
         Returns:
             [B, 3, H, W]; differentiable in both, but not in codes.
         """
-        pasted: Tensor = _Paste.apply(developed, picture, self.changed, self.coded)
+        pasted: Tensor = _Paste.apply(developed, image, self.changed, self.coded)
         return pasted
 
 
 class _Paste(torch.autograd.Function):
-    """Autograd function of `Window.paste`: one copy an image each way; slices would copy whole images."""
+    """Autograd function of `ChangedWindow.paste`: one copy an image each way; slices would copy whole images."""
 
     @staticmethod
     def forward(
@@ -538,7 +536,7 @@ def _size(rectangle: Rectangle) -> tuple[int, int]:
 def develop_at(
     radiance: Tensor,
     exposure: Tensor | float,
-    sensor: Sensor,
+    sensor: SensorModel,
     pixels: Tensor,
     noise: Tensor | None = None,
     *,
@@ -564,7 +562,7 @@ def develop_at(
     """
     count, height, width = radiance.shape[:3]
     rectangles = _rectangles(pixels, (count, height, width))
-    window = Window.of(rectangles, radiance.shape[:3], sensor, quality=quality, subsampling=subsampling)
+    window = ChangedWindow.of(rectangles, radiance.shape[:3], sensor, quality=quality, subsampling=subsampling)
     developed = window.develop(window.crop(radiance), exposure, None if noise is None else window.crop(noise))
     image_index = pixels // (height * width)
     corner = torch.tensor([[rows[0], columns[0]] for rows, columns in window.coded], device=pixels.device)[image_index]

@@ -130,26 +130,28 @@ class _Reader:
         for child in node.get("children", []):
             self.node(child, matrix, (*above, index))
 
-    def primitive(self, data: dict[str, Any], matrix: F64, name: str, where: str) -> None:
+    def primitive(self, data: dict[str, Any], matrix: F64, name: str, location: str) -> None:
         attributes = data["attributes"]
         mode = data.get("mode", 4)
         if mode not in (4, 5, 6):
             return  # points and lines have no surface
-        points = self.accessor(attributes["POSITION"], "VEC3", where)
+        points = self.accessor(attributes["POSITION"], "VEC3", location)
         if "TEXCOORD_0" not in attributes:
-            raise self.fail(f"{where}: no texture coordinates (UVs); unwrap the mesh before the export")
-        uv = self.accessor(attributes["TEXCOORD_0"], "VEC2", where)
+            raise self.fail(f"{location}: no texture coordinates (UVs); unwrap the mesh before the export")
+        uv = self.accessor(attributes["TEXCOORD_0"], "VEC2", location)
         normals = (
-            self.accessor(attributes["NORMAL"], "VEC3", where) if "NORMAL" in attributes else np.zeros_like(points)
+            self.accessor(attributes["NORMAL"], "VEC3", location) if "NORMAL" in attributes else np.zeros_like(points)
         )
         if not len(points) == len(uv) == len(normals):
-            raise self.fail(f"{where}: attributes have different lengths")
+            raise self.fail(f"{location}: attributes have different lengths")
         if "indices" in data:
-            indices = self.accessor(data["indices"], "SCALAR", where)[:, 0].astype(np.int64)
+            indices = self.accessor(data["indices"], "SCALAR", location)[:, 0].astype(np.int64)
         else:
             indices = np.arange(len(points))
         if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
-            raise self.fail(f"{where}: index {int(indices.max())} is out of range (there are {len(points)} vertices)")
+            raise self.fail(
+                f"{location}: index {int(indices.max())} is out of range (there are {len(points)} vertices)"
+            )
         faces = _triangles(indices, mode)
         self.faces += len(faces)
         if self.faces > MAX_FACES:
@@ -157,7 +159,7 @@ class _Reader:
         linear = matrix[:3, :3]
         determinant = float(np.linalg.det(linear))
         if abs(determinant) < 1e-18:
-            raise self.fail(f"{where}: its node has a singular matrix")
+            raise self.fail(f"{location}: its node has a singular matrix")
         # A mirroring node turns its faces inside out.
         if determinant < 0.0:
             faces = faces[:, ::-1]
@@ -173,7 +175,7 @@ class _Reader:
         group = self.triangles.groups.index(name)
         self.triangles.add(positions[faces], uv[faces], face_normals[faces], material=material_index, group=group)
 
-    def accessor(self, index: int, kind: str, where: str) -> F64:
+    def accessor(self, index: int, kind: str, location: str) -> F64:
         """Values [n, width] of an accessor as float64."""
         description = self.item("accessors", index)
         label = f"accessors[{index}]"
@@ -182,7 +184,7 @@ class _Reader:
         if description.get("type") != kind or description.get("componentType") not in _TYPES:
             raise self.fail(
                 f"{label}: type {description.get('type')} of {description.get('componentType')} "
-                f"where {kind} is needed ({where})"
+                f"where {kind} is needed ({location})"
             )
         count, width = int(description["count"]), _WIDTHS[kind]
         if not 0 <= count <= 3 * MAX_VERTICES:

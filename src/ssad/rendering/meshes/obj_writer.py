@@ -50,10 +50,11 @@ def write_obj(path: Path, mesh: Mesh, *, texture: str | None = None) -> None:
     safeio.write_atomic(path.with_suffix(".mtl"), "\n\n".join(blocks) + "\n")
 
 
-def _material(one: Material) -> str:
+def _material(material: Material) -> str:
     """A material as MTL has it."""
-    colour: F64 = np.asarray(one.colour, np.float64)
+    colour: F64 = np.asarray(material.colour, np.float64)
     diffuse, specular, emission = (
-        " ".join(f"{value:.4g}" for value in row) for row in (colour, [one.specular] * 3, colour * one.emission)
+        " ".join(f"{value:.4g}" for value in row)
+        for row in (colour, [material.specular] * 3, colour * material.emission)
     )
-    return f"newmtl {one.name}\nKd {diffuse}\nKs {specular}\nNs {10 + 200 * one.gloss:.4g}\nKe {emission}"
+    return f"newmtl {material.name}\nKd {diffuse}\nKs {specular}\nNs {10 + 200 * material.gloss:.4g}\nKe {emission}"

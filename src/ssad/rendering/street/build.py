@@ -16,7 +16,7 @@ from ssad.rendering.street.dressing import Masts, furnish, light_streets, plant,
 from ssad.rendering.street.free_ground import FreeGround, sides
 from ssad.rendering.street.markings import paint
 from ssad.rendering.street.model import FORMAT, TILE, Street, load_street, save_street
-from ssad.rendering.street.palette import STYLES, Look, style_of
+from ssad.rendering.street.palette import STYLES, TownMaterials, style_of
 from ssad.rendering.street.paving import pave
 from ssad.rendering.street.plots import fill_blocks, line_streets
 from ssad.rendering.street.region import survey
@@ -40,7 +40,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     """
     graph = load_town(town) if isinstance(town, str) else town
     name = style_of(graph.name, style)
-    materials = Look(STYLES[name], Palette(), generator("street", graph.name, seed, name))
+    materials = TownMaterials(STYLES[name], Palette(), generator("street", graph.name, seed, name))
     builder, ground = TriangleBuilder(), survey(graph)
     free_ground, masts, street_sides = FreeGround(graph, ground), Masts(), sides(graph)
     # The order matters: each step occupies free ground and draws from the same generator.

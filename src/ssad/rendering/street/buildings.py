@@ -21,28 +21,28 @@ from ssad.rendering.street.facades import (
     walls,
 )
 from ssad.rendering.street.model import NEAR
-from ssad.rendering.street.palette import Look
-from ssad.rendering.street.triangles import Piece, box, flat, join
+from ssad.rendering.street.palette import TownMaterials
+from ssad.rendering.street.triangles import TrianglePiece, box, flat, join
 
 Size = tuple[float, float]  # m: width of the front, depth
 
 
-def draw_size(kind: str, look: Look) -> Size:
+def draw_size(kind: str, look: TownMaterials) -> Size:
     """Front and depth of a building of a kind, m."""
     front, depth = np.round(look.generator.uniform(*SIZES[kind]), 1).tolist()
     return front, depth
 
 
-def draw_building(kind: str, size: Size, look: Look) -> Piece:
+def draw_building(kind: str, size: Size, look: TownMaterials) -> TrianglePiece:
     """A building of a kind and size (front, depth)."""
     return join(KINDS[kind](size, look))
 
 
-def _masonry(look: Look) -> int:
+def _masonry(look: TownMaterials) -> int:
     return look.pick(str(look.generator.choice(["plaster", "plaster", "brick"])))
 
 
-def _chimney(x: float, y: float, top: float, look: Look) -> Piece:
+def _chimney(x: float, y: float, top: float, look: TownMaterials) -> TrianglePiece:
     brick = look.walls["brick"][0]
     return join(
         [
@@ -54,9 +54,11 @@ def _chimney(x: float, y: float, top: float, look: Look) -> Piece:
     )
 
 
-def _dormers(count: int, width: float, y: float, z: float, look: Look, *, wall: int, roof: int) -> list[Piece]:
+def _dormers(
+    count: int, width: float, y: float, z: float, look: TownMaterials, *, wall: int, roof: int
+) -> list[TrianglePiece]:
     """Windows that stand out of the front of a roof."""
-    parts: list[Piece] = []
+    parts: list[TrianglePiece] = []
     for x in rows(width, count, 1.5).tolist():
         left_edge = x - width / 2
         extent = (left_edge, left_edge + 1.5), (y, y + 2.4), (z, z + 1.5)
@@ -67,7 +69,7 @@ def _dormers(count: int, width: float, y: float, z: float, look: Look, *, wall: 
     return parts
 
 
-def _terrace(size: Size, look: Look, *, shop: bool = False) -> list[Piece]:
+def _terrace(size: Size, look: TownMaterials, *, shop: bool = False) -> list[TrianglePiece]:
     """A house in a row: bare side walls, roof with its ridge along the street."""
     rng, (width, depth) = look.generator, size
     storey, floors = rng.uniform(2.8, 3.3), int(rng.integers(2, 5 if look.style.old else 4))
@@ -117,11 +119,11 @@ def _terrace(size: Size, look: Look, *, shop: bool = False) -> list[Piece]:
     return parts
 
 
-def _shop(size: Size, look: Look) -> list[Piece]:
+def _shop(size: Size, look: TownMaterials) -> list[TrianglePiece]:
     return _terrace(size, look, shop=True)
 
 
-def _shop_front(w: float, ground: float, front: Wall, look: Look) -> list[Piece]:
+def _shop_front(w: float, ground: float, front: Wall, look: TownMaterials) -> list[TrianglePiece]:
     """Large windows, a door, a sign board and an awning on the ground floor."""
     rng = look.generator
     trim = look.pick("door")
@@ -155,7 +157,7 @@ def _shop_front(w: float, ground: float, front: Wall, look: Look) -> list[Piece]
     return parts
 
 
-def _house(size: Size, look: Look, *, floors: int = 2) -> list[Piece]:
+def _house(size: Size, look: TownMaterials, *, floors: int = 2) -> list[TrianglePiece]:
     """A detached house: gable or hip roof, windows all round, often a lower wing with a garage."""
     rng, (width, depth) = look.generator, size
     storey = rng.uniform(2.6, 2.9)
@@ -205,11 +207,11 @@ def _house(size: Size, look: Look, *, floors: int = 2) -> list[Piece]:
     return parts
 
 
-def _bungalow(size: Size, look: Look) -> list[Piece]:
+def _bungalow(size: Size, look: TownMaterials) -> list[TrianglePiece]:
     return _house(size, look, floors=1)
 
 
-def _flats(size: Size, look: Look) -> list[Piece]:
+def _flats(size: Size, look: TownMaterials) -> list[TrianglePiece]:
     """A block of flats with balconies."""
     rng, (width, depth) = look.generator, size
     storey, floors = 2.9, int(rng.integers(3, 7))
@@ -234,7 +236,7 @@ def _flats(size: Size, look: Look) -> list[Piece]:
         columns = rows(width, bay_count, 2.4)[1 :: max(2, bay_count // 3)]
         columns = columns[(columns > 0.2) & (columns < width - 2.6)]
         xx, zz = (grid_values.reshape(-1) for grid_values in np.meshgrid(columns, storey * np.arange(1, floors)))
-        parts += balcony(sides[0], xx, zz, 2.4, look, deep=min(1.2, 0.5 * max(0.8, look.style.setback[0] + 0.8)))
+        parts += balcony(sides[0], xx, zz, 2.4, look, depth=min(1.2, 0.5 * max(0.8, look.style.setback[0] + 0.8)))
     if rng.random() < 0.55:
         parts += flat_roof(x, y, roof_height, look, coping=look.palette.shade(material, 0.8))
     else:
@@ -244,7 +246,7 @@ def _flats(size: Size, look: Look) -> list[Piece]:
     return parts
 
 
-def _office(size: Size, look: Look, *, floors: int | None = None) -> list[Piece]:
+def _office(size: Size, look: TownMaterials, *, floors: int | None = None) -> list[TrianglePiece]:
     """Offices: bands of glass, a grid of windows or a curtain wall; a glazed ground floor; flat roof."""
     rng, (width, depth) = look.generator, size
     storey, floor_count = 3.6, floors or int(rng.integers(3, 8))
@@ -286,11 +288,11 @@ def _office(size: Size, look: Look, *, floors: int | None = None) -> list[Piece]
     return parts + flat_roof(x, y, roof_height, look, coping=look.palette.shade(material, 0.8), plant=4)
 
 
-def _tower(size: Size, look: Look) -> list[Piece]:
+def _tower(size: Size, look: TownMaterials) -> list[TrianglePiece]:
     return _office(size, look, floors=int(look.generator.integers(9, 15)))
 
 
-def _hall(size: Size, look: Look) -> list[Piece]:
+def _hall(size: Size, look: TownMaterials) -> list[TrianglePiece]:
     """A warehouse: metal sheet, roller doors, a strip of windows, a low roof."""
     rng, (width, depth) = look.generator, size
     eaves_height = rng.uniform(5.5, 8.5)
@@ -329,7 +331,7 @@ def _hall(size: Size, look: Look) -> list[Piece]:
     return parts
 
 
-def _shed(size: Size, look: Look) -> list[Piece]:
+def _shed(size: Size, look: TownMaterials) -> list[TrianglePiece]:
     """A garden shed or garage."""
     (width, depth), eaves_height = size, look.generator.uniform(2.1, 2.7)
     x, y = (-width / 2, width / 2), (0.0, depth)
@@ -339,7 +341,7 @@ def _shed(size: Size, look: Look) -> list[Piece]:
     return parts + door(walls(x, y, (0.0, eaves_height))[0], width / 2, look, size=(min(1.6, width - 0.8), 1.9))
 
 
-def _chapel(size: Size, look: Look) -> list[Piece]:
+def _chapel(size: Size, look: TownMaterials) -> list[TrianglePiece]:
     """A church: a nave with a steep roof and a tower with a spire at the front."""
     (width, depth), stone = size, int(look.generator.choice(look.stone))
     x, y, eaves_height, roof = (-width / 2, width / 2), (4.0, depth), 8.0, look.pick("roof_tiles")
@@ -364,7 +366,7 @@ def _chapel(size: Size, look: Look) -> list[Piece]:
     return parts + door(walls(*tower, (0.0, tower_height))[0], 2.6, look, size=(1.8, 2.9))
 
 
-KINDS: Mapping[str, Callable[[Size, Look], list[Piece]]] = {
+KINDS: Mapping[str, Callable[[Size, TownMaterials], list[TrianglePiece]]] = {
     "terrace": _terrace,
     "shop": _shop,
     "house": _house,

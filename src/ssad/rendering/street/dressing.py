@@ -10,7 +10,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.rendering.street.free_ground import CELL, FreeGround, Side
 from ssad.rendering.street.furniture import bench, bollard, lamp, litter_bin, planter, shelter, sign, signal_mast
 from ssad.rendering.street.model import NEAR
-from ssad.rendering.street.palette import Look
+from ssad.rendering.street.palette import TownMaterials
 from ssad.rendering.street.paving import EARTH, KERB
 from ssad.rendering.street.plants import bush, tree
 from ssad.rendering.street.triangles import TriangleBuilder, flat
@@ -28,7 +28,9 @@ class Masts:
     lens: list[list[tuple[int, int]]] = field(default_factory=list)
 
 
-def light_streets(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Side], masts: Masts) -> None:
+def light_streets(
+    soup: TriangleBuilder, site: FreeGround, look: TownMaterials, sides: list[Side], masts: Masts
+) -> None:
     """Lamps along one side of each street, by turns, at the kerb."""
     lamp_piece, (reach, height) = lamp(look)
     poses = []
@@ -51,7 +53,7 @@ def _kerb(side: Side) -> float:
     return BIN_ROOM - side.kerb if side.kerb else 0.9
 
 
-def signals(soup: TriangleBuilder, graph: LaneGraph, site: FreeGround, look: Look, masts: Masts) -> None:
+def signals(soup: TriangleBuilder, graph: LaneGraph, site: FreeGround, look: TownMaterials, masts: Masts) -> None:
     """Masts at the signals of the map, turned to their approach; give-way signs where a junction has none.
 
     The stop and yield signs of the map are bodies of their own: only their ground is taken here.
@@ -66,7 +68,7 @@ def signals(soup: TriangleBuilder, graph: LaneGraph, site: FreeGround, look: Loo
     for signal_index, (x, y) in enumerate(graph.signal_xy.astype(float).tolist()):
         yaw = float(graph.signal_yaw[signal_index]) + np.pi
         # Some signals of the map stand too close to the road: move them a little.
-        position = _moved(site, (x, y), float(graph.signal_yaw[signal_index]))
+        position = _clear_position(site, (x, y), float(graph.signal_yaw[signal_index]))
         if position is None:
             continue
         if graph.signal_virtual[signal_index]:
@@ -94,7 +96,7 @@ def signals(soup: TriangleBuilder, graph: LaneGraph, site: FreeGround, look: Loo
             )
 
 
-def _moved(site: FreeGround, xy: tuple[float, float], yaw: float) -> tuple[float, float] | None:
+def _clear_position(site: FreeGround, xy: tuple[float, float], yaw: float) -> tuple[float, float] | None:
     """Return the position, or the first one up to 2 m to the right of the traffic that is clear; None if none is."""
     for outward in (0.0, 0.25, 0.5, 1.0, 1.5, 2.0):
         for forward in (0.0, 0.4, 0.8):
@@ -105,7 +107,7 @@ def _moved(site: FreeGround, xy: tuple[float, float], yaw: float) -> tuple[float
     return None
 
 
-def furnish(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Side]) -> None:
+def furnish(soup: TriangleBuilder, site: FreeGround, look: TownMaterials, sides: list[Side]) -> None:
     """Signs, street trees, benches, bins, bollards and shelters on the sidewalks."""
     rng, style = look.generator, look.style
     stock = {"bench": bench(look), "bin": litter_bin(look), "bollard": bollard(look), "shelter": shelter(look)}
@@ -118,7 +120,7 @@ def furnish(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Sid
             tree_piece = trees[int(rng.integers(len(trees)))]
             for tree_index in range(int(side.length / style.rows)):
                 x, y, yaw = side.pose((tree_index + 0.5) * style.rows + float(rng.normal(0, 0.8)), 1.1)
-                if site.free((x, y), away=0.6) and rng.random() < 0.85:
+                if site.free((x, y), distance=0.6) and rng.random() < 0.85:
                     scale = rng.uniform(0.7, 1.0) * np.ones(3)
                     soup.place(tree_piece, [(x, y, EARTH, rng.uniform(0, 6.28))], scale=scale[None])
                     site.take(
@@ -162,7 +164,10 @@ def furnish(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Sid
 
 
 def plant(
-    soup: TriangleBuilder, site: FreeGround, look: Look, parks: list[tuple[tuple[float, float, float], float, float]]
+    soup: TriangleBuilder,
+    site: FreeGround,
+    look: TownMaterials,
+    parks: list[tuple[tuple[float, float, float], float, float]],
 ) -> None:
     """Trees and bushes on open ground, denser in parks and around the town; patches of dry grass and soil."""
     rng, style = look.generator, look.style
@@ -186,7 +191,7 @@ def plant(
             if is_inside and rng.random() < 0.25:
                 continue
         outline = point + 1.6 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-        if not site.free(outline, away=1.4):
+        if not site.free(outline, distance=1.4):
             continue
         site.take(outline)
         tree_index = int(rng.integers(len(tree_pieces)))
@@ -196,7 +201,7 @@ def plant(
         soup.place(tree_pieces[tree_index], poses, scale=np.array(tree_scales[tree_index]))
     for _ in range(int(1.2 * tree_count)):
         point = rng.uniform(site.low + 4.0, site.high - 4.0)
-        if site.free(point + 0.7 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]), away=1.0):
+        if site.free(point + 0.7 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]), distance=1.0):
             soup.place(
                 shrubs[int(rng.integers(len(shrubs)))],
                 [(*point, EARTH - 0.03, rng.uniform(0.0, 6.28))],
@@ -211,7 +216,7 @@ def plant(
             1.4,
             1.0,
         ]
-        if site.free(outline, away=4.5):
+        if site.free(outline, distance=4.5):
             material = look.lawn if style.old else look.dry if rng.random() < 0.6 else look.soil
             corners = np.column_stack([outline, np.full(9, EARTH + 0.006)])[None]
             soup.add(flat(corners, material, levels=NEAR), point)

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from ssad.rendering.meshes.mesh import F64
 from ssad.rendering.street.model import MID, NEAR
-from ssad.rendering.street.palette import Look
-from ssad.rendering.street.triangles import ALL, Piece, box, flat
+from ssad.rendering.street.palette import TownMaterials
+from ssad.rendering.street.triangles import ALL, TrianglePiece, box, flat
 
 VISIBLE = NEAR | MID
 PARAPET = 0.7  # m, of flat roofs
@@ -32,8 +32,10 @@ class Wall:
         """Unit vector outwards."""
         return np.array([self.along[1], -self.along[0], 0.0])
 
-    def quads(self, x: npt.ArrayLike, z: npt.ArrayLike, wide: npt.ArrayLike, high: npt.ArrayLike, away: float) -> F64:
-        """Rectangles [n, 4, 3] on the wall: left edges x, lower edges z, `away` m before it."""
+    def quads(
+        self, x: npt.ArrayLike, z: npt.ArrayLike, wide: npt.ArrayLike, high: npt.ArrayLike, distance: float
+    ) -> F64:
+        """Rectangles [n, 4, 3] on the wall: left edges x, lower edges z, `distance` m before it."""
         left_edges, lower_edges, widths, heights = np.broadcast_arrays(
             *(np.atleast_1d(np.asarray(value, np.float64)) for value in (x, z, wide, high))
         )
@@ -43,7 +45,7 @@ class Wall:
             (left_edges + widths, lower_edges + heights),
             (left_edges, lower_edges + heights),
         ]
-        base = self.foot + away * self.out
+        base = self.foot + distance * self.out
         return np.stack(
             [
                 base + left_edges[:, None] * self.along + lower_edges[:, None] * UP
@@ -64,7 +66,7 @@ def walls(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]
     ]
 
 
-def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], material: int) -> Piece:
+def block(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], material: int) -> TrianglePiece:
     """Return the four walls of a block, without top."""
     return flat(
         np.concatenate([wall.quads(0.0, 0.0, wall.length, wall.height, 0.0) for wall in walls(x, y, z)]), material
@@ -76,12 +78,12 @@ def panes(
     x: F64,
     z: F64,
     size: tuple[float, float],
-    look: Look,
+    look: TownMaterials,
     *,
     frame: int,
     sill: bool = True,
     blinds: float = 0.15,
-) -> list[Piece]:
+) -> list[TrianglePiece]:
     """Windows of one size (width, height) with lower left corners x [n], z [n]; some have blinds drawn."""
     x, z = (np.atleast_1d(np.asarray(value, np.float64)) for value in (x, z))
     if not len(x):
@@ -111,17 +113,17 @@ def panes(
     return parts
 
 
-def rows(length: float, count: int, wide: float, *, margin: float = 0.0) -> F64:
+def rows(length: float, count: int, width: float, *, margin: float = 0.0) -> F64:
     """Left edges of `count` things of one width spread evenly over a length."""
     bay_width = (length - 2 * margin) / max(count, 1)
-    return np.asarray(margin + bay_width * (np.arange(count) + 0.5) - wide / 2)
+    return np.asarray(margin + bay_width * (np.arange(count) + 0.5) - width / 2)
 
 
 def grid(
     wall: Wall,
     floors: int,
     storey: float,
-    look: Look,
+    look: TownMaterials,
     *,
     size: tuple[float, float],
     bay: float,
@@ -130,7 +132,7 @@ def grid(
     ground: float = 0.0,
     sill: bool = True,
     skip: F64 | None = None,
-) -> list[Piece]:
+) -> list[TrianglePiece]:
     """Windows in rows of floors `first`... and columns about `bay` m apart; skip: x of columns that have none below."""
     count = int(wall.length // bay)
     if count < 1 or floors <= first:
@@ -145,7 +147,7 @@ def grid(
     return panes(wall, xx, zz, size, look, frame=frame, sill=sill)
 
 
-def door(wall: Wall, x: float, look: Look, *, size: tuple[float, float] = (1.0, 2.1)) -> list[Piece]:
+def door(wall: Wall, x: float, look: TownMaterials, *, size: tuple[float, float] = (1.0, 2.1)) -> list[TrianglePiece]:
     """A door in a frame, its middle at x, with a step."""
     width, height = size
     left = x - width / 2
@@ -166,7 +168,7 @@ def gable(
     across: bool = False,
     eaves: float = 0.4,
     hip: float = 0.0,
-) -> list[Piece]:
+) -> list[TrianglePiece]:
     """Return a pitched roof over a block.
 
     Args:
@@ -305,11 +307,11 @@ def flat_roof(
     x: tuple[float, float],
     y: tuple[float, float],
     z: float,
-    look: Look,
+    look: TownMaterials,
     *,
     coping: int,
     plant: int = 2,
-) -> list[Piece]:
+) -> list[TrianglePiece]:
     """A flat roof with a parapet above z and boxes of building services."""
     rng = look.generator
     # m, thickness of the parapet
@@ -343,13 +345,15 @@ def flat_roof(
     return parts
 
 
-def balcony(wall: Wall, x: F64, z: F64, wide: float, look: Look, *, deep: float = 1.2) -> list[Piece]:
+def balcony(
+    wall: Wall, x: F64, z: F64, widths: float, look: TownMaterials, *, depth: float = 1.2
+) -> list[TrianglePiece]:
     """Balconies: slabs and railings before a wall, left edges x [n], floors at z [n]."""
     count = len(x)
     if not count:
         return []
     corners = wall.foot + x[:, None] * wall.along + z[:, None] * UP
-    across, forward = wide * wall.along, deep * wall.out
+    across, forward = widths * wall.along, depth * wall.out
     slab_corners = [corners, corners + forward, corners + forward + across, corners + across]
     slab_height, rail_height = 0.16 * UP, 1.05 * UP
     quads = [

@@ -25,27 +25,31 @@ class FreeGround:
         self.graph, self.ground = graph, ground
         self.low = np.array(ground.origin)
         rows, columns = ground.road.shape
-        self.taken = np.zeros((int((rows - 1) / CELL), int((columns - 1) / CELL)), bool)
+        self.occupied = np.zeros((int((rows - 1) / CELL), int((columns - 1) / CELL)), bool)
         self.high = self.low + np.array([columns - 1, rows - 1], float)
         corners = [graph.crosswalk(index).astype(np.float64) for index in range(len(graph.crosswalk_offset) - 1)]
         self.crosswalks = np.array([polygon.mean(axis=0) for polygon in corners]).reshape(-1, 2)
 
-    def _cells(self, xy: F64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        cell = np.floor((xy - self.low) / CELL).astype(np.int64)
-        ny, nx = self.taken.shape
+    def _cells(self, points: F64) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        cell = np.floor((points - self.low) / CELL).astype(np.int64)
+        ny, nx = self.occupied.shape
         return np.clip(cell[:, 1], 0, ny - 1), np.clip(cell[:, 0], 0, nx - 1)
 
-    def free(self, xy: npt.ArrayLike, *, away: float) -> bool:
-        """Return whether all points [n, 2] are in the town, `away` m from road and sidewalk, and not occupied."""
+    def free(self, xy: npt.ArrayLike, *, distance: float) -> bool:
+        """Return whether all points [n, 2] are in the town, `distance` m from road and sidewalk, and not occupied."""
         points = np.asarray(xy, np.float64).reshape(-1, 2)
         # 2 m inside the raster: `_cells` clips and would test the wrong cells outside.
-        if (points < self.low + 2.0).any() or (points > self.high - 2.0).any() or self.taken[self._cells(points)].any():
+        if (
+            (points < self.low + 2.0).any()
+            or (points > self.high - 2.0).any()
+            or self.occupied[self._cells(points)].any()
+        ):
             return False
-        return bool((self.ground.at(self.ground.paved, points) >= away).all())
+        return bool((self.ground.at(self.ground.paved, points) >= distance).all())
 
-    def take(self, xy: npt.ArrayLike) -> None:
+    def take(self, points: npt.ArrayLike) -> None:
         """Mark the ground under points [n, 2] as occupied."""
-        self.taken[self._cells(np.asarray(xy, np.float64).reshape(-1, 2))] = True
+        self.occupied[self._cells(np.asarray(points, np.float64).reshape(-1, 2))] = True
 
     def clear(self, xy: npt.ArrayLike, *, size: float = 0.3, crossing: float = 1.5) -> bool:
         """Return whether an object may stand at points on a sidewalk or beside it.
@@ -58,7 +62,7 @@ class FreeGround:
             crossing: Distance to keep from crosswalks, m.
         """
         points = np.asarray(xy, np.float64).reshape(-1, 2)
-        if (self.ground.at(self.ground.drive, points) < KEEP + size).any() or self.taken[self._cells(points)].any():
+        if (self.ground.at(self.ground.drive, points) < KEEP + size).any() or self.occupied[self._cells(points)].any():
             return False
         return bool((self.crossing(points) > crossing + size).all())
 
@@ -75,15 +79,17 @@ class FreeGround:
         return distances
 
 
-def polygon_distance(xy: F64, corners: F64) -> F64:
+def polygon_distance(points: F64, corners: F64) -> F64:
     """Return the distance [n] of points from a polygon [m, 2]; 0 inside."""
     starts, ends = corners, np.roll(corners, -1, axis=0)
     edges = ends - starts
-    edge_share = np.einsum("nmi,mi->nm", xy[:, None] - starts, edges) / np.maximum((edges * edges).sum(axis=1), 1e-12)
+    edge_share = np.einsum("nmi,mi->nm", points[:, None] - starts, edges) / np.maximum(
+        (edges * edges).sum(axis=1), 1e-12
+    )
     edge_distance = np.hypot(
-        *np.moveaxis(xy[:, None] - starts - np.clip(edge_share, 0.0, 1.0)[..., None] * edges, -1, 0)
+        *np.moveaxis(points[:, None] - starts - np.clip(edge_share, 0.0, 1.0)[..., None] * edges, -1, 0)
     ).min(axis=1)
-    return np.where(in_polygon(xy, corners), 0.0, edge_distance)
+    return np.where(in_polygon(points, corners), 0.0, edge_distance)
 
 
 @dataclass(frozen=True)
@@ -105,23 +111,23 @@ class Side:
         """Length of the outer edge, m."""
         return float(self.edge.s[-1])
 
-    def pose(self, s: float, away: float = 0.0) -> tuple[float, float, float]:
+    def pose(self, arc_length: float, distance: float = 0.0) -> tuple[float, float, float]:
         """Return a pose beside the street; beyond the ends the line continues straight.
 
         Args:
-            s: Arc length along the edge, m.
-            away: Distance outwards from the edge, m; negative: towards the road.
+            arc_length: Arc length along the edge, m.
+            distance: Distance outwards from the edge, m; negative: towards the road.
 
         Returns:
             x, y (m) and the heading of the traffic (rad).
         """
         edge = self.edge
-        clamped = float(np.clip(s, 0.0, self.length))
+        clamped = float(np.clip(arc_length, 0.0, self.length))
         # Unwrapped, so that interpolation does not jump at pi.
         yaw = float(np.interp(clamped, edge.s, np.unwrap(edge.yaw)))
         x, y = (float(np.interp(clamped, edge.s, edge.xy[:, column])) for column in range(2))
-        overhang, cos, sin = s - clamped, np.cos(yaw), np.sin(yaw)
-        return x + overhang * cos + away * sin, y + overhang * sin - away * cos, yaw
+        overhang, cos, sin = arc_length - clamped, np.cos(yaw), np.sin(yaw)
+        return x + overhang * cos + distance * sin, y + overhang * sin - distance * cos, yaw
 
 
 def sides(graph: LaneGraph) -> list[Side]:

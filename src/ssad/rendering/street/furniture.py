@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssad.rendering.street.model import MID, NEAR
-from ssad.rendering.street.palette import Look
-from ssad.rendering.street.triangles import ALL, Piece, box, cylinder, flat, join
+from ssad.rendering.street.palette import TownMaterials
+from ssad.rendering.street.triangles import ALL, TrianglePiece, box, cylinder, flat, join
 
 VISIBLE = NEAR | MID
 LENS = 0.11  # m, radius of a signal's lens
@@ -22,14 +22,14 @@ def disc(
     sides: int = 10,
     turn: float = 0.0,
     levels: int = NEAR,
-) -> Piece:
+) -> TrianglePiece:
     """Return a flat disc that faces along x."""
     angles = turn + np.arange(sides) * 2.0 * np.pi / sides
     ring = np.column_stack([0 * angles, np.cos(angles), np.sin(angles)]) * radius + centre
     return flat(ring[None], material, levels=levels)
 
 
-def lamp(look: Look) -> tuple[Piece, tuple[float, float]]:
+def lamp(look: TownMaterials) -> tuple[TrianglePiece, tuple[float, float]]:
     """A street lamp, and the reach and height of its light, m."""
     if look.style.old:
         parts = [
@@ -62,13 +62,13 @@ class SignalMast:
         sides: Number of faces of a lens.
     """
 
-    piece: Piece
+    piece: TrianglePiece
     heads: tuple[tuple[float, float], ...]
     lens: tuple[tuple[int, int, int], ...]
     sides: int
 
 
-def signal_mast(look: Look, reach: float) -> SignalMast:
+def signal_mast(look: TownMaterials, reach: float) -> SignalMast:
     """A post with a head; with `reach` > 0 also an arm that holds a second head `reach` m over the road."""
     post = look.black if look.style.old else look.metal
     height = 6.2 if reach > 0.0 else 3.5
@@ -99,7 +99,7 @@ def signal_mast(look: Look, reach: float) -> SignalMast:
     return SignalMast(join(parts), tuple(heads), tuple(lens_of_heads), sides - 2)
 
 
-def sign(kind: str, look: Look) -> Piece:
+def sign(kind: str, look: TownMaterials) -> TrianglePiece:
     """A traffic sign on a post, facing along x: give_way, limit, crossing, parking."""
     sign_materials = look.sign
     parts = [cylinder((0.035, 0.035), (0.0, 2.75), look.metal, sides=5, levels=VISIBLE)]
@@ -117,7 +117,7 @@ def sign(kind: str, look: Look) -> Piece:
     back_vertices = back.vertices + np.array([0.045, 0, 0])
     # `disc` faces along x: reverse it to get the back.
     faces, uv = back.faces[:, ::-1].copy(), back.uv[:, ::-1]
-    parts.append(Piece(back_vertices, faces, -back.normals, uv, back.material, back.levels))
+    parts.append(TrianglePiece(back_vertices, faces, -back.normals, uv, back.material, back.levels))
     bars: dict[str, list[tuple[float, float, float, float]]] = {  # y0, z0, y1, z1 of letters, roughly
         "limit": [(-0.14, -0.11, -0.03, 0.11), (0.03, -0.11, 0.14, 0.11)],
         "parking": [(-0.1, -0.18, -0.03, 0.18), (-0.03, 0.0, 0.12, 0.18)],
@@ -128,7 +128,7 @@ def sign(kind: str, look: Look) -> Piece:
     return join(parts)
 
 
-def bench(look: Look) -> Piece:
+def bench(look: TownMaterials) -> TrianglePiece:
     """A bench that faces along x."""
     wood = look.wood[0]
     slats = np.array([[0.02 + 0.14 * slat, -0.9, 0.42] for slat in range(3)])
@@ -145,7 +145,7 @@ def bench(look: Look) -> Piece:
     )
 
 
-def litter_bin(look: Look) -> Piece:
+def litter_bin(look: TownMaterials) -> TrianglePiece:
     """A litter bin."""
     return join(
         [
@@ -155,7 +155,7 @@ def litter_bin(look: Look) -> Piece:
     )
 
 
-def wheelie_bin(look: Look) -> Piece:
+def wheelie_bin(look: TownMaterials) -> TrianglePiece:
     """A household bin on wheels."""
     colour = look.walls["awning"][int(look.generator.integers(2, 6))]
     return join(
@@ -166,13 +166,13 @@ def wheelie_bin(look: Look) -> Piece:
     )
 
 
-def bollard(look: Look) -> Piece:
+def bollard(look: TownMaterials) -> TrianglePiece:
     """A bollard."""
     post = cylinder((0.07, 0.06), (0.0, 0.9), look.iron, sides=6, levels=NEAR)
     return join([post, disc((0.071, 0.0, 0.78), 0.03, look.white)])
 
 
-def shelter(look: Look) -> Piece:
+def shelter(look: TownMaterials) -> TrianglePiece:
     """A bus shelter, open along x, 4 m wide."""
     posts = np.array([[x, y, 0.0] for x in (-0.55, 0.55) for y in (-2.0, 1.94)])
     pane = box((-0.57, -1.95, 0.25), (-0.54, 1.95, 2.2), look.glass[3], levels=VISIBLE, base=True)
@@ -187,12 +187,12 @@ def shelter(look: Look) -> Piece:
     )
 
 
-def planter(look: Look) -> Piece:
+def planter(look: TownMaterials) -> TrianglePiece:
     """A stone trough; a bush goes into it."""
     return box((-0.45, -0.45, 0.0), (0.45, 0.45, 0.55), look.stone[1], levels=VISIBLE)
 
 
-def fence(kind: str, look: Look) -> Piece:
+def fence(kind: str, look: TownMaterials) -> TrianglePiece:
     """A metre of fence along x: pickets, planks, wall, rail, chain."""
     if kind == "pickets":
         wood = look.wood[1]

@@ -10,7 +10,7 @@ from ssad.core.types import LaneType
 from ssad.rendering.meshes.mesh import F64
 from ssad.rendering.street.free_ground import place, polygon_distance
 from ssad.rendering.street.model import MID, NEAR
-from ssad.rendering.street.palette import Look
+from ssad.rendering.street.palette import TownMaterials
 from ssad.rendering.street.paving import Edge, lane_edge, ribbon
 from ssad.rendering.street.triangles import TriangleBuilder, flat
 
@@ -31,12 +31,12 @@ _ARROW = {  # polygons of arrows along x from the tail; y to the left
 }
 
 
-def paint(soup: TriangleBuilder, graph: LaneGraph, look: Look) -> None:
+def paint(soup: TriangleBuilder, graph: LaneGraph, look: TownMaterials) -> None:
     """All markings of the town, and wear."""
     driving_lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)).tolist()
     for lane in driving_lanes:
         _lines(soup, graph, lane, look)
-        _worn(soup, graph, lane, look)
+        _wear(soup, graph, lane, look)
     stop_sign_lanes = set(graph.rule_lane[graph.sign_kind[graph.rule_sign] == SignKind.STOP].tolist())
     sign_lanes = set(graph.rule_lane.tolist())
     for signal, lane, s in zip(
@@ -51,7 +51,7 @@ def paint(soup: TriangleBuilder, graph: LaneGraph, look: Look) -> None:
         _crosswalk(soup, graph.crosswalk(crosswalk).astype(np.float64), look)
 
 
-def _lines(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> None:
+def _lines(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMaterials) -> None:
     """Lines at both sides of a lane; a line between two lanes is painted by the lower of them."""
     for share, marking, neighbour in (
         (1.0, int(graph.left_marking[lane]), int(graph.left[lane])),
@@ -101,15 +101,15 @@ def _between_crosswalks(graph: LaneGraph, edge: Edge) -> Edge | None:
 
 
 def _strip(
-    soup: TriangleBuilder, edge: Edge, aside: float, material: int, *, width: float = LINE, z: float = PAINT
+    soup: TriangleBuilder, edge: Edge, offset: float, material: int, *, width: float = LINE, z: float = PAINT
 ) -> None:
-    """A line along an edge, `aside` m to its left."""
-    centre_line = edge.xy + aside * edge.normal
+    """A line along an edge, `offset` m to its left."""
+    centre_line = edge.xy + offset * edge.normal
     half_width = 0.5 * width * edge.normal
     soup.add(ribbon(centre_line + half_width, centre_line - half_width, (z, z), material, levels=VISIBLE))
 
 
-def _dashes(soup: TriangleBuilder, edge: Edge, aside: float, material: int) -> None:
+def _dashes(soup: TriangleBuilder, edge: Edge, offset: float, material: int) -> None:
     """Dashes that begin and end with half a space."""
     period = DASH + SPACE
     count = max(1, round(float(edge.s[-1]) / period))
@@ -117,7 +117,7 @@ def _dashes(soup: TriangleBuilder, edge: Edge, aside: float, material: int) -> N
     # Each dash has a middle point, so that it follows bends of the road.
     cut_s = np.stack([starts, starts + DASH / 2, starts + DASH], axis=1).clip(0.0, edge.s[-1])
     xy = np.stack(
-        [np.interp(cut_s, edge.s, edge.xy[:, column] + aside * edge.normal[:, column]) for column in range(2)], axis=-1
+        [np.interp(cut_s, edge.s, edge.xy[:, column] + offset * edge.normal[:, column]) for column in range(2)], axis=-1
     )
     normal = np.stack([np.interp(cut_s, edge.s, edge.normal[:, column]) for column in range(2)], axis=-1) * 0.5 * LINE
     left, right = xy + normal, xy - normal
@@ -133,12 +133,14 @@ def _paint(soup: TriangleBuilder, corners: F64, material: int, *, z: float = PAI
     soup.add(flat(np.concatenate([corners, np.full((*corners.shape[:2], 1), z)], axis=2), material, levels=levels))
 
 
-def _stop(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, *, give_way: bool, look: Look) -> None:
+def _stop(
+    soup: TriangleBuilder, graph: LaneGraph, lane: int, arc_length: float, *, give_way: bool, look: TownMaterials
+) -> None:
     """A stop line across a lane, or the teeth of a give-way line; and arrows on multi-lane arms.
 
     give_way: no signal or stop sign stands here.
     """
-    x, y, yaw, width = graph.at(lane, s)
+    x, y, yaw, width = graph.at(lane, arc_length)
     half_width = 0.5 * width - 0.12
     if give_way:
         tooth_offsets = np.arange(-half_width, half_width - 0.3, 0.75)[:, None, None]
@@ -153,12 +155,12 @@ def _stop(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, *, give_
             graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour)
             for neighbour in neighbours
         )
-        and s > 30.0
+        and arc_length > 30.0
     ):
-        _arrows(soup, graph, lane, s, look)
+        _arrows(soup, graph, lane, arc_length, look)
 
 
-def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, look: Look) -> None:
+def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, arc_length: float, look: TownMaterials) -> None:
     """Arrows for the turns that a lane leads to, twice before the stop line."""
     directions = set()
     for successor in graph.successors(lane).tolist():
@@ -166,7 +168,7 @@ def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, look: 
         turn_angle = float(wrap_angle(graph.yaw[points.stop - 1] - graph.yaw[points.start]))
         directions.add("ahead" if abs(turn_angle) < 0.5 else "left" if turn_angle > 0 else "right")
     for distance in (9.0, 24.0):
-        x, y, yaw, _ = graph.at(lane, s - distance)
+        x, y, yaw, _ = graph.at(lane, arc_length - distance)
         for direction in sorted(directions):
             for polygon in _ARROW["ahead" if direction == "ahead" else "left"]:
                 polygon_points = np.array([polygon])
@@ -175,7 +177,7 @@ def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, look: 
                 _paint(soup, place((x, y, yaw), polygon_points), look.white)
 
 
-def _crosswalk(soup: TriangleBuilder, corners: F64, look: Look) -> None:
+def _crosswalk(soup: TriangleBuilder, corners: F64, look: TownMaterials) -> None:
     """Bars along the traffic, over a rectangle [4, 2]: along its shorter sides."""
     if len(corners) != 4:
         return
@@ -197,7 +199,7 @@ def _crosswalk(soup: TriangleBuilder, corners: F64, look: Look) -> None:
     _paint(soup, quads, look.white)
 
 
-def _worn(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> None:
+def _wear(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMaterials) -> None:
     """Lighter wheel tracks, repaired patches and manholes on a lane."""
     rng = look.generator
     for share in (0.27, 0.73):

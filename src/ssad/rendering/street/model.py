@@ -87,26 +87,30 @@ class Street:
         """Return the faces of one tile at one level (0 full, 2 coarsest)."""
         return self.order[self.offset[level, tile] : self.offset[level, tile + 1]]
 
-    def select(self, eye: tuple[float, float], *, far: float = 500.0, reach: tuple[float, float] = REACH) -> I32:
+    def select(
+        self, viewpoint: tuple[float, float], *, max_distance: float = 500.0, reach: tuple[float, float] = REACH
+    ) -> I32:
         """Return the faces that a camera at x, y needs.
 
-        Near tiles come at level 0, then 1, then 2 up to `far` m; the horizon is always included. The distance of a
-        tile is that of its nearest point.
+        Near tiles come at level 0, then 1, then 2 up to `max_distance` m; the horizon is always included. The distance
+        of a tile is that of its nearest point.
         """
         selections = [self.tile_faces(self.nx * self.ny)]
-        for tile_index, distance in enumerate(self._away(eye)):
-            if distance <= far:
+        for tile_index, distance in enumerate(self._away(viewpoint)):
+            if distance <= max_distance:
                 selections.append(
                     self.tile_faces(tile_index, 0 if distance <= reach[0] else 1 if distance <= reach[1] else 2)
                 )
         return np.concatenate(selections)
 
-    def _away(self, eye: tuple[float, float]) -> npt.NDArray[np.float64]:
+    def _away(self, viewpoint: tuple[float, float]) -> npt.NDArray[np.float64]:
         """Return the distance [nx * ny] of each tile from a point, m."""
         axis_gaps = []
         for axis, count in ((0, self.nx), (1, self.ny)):
             lower_edges = self.origin[axis] + self.tile * np.arange(count)
-            axis_gaps.append(np.maximum(np.maximum(lower_edges - eye[axis], eye[axis] - lower_edges - self.tile), 0.0))
+            axis_gaps.append(
+                np.maximum(np.maximum(lower_edges - viewpoint[axis], viewpoint[axis] - lower_edges - self.tile), 0.0)
+            )
         return np.asarray(np.hypot(axis_gaps[0][None, :], axis_gaps[1][:, None]).reshape(-1))
 
     def check(self) -> None:
@@ -117,9 +121,9 @@ class Street:
         """
         face_count, tile_count = len(self.faces), self.nx * self.ny + 1
 
-        def require(ok: bool, what: str) -> None:
-            if not ok:
-                raise FormatError(f"street of {self.name}: {what}; delete the cached file and build it again")
+        def require(is_met: bool, requirement: str) -> None:
+            if not is_met:
+                raise FormatError(f"street of {self.name}: {requirement}; delete the cached file and build it again")
 
         shapes = {
             "normals": (face_count, 3, 3),

@@ -200,7 +200,7 @@ _WALLS = {
 
 
 @dataclass
-class Look:
+class TownMaterials:
     """Materials of one town, as indices into its palette, and the generator that draws everything else."""
 
     style: TownStyle

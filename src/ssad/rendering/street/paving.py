@@ -11,9 +11,9 @@ import numpy.typing as npt
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.rendering.meshes.mesh import F32, F64
-from ssad.rendering.street.palette import Look
+from ssad.rendering.street.palette import TownMaterials
 from ssad.rendering.street.region import WALK, Ground, region_mesh
-from ssad.rendering.street.triangles import ALL, HORIZON_OWNER, Piece, TriangleBuilder, flat
+from ssad.rendering.street.triangles import ALL, HORIZON_OWNER, TriangleBuilder, TrianglePiece, flat
 
 KERB = 0.13  # m, height of a sidewalk
 STONE = 0.16  # m, width of a kerb stone
@@ -53,23 +53,23 @@ def lane_edge(graph: LaneGraph, lane: int, share: float) -> Edge:
     return Edge(lane, xy, yaw, s)
 
 
-def _bends(yaw: F32, s: F32, width: F32) -> list[int]:
+def _bends(yaw: F32, arc_lengths: F32, width: F32) -> list[int]:
     """Return the indices of the lane points that its shape needs; straight stretches keep one in `STRAIGHT` m."""
-    indices, last = [0], len(s) - 1
+    indices, last = [0], len(arc_lengths) - 1
     for index in range(1, last):
         previous = indices[-1]
         heading_change = abs(float(wrap_angle(yaw[index + 1] - yaw[previous])))
         # Long quads would make tiles draw too much, so straight lines are cut as well.
         if (
             heading_change > 0.003
-            or s[index + 1] - s[previous] > STRAIGHT
+            or arc_lengths[index + 1] - arc_lengths[previous] > STRAIGHT
             or abs(width[index + 1] - width[previous]) > 0.002
         ):
             indices.append(index)
     return [*indices, last]
 
 
-def ribbon(left: F64, right: F64, z: tuple[float, float], material: int, *, levels: int = ALL) -> Piece:
+def ribbon(left: F64, right: F64, z: tuple[float, float], material: int, *, levels: int = ALL) -> TrianglePiece:
     """Return quads between two lines [n, 2] at heights z (left, right)."""
     right_line = np.column_stack([right, np.full(len(right), z[1])])
     left_line = np.column_stack([left, np.full(len(left), z[0])])
@@ -78,7 +78,7 @@ def ribbon(left: F64, right: F64, z: tuple[float, float], material: int, *, leve
     )
 
 
-def pave(soup: TriangleBuilder, graph: LaneGraph, ground: Ground, look: Look) -> None:
+def pave(soup: TriangleBuilder, graph: LaneGraph, ground: Ground, look: TownMaterials) -> None:
     """Road surface, sidewalks and kerbs, earth, far ground."""
     origin = np.array(ground.origin)
     vertices, faces = region_mesh(ground.road[::2, ::2] - 0.3)
@@ -102,10 +102,10 @@ def pave(soup: TriangleBuilder, graph: LaneGraph, ground: Ground, look: Look) ->
     _far(soup, ground, look)
 
 
-def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) -> Piece:
+def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) -> TrianglePiece:
     """Return nearly level triangles with vertical normals and world coordinates as uv."""
     normals = np.broadcast_to([0.0, 0.0, 1.0], (len(faces), 3, 3))
-    return Piece(
+    return TrianglePiece(
         np.column_stack([xy, z]),
         faces,
         normals,
@@ -115,7 +115,7 @@ def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) ->
     )
 
 
-def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> None:
+def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMaterials) -> None:
     """A raised strip: kerb stones and their face along the road, slabs, and faces at the back and at free ends."""
     right, left = lane_edge(graph, lane, 0.0), lane_edge(graph, lane, 1.0)
     if float(graph.width[graph.points(lane)].max()) < 0.3:
@@ -150,7 +150,7 @@ def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) ->
             soup.add(flat(np.array([corners]), look.kerb))
 
 
-def _far(soup: TriangleBuilder, ground: Ground, look: Look) -> None:
+def _far(soup: TriangleBuilder, ground: Ground, look: TownMaterials) -> None:
     """Ground to the horizon and two rows of hills, in every view."""
     x0, y0 = np.array(ground.origin) + 1.0
     x1, y1 = np.array(ground.origin) + np.array(ground.paved.shape[::-1]) - 2.0

@@ -8,8 +8,8 @@ import numpy.typing as npt
 from ssad.core.geometry import cross
 from ssad.rendering.meshes.mesh import F64
 from ssad.rendering.street.model import FAR, MID, NEAR
-from ssad.rendering.street.palette import Look
-from ssad.rendering.street.triangles import Piece, box, cylinder, join, smooth
+from ssad.rendering.street.palette import TownMaterials
+from ssad.rendering.street.triangles import TrianglePiece, box, cylinder, join, smooth
 
 VISIBLE = NEAR | MID
 
@@ -64,7 +64,9 @@ def _ball() -> tuple[F64, np.ndarray]:
 BALL, BALL_FACES = _ball()
 
 
-def blob(centre: F64, radius: F64, material: int, look: Look, *, levels: int, rough: float = 0.14) -> Piece:
+def blob(
+    centre: F64, radius: F64, material: int, look: TownMaterials, *, levels: int, rough: float = 0.14
+) -> TrianglePiece:
     """An uneven ellipsoid of 20 triangles, shaded smooth."""
     rng = look.generator
     angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -74,7 +76,9 @@ def blob(centre: F64, radius: F64, material: int, look: Look, *, levels: int, ro
     return smooth(vertices, BALL_FACES, directions / radius, material, levels=levels)
 
 
-def leaves(centre: F64, radius: F64, look: Look, *, count: int, size: float, materials: list[int]) -> Piece:
+def leaves(
+    centre: F64, radius: F64, look: TownMaterials, *, count: int, size: float, materials: list[int]
+) -> TrianglePiece:
     """Triangles about `size` m on an ellipsoid, tilted at random, with their outsides away from its centre."""
     rng = look.generator
     positions = np.arange(count) + 0.5
@@ -107,7 +111,7 @@ def leaves(centre: F64, radius: F64, look: Look, *, count: int, size: float, mat
 
 def _scraps(  # noqa: PLR0917
     place: F64, out: F64, side: F64, half: F64 | float, turns: tuple[float, ...], normal: F64, material: npt.ArrayLike
-) -> Piece:
+) -> TrianglePiece:
     """A triangle about each place [n, 3]: across `out` (unit), its corners turned from `side`, `half` m away."""
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     cosines, sines = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
@@ -116,14 +120,14 @@ def _scraps(  # noqa: PLR0917
     return smooth(corners.reshape(-1, 3), faces, normal, material, levels=NEAR)
 
 
-def _greens(kind: str, look: Look) -> list[int]:
+def _greens(kind: str, look: TownMaterials) -> list[int]:
     """Three greens of a kind, light to dark."""
     entries = list(look.palette.table)
     indices = look.generator.choice(look.leaves[kind], 3, replace=False).tolist()
     return sorted(indices, key=lambda index: -sum(entries[index].colour))
 
 
-def tree(kind: str, look: Look) -> Piece:
+def tree(kind: str, look: TownMaterials) -> TrianglePiece:
     """A tree of a kind (round, tall, birch, conifer), its trunk at the origin; 5 to 14 m tall."""
     rng = look.generator
     if kind == "conifer":
@@ -162,7 +166,7 @@ def tree(kind: str, look: Look) -> Piece:
     return join(parts)
 
 
-def _conifer(look: Look) -> Piece:
+def _conifer(look: TownMaterials) -> TrianglePiece:
     """Whorls of branches as cones with ragged rims."""
     rng, greens = look.generator, _greens("conifer", look)
     height = rng.uniform(7.5, 13.0)
@@ -210,7 +214,7 @@ def _conifer(look: Look) -> Piece:
     return join(parts)
 
 
-def bush(look: Look) -> Piece:
+def bush(look: TownMaterials) -> TrianglePiece:
     """A bush about 1.2 m tall."""
     rng = look.generator
     greens = _greens(str(rng.choice(["round", "tall", "birch"])), look)
@@ -224,7 +228,7 @@ def bush(look: Look) -> Piece:
     )
 
 
-def hedge(look: Look, material: int) -> Piece:
+def hedge(look: TownMaterials, material: int) -> TrianglePiece:
     """A metre of hedge along x, 0.7 m thick and 1 m tall; scale it."""
     rng = look.generator
     light_green = look.palette.shade(material, 1.5)

@@ -12,10 +12,10 @@ from ssad.rendering.street.buildings import draw_building, draw_size
 from ssad.rendering.street.free_ground import FreeGround, Side, footprint, place
 from ssad.rendering.street.furniture import bench, fence, wheelie_bin
 from ssad.rendering.street.model import MID, NEAR
-from ssad.rendering.street.palette import Look
+from ssad.rendering.street.palette import TownMaterials
 from ssad.rendering.street.paving import EARTH
 from ssad.rendering.street.plants import hedge
-from ssad.rendering.street.triangles import ALL, Piece, TriangleBuilder, flat
+from ssad.rendering.street.triangles import ALL, TriangleBuilder, TrianglePiece, flat
 
 Pose = tuple[float, float, float]
 FLAT = EARTH + 0.012  # m, height of drives and yards over the earth
@@ -28,10 +28,10 @@ class _Works:
 
     soup: TriangleBuilder
     site: FreeGround
-    look: Look
-    hedges: list[Piece]
-    fences: list[Piece]
-    bins: Piece
+    look: TownMaterials
+    hedges: list[TrianglePiece]
+    fences: list[TrianglePiece]
+    bins: TrianglePiece
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Plots:
     parks: list[tuple[Pose, float, float]] = field(default_factory=list)
 
 
-def line_streets(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Side]) -> Plots:
+def line_streets(soup: TriangleBuilder, site: FreeGround, look: TownMaterials, sides: list[Side]) -> Plots:
     """Buildings along all sides of streets."""
     style, rng = look.style, look.generator
     hedges = [hedge(look, material) for material in look.hedge]
@@ -70,15 +70,15 @@ def line_streets(soup: TriangleBuilder, site: FreeGround, look: Look, sides: lis
     return plots
 
 
-def _draw(table: Mapping[str, float], look: Look) -> str:
+def _draw(table: Mapping[str, float], look: TownMaterials) -> str:
     kinds = list(table)
     weights = np.array([table[kind] for kind in kinds])
     return str(look.generator.choice(kinds, p=weights / weights.sum()))
 
 
-def _facing(side: Side, s: float, away: float) -> Pose:
-    """Return the frame of a building whose front is `away` m behind the sidewalk: y points away from the street."""
-    x, y, yaw = side.pose(s, away)
+def _facing(side: Side, arc_length: float, distance: float) -> Pose:
+    """Return the frame of a building whose front is `distance` m behind the sidewalk: y points away from the street."""
+    x, y, yaw = side.pose(arc_length, distance)
     return x, y, yaw + np.pi
 
 
@@ -91,7 +91,7 @@ def _build(works: _Works, plots: Plots, pose: Pose, *, kind: str, size: tuple[fl
     # Terraced buildings share walls: their ground may touch that of the neighbours.
     side_margin = 0.25 if materials.style.gap[0] > 0.0 else -0.45
     ground_points = footprint(pose, (-width / 2 - side_margin, width / 2 + side_margin), (-0.05, depth + yard_depth))
-    if not site.free(ground_points, away=0.05 if setback < 2.0 else 1.5):
+    if not site.free(ground_points, distance=0.05 if setback < 2.0 else 1.5):
         return False
     builder.place(draw_building(kind, (width, depth), materials), [(pose[0], pose[1], EARTH - 0.02, pose[2])])
     site.take(footprint(pose, (-width / 2, width / 2), (-0.6 if is_detached else 0.0, depth + 0.4)))
@@ -153,7 +153,7 @@ def _garden(works: _Works, plots: Plots, pose: Pose, size: tuple[float, float, f
     offsets = np.arange(-width / 2 - 1.0, width / 2 + 1.0)
     is_open = ~((offsets > drive_span[0] - 0.7) & (offsets < drive_span[1] + 0.7)) & (np.abs(offsets) > 1.2)
     positions = place(pose, np.column_stack([offsets[is_open], np.full(int(is_open.sum()), -setback + 0.75)]))
-    free_positions = [position_xy for position_xy in positions if site.free(position_xy, away=0.3)]
+    free_positions = [position_xy for position_xy in positions if site.free(position_xy, distance=0.3)]
     if free_positions:
         builder.place(
             barrier,
@@ -163,14 +163,14 @@ def _garden(works: _Works, plots: Plots, pose: Pose, size: tuple[float, float, f
         site.take(np.array(free_positions))
 
 
-def _open_plot(works: _Works, plots: Plots, side: Side, s: float) -> float:
+def _open_plot(works: _Works, plots: Plots, side: Side, arc_length: float) -> float:
     """A car park or a small park instead of a building; gives the length used, m."""
     builder, site, materials = works.soup, works.site, works.look
     rng = materials.generator
     stall_count = int(rng.integers(4, 9))
     width, depth = 2.6 * stall_count + 1.0, 11.5
-    pose = _facing(side, s + width / 2, 0.4)
-    if not site.free(footprint(pose, (-width / 2, width / 2), (0.0, depth)), away=0.3):
+    pose = _facing(side, arc_length + width / 2, 0.4)
+    if not site.free(footprint(pose, (-width / 2, width / 2), (0.0, depth)), distance=0.3):
         return 4.0
     if rng.random() < 0.55:
         if not _slab(works, pose, (-width / 2, width / 2), (-0.4, depth), material=materials.asphalt):
@@ -194,7 +194,7 @@ def _open_plot(works: _Works, plots: Plots, side: Side, s: float) -> float:
     return width + 0.5
 
 
-def fill_blocks(soup: TriangleBuilder, site: FreeGround, look: Look, *, tries: int) -> None:
+def fill_blocks(soup: TriangleBuilder, site: FreeGround, look: TownMaterials, *, tries: int) -> None:
     """Buildings behind those along the streets, at random places, turned like a grid of their own."""
     rng = look.generator
     for _ in range(tries):
@@ -208,7 +208,7 @@ def fill_blocks(soup: TriangleBuilder, site: FreeGround, look: Look, *, tries: i
         pose = (float(centre[0]), float(centre[1]), float(rng.integers(4)) * np.pi / 2 + float(rng.normal(0.0, 0.08)))
         margin = 2.0 if kind == "shed" else 4.0
         if not site.free(
-            footprint(pose, (-width / 2 - margin, width / 2 + margin), (-margin, depth + margin)), away=6.0
+            footprint(pose, (-width / 2 - margin, width / 2 + margin), (-margin, depth + margin)), distance=6.0
         ):
             continue
         soup.place(draw_building(kind, (width, depth), look), [(pose[0], pose[1], EARTH - 0.02, pose[2])])

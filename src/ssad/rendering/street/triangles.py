@@ -17,7 +17,7 @@ ArrayLike = npt.ArrayLike
 
 
 @dataclass(frozen=True)
-class Piece:
+class TrianglePiece:
     """Triangles in one frame.
 
     Attributes:
@@ -62,11 +62,11 @@ class TriangleBuilder:
     """
 
     def __init__(self) -> None:
-        self.pieces: list[Piece] = []
+        self.pieces: list[TrianglePiece] = []
         self.owner: list[F64] = []  # [F, 2] middle of the object that a face belongs to; NaN for the horizon
         self.size = 0
 
-    def add(self, piece: Piece, owner: ArrayLike | None = None) -> int:
+    def add(self, piece: TrianglePiece, owner: ArrayLike | None = None) -> int:
         """Add a piece and return the index of its first face.
 
         Args:
@@ -83,7 +83,7 @@ class TriangleBuilder:
         self.size += count
         return first_face
 
-    def place(self, piece: Piece, poses: ArrayLike, *, scale: ArrayLike = 1.0) -> int:
+    def place(self, piece: TrianglePiece, poses: ArrayLike, *, scale: ArrayLike = 1.0) -> int:
         """Add copies of a piece, each an object of its own.
 
         Args:
@@ -116,7 +116,7 @@ class TriangleBuilder:
         normals = np.einsum("nij,nfkj->nfki", rotations, piece.normals[None] / scales[:, None, None])
         normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
         faces = piece.faces[None] + (vertex_count * np.arange(count, dtype=np.int32))[:, None, None]
-        copies = Piece(
+        copies = TrianglePiece(
             positions.reshape(-1, 3),
             faces.reshape(-1, 3).astype(np.int32),
             normals.reshape(-1, 3, 3),
@@ -127,10 +127,10 @@ class TriangleBuilder:
         return self.add(copies, np.repeat(pose_rows[:, :2], face_count, axis=0))
 
 
-def join(pieces: list[Piece]) -> Piece:
+def join(pieces: list[TrianglePiece]) -> TrianglePiece:
     """Merge pieces into one."""
     first_vertices = np.concatenate([[0], np.cumsum([len(piece.vertices) for piece in pieces])])
-    return Piece(
+    return TrianglePiece(
         np.concatenate([piece.vertices for piece in pieces]),
         np.concatenate(
             [piece.faces + first_vertex for piece, first_vertex in zip(pieces, first_vertices, strict=False)]
@@ -142,7 +142,7 @@ def join(pieces: list[Piece]) -> Piece:
     )
 
 
-def flat(corners: ArrayLike, material: ArrayLike, *, levels: int = ALL) -> Piece:
+def flat(corners: ArrayLike, material: ArrayLike, *, levels: int = ALL) -> TrianglePiece:
     """Flat convex polygons [n, k, 3], counter-clockwise seen from outside.
 
     Their uv are metres from the first corner along the first edge, upwards from there on walls.
@@ -168,7 +168,7 @@ def flat(corners: ArrayLike, material: ArrayLike, *, levels: int = ALL) -> Piece
     is_level = normals[:, 2] > 0.99
     surface_uv = np.where(is_level[:, None, None], points[..., :2], surface_uv)
     material_index = np.repeat(np.broadcast_to(np.asarray(material, np.int32), count), corner_count - 2)
-    return Piece(
+    return TrianglePiece(
         points.reshape(-1, 3),
         faces.astype(np.int32),
         np.repeat(np.repeat(normals, corner_count - 2, axis=0)[:, None], 3, axis=1),
@@ -181,7 +181,9 @@ def flat(corners: ArrayLike, material: ArrayLike, *, levels: int = ALL) -> Piece
 _SIDES = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7], [3, 2, 1, 0]])
 
 
-def box(low: ArrayLike, high: ArrayLike, material: ArrayLike, *, levels: int = ALL, base: bool = False) -> Piece:
+def box(
+    low: ArrayLike, high: ArrayLike, material: ArrayLike, *, levels: int = ALL, base: bool = False
+) -> TrianglePiece:
     """Return axis-aligned boxes from low [n, 3] to high [n, 3]; the underside is left out unless `base`."""
     lower, upper = (np.asarray(corner_values, np.float64).reshape(-1, 3) for corner_values in (low, high))
     corners = np.stack(
@@ -199,7 +201,7 @@ def box(low: ArrayLike, high: ArrayLike, material: ArrayLike, *, levels: int = A
 
 def smooth(
     vertices: ArrayLike, faces: ArrayLike, normals: ArrayLike, material: ArrayLike, *, levels: int = ALL
-) -> Piece:
+) -> TrianglePiece:
     """A piece with a normal for each vertex [V, 3]; uv: angle about z and height, m."""
     points, triangles, unit_normals = (
         np.asarray(vertices, np.float64),
@@ -210,7 +212,7 @@ def smooth(
     arc_length = np.arctan2(points[:, 1], points[:, 0]) * np.hypot(points[:, 0], points[:, 1])
     uv = np.stack([arc_length, points[:, 2]], axis=1)
     material_index = np.broadcast_to(np.asarray(material, np.int32), len(triangles)).astype(np.int32)
-    return Piece(
+    return TrianglePiece(
         points,
         triangles,
         unit_normals[triangles],
@@ -222,7 +224,7 @@ def smooth(
 
 def cylinder(
     radius: tuple[float, float], height: tuple[float, float], material: int, *, sides: int = 8, levels: int = ALL
-) -> Piece:
+) -> TrianglePiece:
     """Return a post about z from height[0] to height[1] with radius[0] and radius[1], closed at the top."""
     angles = np.arange(sides) * (2.0 * np.pi / sides)
     ring = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)

@@ -25,27 +25,29 @@ class Events:
     """The event sensors on the ego of an episode.
 
     Attributes:
-        where: Name of the server, for messages.
-        hits: Bodies that the ego has touched since `begin`, or since they were last collected: id and type of
+        server_name: Name of the server, for messages.
+        collisions: Bodies that the ego has touched since `begin`, or since they were last collected: id and type of
             each.
-        crossed: Frame and marking types, by CARLA's names, of each event of the lane sensor.
+        lane_crossings: Frame and marking types, by CARLA's names, of each event of the lane sensor.
     """
 
-    where: str
-    hits: list[tuple[int, str]] = field(default_factory=list)
-    crossed: list[tuple[int, tuple[str, ...]]] = field(default_factory=list)
+    server_name: str
+    collisions: list[tuple[int, str]] = field(default_factory=list)
+    lane_crossings: list[tuple[int, tuple[str, ...]]] = field(default_factory=list)
     _sensors: dict[str, carla.Sensor] = field(default_factory=dict)
-    _began: int = 0
+    _first_frame: int = 0
 
     def attach(self, world: carla.World, body: carla.Actor) -> None:
         """Spawn the sensors on a body."""
         import carla
 
         def on_collision(event: carla.CollisionEvent) -> None:
-            self.hits.append((event.other_actor.id, event.other_actor.type_id))
+            self.collisions.append((event.other_actor.id, event.other_actor.type_id))
 
         def on_crossing(event: carla.LaneInvasionEvent) -> None:
-            self.crossed.append((event.frame, tuple(str(marking.type) for marking in event.crossed_lane_markings)))
+            self.lane_crossings.append(
+                (event.frame, tuple(str(marking.type) for marking in event.crossed_lane_markings))
+            )
 
         library = world.get_blueprint_library()
         callbacks: dict[str, Callable[[Any], None]] = {COLLISION: on_collision, LANES: on_crossing}
@@ -56,9 +58,9 @@ class Events:
 
     def begin(self, frame: int) -> None:
         """Start an episode: events up to this frame are discarded, as they stem from the drop onto the road."""
-        self.hits.clear()
-        self.crossed.clear()
-        self._began = frame
+        self.collisions.clear()
+        self.lane_crossings.clear()
+        self._first_frame = frame
 
     def check(self) -> None:
         """Raise ConfigError if a sensor no longer exists: its missing events would pass for a clean drive."""
@@ -69,14 +71,14 @@ class Events:
     @property
     def measured(self) -> dict[str, Any]:
         """`lane_crossings`: events of the lane sensor so far; `lane_markings`: number of crossings of each type."""
-        crossings = [markings for frame, markings in self.crossed if frame > self._began]
+        crossings = [markings for frame, markings in self.lane_crossings if frame > self._first_frame]
         marking_counts = Counter(marking for markings in crossings for marking in markings)
         return {"lane_crossings": len(crossings), "lane_markings": dict(sorted(marking_counts.items()))}
 
     def detach(self) -> None:
         """Remove the sensors."""
         sensors, self._sensors = self._sensors, {}
-        self.hits.clear()
+        self.collisions.clear()
         for sensor in sensors.values():
             stop: Callable[[], object] = sensor.stop  # the stubs do not declare its return type
             stop()

@@ -31,7 +31,7 @@ _LIDAR_AXES: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0
 
 
 @dataclass(frozen=True)
-class Eye:
+class SensorBlueprint:
     """A sensor to be spawned in CARLA.
 
     Attributes:
@@ -49,7 +49,7 @@ class Eye:
     empty: F32 | U8
 
 
-def camera_eye(camera: Camera) -> Eye:
+def camera_blueprint(camera: Camera) -> SensorBlueprint:
     """Describe a camera. ConfigError if its pixels are not square."""
     (fx, skew, cx), (_, fy, cy), _ = np.asarray(camera.intrinsic, np.float64).tolist()
     if abs(fx - fy) > SQUARE * fx or skew:
@@ -70,12 +70,16 @@ def camera_eye(camera: Camera) -> Eye:
         "image_size_y": full_height,
         "fov": math.degrees(2.0 * math.atan(0.5 * full_width / fx)),
     }
-    return Eye(
-        "sensor.camera.rgb", _words(attributes), _place(camera.to_ego, _CAMERA_AXES), read, np.zeros(shape, np.uint8)
+    return SensorBlueprint(
+        "sensor.camera.rgb",
+        _attribute_strings(attributes),
+        _sensor_pose(camera.to_ego, _CAMERA_AXES),
+        read,
+        np.zeros(shape, np.uint8),
     )
 
 
-def lidar_eye(lidar: Lidar, dt: float) -> Eye:
+def lidar_blueprint(lidar: Lidar, dt: float) -> SensorBlueprint:
     """Describe a LiDAR that turns once per step. ConfigError if its beams are not evenly spaced."""
     beams = np.asarray(lidar.beams, np.float64)
     beam_step = float(np.diff(beams).mean()) if len(beams) > 1 else 1.0
@@ -109,10 +113,12 @@ def lidar_eye(lidar: Lidar, dt: float) -> Eye:
         "noise_stddev": lidar.noise,
         "dropoff_general_rate": lidar.lost,
     }
-    return Eye("sensor.lidar.ray_cast", _words(attributes), _place(lidar.to_ego, _LIDAR_AXES), read, empty)
+    return SensorBlueprint(
+        "sensor.lidar.ray_cast", _attribute_strings(attributes), _sensor_pose(lidar.to_ego, _LIDAR_AXES), read, empty
+    )
 
 
-def radar_eye(radar: Lidar, dt: float) -> Eye:
+def radar_blueprint(radar: Lidar, dt: float) -> SensorBlueprint:
     """Describe a radar with the rays of `ssad.rendering.radar`."""
     point_count = len(radar.beams) * radar.azimuths
     vertical_angle = float(np.ptp(radar.beams)) * (1.0 + 1.0 / max(len(radar.beams) - 1, 1))
@@ -132,21 +138,23 @@ def radar_eye(radar: Lidar, dt: float) -> Eye:
         "range": radar.reach,
         "points_per_second": round(point_count / dt),
     }
-    return Eye("sensor.other.radar", _words(attributes), _place(radar.to_ego, _LIDAR_AXES), read, empty)
+    return SensorBlueprint(
+        "sensor.other.radar", _attribute_strings(attributes), _sensor_pose(radar.to_ego, _LIDAR_AXES), read, empty
+    )
 
 
-def _words(told: Mapping[str, float]) -> dict[str, str]:
-    return {name: repr(value) for name, value in told.items()}
+def _attribute_strings(attributes: Mapping[str, float]) -> dict[str, str]:
+    return {name: repr(value) for name, value in attributes.items()}
 
 
-def _place(to_ego: F64, axes: F64) -> F64:
+def _sensor_pose(to_ego: F64, axes: F64) -> F64:
     """Return sensor to car of a frame of x forward, y left, z up, given the sensor's own axes."""
     pose = np.array(to_ego, np.float64)
     pose[:3, :3] = pose[:3, :3] @ axes.T
     return pose
 
 
-def angles_of(place: F64) -> tuple[float, float, float]:
+def carla_angles(place: F64) -> tuple[float, float, float]:
     """Return CARLA's roll, pitch and yaw, degrees, of a rotation in a frame of x forward, y left, z up."""
     forward, right, up = place[:3, 0], -place[:3, 1], place[:3, 2]
     yaw = math.atan2(-forward[1], forward[0])
@@ -155,46 +163,46 @@ def angles_of(place: F64) -> tuple[float, float, float]:
 
 
 @dataclass
-class Carried:
+class EgoSensors:
     """The sensors on the ego of an episode.
 
     Attributes:
-        eyes: Sensors by name.
+        blueprints: Sensors by name.
         timeout: Time limit of a reading, s.
-        where: Name of the server, for messages.
+        server_name: Name of the server, for messages.
     """
 
-    eyes: Mapping[str, Eye]
+    blueprints: Mapping[str, SensorBlueprint]
     timeout: float
-    where: str
+    server_name: str
     _sensors: list[carla.Sensor] = field(default_factory=list)
-    _came: dict[str, Queue[tuple[int, bytes]]] = field(default_factory=dict)
-    _seen: dict[str, tuple[int, F32 | U8]] = field(default_factory=dict)
+    _queues: dict[str, Queue[tuple[int, bytes]]] = field(default_factory=dict)
+    _latest_readings: dict[str, tuple[int, F32 | U8]] = field(default_factory=dict)
 
     def attach(self, world: carla.World, body: carla.Actor, middle: float) -> None:
         """Spawn them on a body whose centre lies so far ahead of its origin, m."""
         import carla
 
         library = world.get_blueprint_library()
-        for name, description in self.eyes.items():
+        for name, description in self.blueprints.items():
             blueprint = library.find(description.kind)
             for key, value in description.attributes.items():
                 blueprint.set_attribute(key, value)
-            roll, pitch, yaw = angles_of(description.place)
+            roll, pitch, yaw = carla_angles(description.place)
             x, y, z = description.place[:3, 3].tolist()
             transform = carla.Transform(
                 carla.Location(x=x + middle, y=0.0 - y, z=z), carla.Rotation(pitch=pitch, yaw=yaw, roll=roll)
             )
             sensor = cast("carla.Sensor", world.spawn_actor(blueprint, transform, attach_to=body))
             measurements: Queue[tuple[int, bytes]] = Queue()
-            self._came[name] = measurements
-            sensor.listen(_into(measurements))
+            self._queues[name] = measurements
+            sensor.listen(_enqueue_into(measurements))
             self._sensors.append(sensor)
 
     def detach(self) -> None:
         """Remove the sensors."""
         sensors, self._sensors = self._sensors, []
-        self._came, self._seen = {}, {}
+        self._queues, self._latest_readings = {}, {}
         for sensor in sensors:
             stop: Callable[[], object] = sensor.stop  # the stubs do not declare its return type
             stop()
@@ -202,50 +210,52 @@ class Carried:
 
     def reading(self, name: str, frame: int) -> F32 | U8:
         """Return the reading of a sensor in a frame. ConfigError if CARLA does not send it in time."""
-        cached = self._seen.get(name)
+        cached = self._latest_readings.get(name)
         if cached is not None and cached[0] == frame:
             return cached[1]
         while True:
             try:
                 # Measurements of earlier frames that were never read are skipped.
-                measured_frame, encoded = self._came[name].get(timeout=self.timeout)
+                measured_frame, encoded = self._queues[name].get(timeout=self.timeout)
             except (Empty, KeyError):
                 raise ConfigError(f"{self.where}: its sensor '{name}' sends nothing of frame {frame}") from None
             if measured_frame == frame:
                 break
         try:
-            value = self.eyes[name].read(encoded)
+            value = self.blueprints[name].read(encoded)
         except ValueError as error:
             raise ConfigError(f"{self.where}: its sensor '{name}' sends something else: {error}") from None
-        self._seen[name] = frame, value
+        self._latest_readings[name] = frame, value
         return value
 
 
-def _into(came: Queue[tuple[int, bytes]]) -> Callable[[carla.Image | carla.LidarMeasurement], None]:
+def _enqueue_into(queue: Queue[tuple[int, bytes]]) -> Callable[[carla.Image | carla.LidarMeasurement], None]:
     def enqueue(data: carla.Image | carla.LidarMeasurement) -> None:
-        came.put((data.frame, bytes(data.raw_data)))
+        queue.put((data.frame, bytes(data.raw_data)))
 
     return enqueue
 
 
-def eyes_of(sensors: Mapping[str, Camera | tuple[str, Lidar]], dt: float) -> dict[str, Eye]:
+def sensor_blueprints(sensors: Mapping[str, Camera | tuple[str, Lidar]], dt: float) -> dict[str, SensorBlueprint]:
     """Return CARLA's sensors by name, for cameras, and for LiDARs and radars paired with "lidar" or "radar"."""
-    descriptions = {}
+    blueprints = {}
     for name, sensor in sensors.items():
         if isinstance(sensor, Camera):
-            descriptions[name] = camera_eye(sensor)
+            blueprints[name] = camera_blueprint(sensor)
         else:
-            descriptions[name] = lidar_eye(sensor[1], dt) if sensor[0] == "lidar" else radar_eye(sensor[1], dt)
-    return descriptions
+            blueprints[name] = (
+                lidar_blueprint(sensor[1], dt) if sensor[0] == "lidar" else radar_blueprint(sensor[1], dt)
+            )
+    return blueprints
 
 
-class Own:
+class CarlaSensor:
     """One of CARLA's sensors as a sensor of `ssad.world.rollout.rollout`; the simulator must carry it."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def __call__(self, simulator: object, agents: I32) -> F32 | U8:
+    def __call__(self, simulator: object, egos: I32) -> F32 | U8:
         """Return the readings [N, ...] of egos [N, 2]."""
-        readings = [simulator.seen(self.name, row) for row in agents.tolist()]  # type: ignore[attr-defined]
+        readings = [simulator.sensor_reading(self.name, row) for row in egos.tolist()]  # type: ignore[attr-defined]
         return np.stack(readings)

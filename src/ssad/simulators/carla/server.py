@@ -41,7 +41,7 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True)
 class Server:
-    """Where a CARLA server listens.
+    """Address and options of a CARLA server.
 
     Attributes:
         host: Name or address.
@@ -93,7 +93,7 @@ def connect(server: Server) -> carla.Client:
         raise ConfigError(f"carla is not installed ({error}); {install_extra('carla')}") from None
     client = carla.Client(server.host, server.port)
     client.set_timeout(server.timeout)
-    server_version = asked(server, "connect", client.get_server_version)
+    server_version = call_server(server, "connect", client.get_server_version)
     client_version = client.get_client_version()
     if server_version != client_version:
         raise ConfigError(
@@ -103,16 +103,16 @@ def connect(server: Server) -> carla.Client:
     return client
 
 
-def asked(server: Server, doing: str, call: Callable[[], T]) -> T:
-    """What a call gives; a ConfigError of one line where the server does not answer, or refuses."""
+def call_server(server: Server, action: str, request: Callable[[], T]) -> T:
+    """Return the result of a request; ConfigError of one line where the server does not answer, or refuses."""
     try:
-        return call()
+        return request()
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise ConfigError(f"{server}: cannot {doing}: {reason}; is the server running, and is it still?") from None
+        raise ConfigError(f"{server}: cannot {action}: {reason}; is the server running, and is it still?") from None
 
 
-def probe(server: Server) -> None:
+def check_version(server: Server) -> None:
     """Ask a server for its version in a separate process: the C++ library may abort on another server.
 
     Raises:
@@ -138,7 +138,7 @@ def probe(server: Server) -> None:
 
 
 def main(host: str, port: str) -> None:
-    """Run the check of `probe`: exit code 2 and one line of output if `connect` fails."""
+    """Run the check of `check_version`: exit code 2 and one line of output if `connect` fails."""
     try:
         connect(Server(host, int(port)))
     except ConfigError as error:

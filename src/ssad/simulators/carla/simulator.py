@@ -39,8 +39,8 @@ from ssad.core.types import (
 )
 from ssad.simulators.carla.blueprints import BLUEPRINTS
 from ssad.simulators.carla.events import Events
-from ssad.simulators.carla.sensors import Carried, Eye
-from ssad.simulators.carla.server import Server, T, asked, connect
+from ssad.simulators.carla.sensors import EgoSensors, SensorBlueprint
+from ssad.simulators.carla.server import Server, T, call_server, connect
 from ssad.simulators.carla.traffic import Traffic
 from ssad.simulators.mirrored import Mirrored
 from ssad.world.kernels.data import Presence
@@ -58,7 +58,7 @@ _FREE = (Controller.TRAJECTORY, Controller.PLACED, Controller.NONE)  # agents th
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Connection:
     """A connection that outlives a simulator of this process, so that the next one need not load the map again."""
 
     client: carla.Client
@@ -67,7 +67,7 @@ class _Kept:
     lights: dict[int, carla.TrafficLight] = field(default_factory=dict)
 
 
-_KEPT: dict[Server, _Kept] = {}
+_CONNECTIONS: dict[Server, _Connection] = {}
 
 
 class Carla(Mirrored):
@@ -83,7 +83,7 @@ class Carla(Mirrored):
         *,
         server: Server,
         assign: Scenes | None = None,
-        eyes: Mapping[str, Eye] | None = None,
+        blueprints: Mapping[str, SensorBlueprint] | None = None,
     ) -> None:
         self.mirror = World(episodes, graphs, assign=assign)
         if self.mirror.batch != 1:
@@ -91,24 +91,24 @@ class Carla(Mirrored):
         self.dt, self.batch, self.agents = self.mirror.dt, self.mirror.batch, self.mirror.agents
         self.episodes, self.graphs = self.mirror.episodes, self.mirror.graphs
         self.server = server
-        connection = _KEPT.pop(server, None)
+        connection = _CONNECTIONS.pop(server, None)
         self.client = connect(server) if connection is None else connection.client
         self.world: carla.World = self._ask("get its world", self.client.get_world)
         # Another client may have loaded another world since; then our map and lights are outdated.
         if connection is None or self.world.id != connection.world.id:
-            connection = _Kept(self.client, self.world)
+            connection = _Connection(self.client, self.world)
         self.town, self._lights = connection.town, connection.lights
-        self._found: carla.WorldSettings = self._ask("get its settings", self.world.get_settings)
+        self._original_settings: carla.WorldSettings = self._ask("get its settings", self.world.get_settings)
         self._bodies: dict[int, carla.Actor] = {}
-        self._middle: dict[int, float] = {}  # m from an actor's origin forward to the centre of its body
+        self._centre_offsets: dict[int, float] = {}  # m from an actor's origin forward to the centre of its body
         self._events = Events(str(server))
-        self._carried = Carried(dict(eyes or {}), server.timeout, str(server))
+        self._ego_sensors = EgoSensors(dict(blueprints or {}), server.timeout, str(server))
         self._frame = 0
         self._traffic: Traffic | None = None
         if server.traffic == "manager":
             self._traffic = self._ask("reach its Traffic Manager", lambda: Traffic(self.client, server.port))
         self._touching: set[int] = set()
-        self._shown: dict[int, int] = {}
+        self._light_states: dict[int, int] = {}
         self._controls: F32 = np.zeros((1, self.agents, 4), np.float32)
         try:
             self.reset()
@@ -127,11 +127,11 @@ class Carla(Mirrored):
 
     @property
     def measured(self) -> dict[str, Any]:
-        """What the ego's own sensors have counted in this episode, as `Events.measured`."""
+        """Counts of the ego's own sensors in this episode, as `Events.measured`."""
         return self._events.measured
 
-    def _ask(self, doing: str, call: Callable[[], T]) -> T:
-        return asked(self.server, doing, call)
+    def _ask(self, action: str, request: Callable[[], T]) -> T:
+        return call_server(self.server, action, request)
 
     # ------------------------------------------------------------ the start
 
@@ -142,27 +142,31 @@ class Carla(Mirrored):
         self.mirror.reset(scenes, episodes=episodes)
         self._controls[:] = 0.0
         self._clear()
-        self._shown = {}
+        self._light_states = {}
         episode = self._episode
         if episode.town != self.town:
-            self._load(episode.town)
+            self._load_town(episode.town)
         self._ask("change its settings", self._synchronise)
-        self._ask("set the weather", self._weather)
+        self._ask("set the weather", self._set_weather)
         active = self.mirror.array("active")[0]
         for agent_index, agent in enumerate(episode.agents):
             if active[agent_index] != Presence.ABSENT:
                 self._spawn(agent_index, agent.pose)
         self._ask("attach its collision and lane sensors", lambda: self._events.attach(self.world, self._bodies[0]))
-        self._ask("attach its sensors", lambda: self._carried.attach(self.world, self._bodies[0], self._middle[0]))
+        self._ask(
+            "attach its sensors", lambda: self._ego_sensors.attach(self.world, self._bodies[0], self._centre_offsets[0])
+        )
         if self._traffic is not None:
             self._ask("begin with its Traffic Manager", partial(self._traffic.begin, episode))
         self._tick()  # all bodies drop onto the road
         for agent_index, agent in enumerate(episode.agents):
             if agent.speed != 0.0 and agent_index in self._bodies and agent.controller not in _FREE:
-                self._ask(f"set the speed of {agent.name}", partial(self._speed, agent_index, agent.pose, agent.speed))
+                self._ask(
+                    f"set the speed of {agent.name}", partial(self._set_speed, agent_index, agent.pose, agent.speed)
+                )
         self._events.begin(self._frame)
 
-    def _load(self, town: str) -> None:
+    def _load_town(self, town: str) -> None:
         import carla
 
         map_text = town_xodr(town)
@@ -203,22 +207,22 @@ class Carla(Mirrored):
         settings.substepping = True
         settings.max_substep_delta_time = 0.01
         settings.max_substeps = 10
-        settings.no_rendering_mode = not any("camera" in eye.kind for eye in self._carried.eyes.values())
+        settings.no_rendering_mode = not any("camera" in eye.kind for eye in self._ego_sensors.blueprints.values())
         self.world.apply_settings(settings)
         self.world.freeze_all_traffic_lights(True)
 
-    def _weather(self) -> None:
+    def _set_weather(self) -> None:
         import carla
 
         self.world.set_weather(getattr(carla.WeatherParameters, self.server.weather))
 
-    def _spawn(self, i: int, pose: Pose) -> None:
-        agent = self._episode.agents[i]
+    def _spawn(self, agent_index: int, pose: Pose) -> None:
+        agent = self._episode.agents[agent_index]
 
         def spawn() -> carla.Actor | None:
             blueprint = self.world.get_blueprint_library().find(BLUEPRINTS.get(agent.model, agent.model))
             if blueprint.has_attribute("role_name"):
-                blueprint.set_attribute("role_name", "hero" if i == 0 else f"ssad {i}")
+                blueprint.set_attribute("role_name", "hero" if agent_index == 0 else f"ssad {agent_index}")
             if blueprint.has_attribute("is_invincible"):
                 blueprint.set_attribute("is_invincible", "true")
             return self.world.try_spawn_actor(blueprint, self._transform(pose))
@@ -231,26 +235,28 @@ class Carla(Mirrored):
             raise ConfigError(
                 f"{self.server}: cannot put {agent.name} at ({pose.x:.1f}, {pose.y:.1f}): something is in the way"
             )
-        self._bodies[i] = body
+        self._bodies[agent_index] = body
         kind = MODELS[agent.model].kind
-        self._middle[i] = 0.0 if kind in (AgentKind.PROP, AgentKind.WALKER) else float(body.bounding_box.location.x)
-        if abs(self._middle[i]) > 0.01:
-            self._ask(f"place {agent.name}", lambda: body.set_transform(self._transform(pose, i)))
-        if agent.controller in _FREE and i > 0:
+        self._centre_offsets[agent_index] = (
+            0.0 if kind in (AgentKind.PROP, AgentKind.WALKER) else float(body.bounding_box.location.x)
+        )
+        if abs(self._centre_offsets[agent_index]) > 0.01:
+            self._ask(f"place {agent.name}", lambda: body.set_transform(self._transform(pose, agent_index)))
+        if agent.controller in _FREE and agent_index > 0:
             self._ask(f"hold {agent.name}", lambda: body.set_simulate_physics(False))
 
-    def _transform(self, pose: Pose, i: int = -1) -> carla.Transform:
+    def _transform(self, pose: Pose, agent_index: int = -1) -> carla.Transform:
         import carla
 
-        centre_offset = self._middle.get(i, 0.0)
+        centre_offset = self._centre_offsets.get(agent_index, 0.0)
         x, y = pose.x - centre_offset * math.cos(pose.yaw), pose.y - centre_offset * math.sin(pose.yaw)
         return carla.Transform(carla.Location(x, -y, ABOVE), carla.Rotation(yaw=-math.degrees(pose.yaw)))
 
-    def _speed(self, i: int, pose: Pose, speed: float) -> None:
+    def _set_speed(self, agent_index: int, pose: Pose, speed: float) -> None:
         import carla
 
         velocity = carla.Vector3D(speed * math.cos(pose.yaw), -speed * math.sin(pose.yaw), 0.0)
-        self._bodies[i].set_target_velocity(velocity)
+        self._bodies[agent_index].set_target_velocity(velocity)
 
     # ------------------------------------------------------------ a step
 
@@ -267,10 +273,10 @@ class Carla(Mirrored):
         control = np.where((controllers == Controller.EXTERNAL)[..., None], self._controls, world.array("control"))
         active = world.array("active").copy()
         time = (int(world.array("step")[0]) + 1) * self.dt
-        self._ask("show its traffic lights", self._signals)
-        self._drive(controllers[0], control[0], active[0], time)
+        self._ask("show its traffic lights", self._set_signals)
+        self._apply_controls(controllers[0], control[0], active[0], time)
         self._tick()
-        placements = self._places(time)
+        placements = self._measure_placements(time)
         world.put("control", control.astype(np.float32))
         world.put("active", active)
         world.place(placements)
@@ -279,10 +285,10 @@ class Carla(Mirrored):
         world.advance()
         touched = (active != Presence.ABSENT) & (world.array("active") == Presence.ABSENT)  # whom the ego has touched
         world.put("controller", np.where(touched, int(Controller.NONE), controllers).astype(controllers.dtype))
-        self._leave(controllers[0], active[0])
-        self._felt()
+        self._remove_departed(controllers[0], active[0])
+        self._add_sensor_contacts()
 
-    def _signals(self) -> None:
+    def _set_signals(self) -> None:
         import carla
 
         light_state = carla.TrafficLightState
@@ -295,16 +301,16 @@ class Carla(Mirrored):
         states = self.mirror.state().signal[0]
         for signal, light in self._lights.items():
             state = int(states[signal])
-            if self._shown.get(signal) != state:
+            if self._light_states.get(signal) != state:
                 light.set_state(light_states[SignalState(state)])
-                self._shown[signal] = state
+                self._light_states[signal] = state
 
-    def _drive(self, said: I32, control: F32, active: I32, time: float) -> None:
-        """Hand everybody their controls; who follows a trajectory appears, is put, and goes."""
+    def _apply_controls(self, controllers: I32, control: F32, active: I32, time: float) -> None:
+        """Apply the controls of all agents; those on a trajectory are spawned, placed and destroyed by it."""
         poses = self.mirror.array("pose")[0]
         for agent_index, agent in enumerate(self._episode.agents):
-            if said[agent_index] == Controller.TRAJECTORY:
-                pose = _on(agent.trajectory, time)
+            if controllers[agent_index] == Controller.TRAJECTORY:
+                pose = _trajectory_pose(agent.trajectory, time)
                 active[agent_index] = Presence.ABSENT if pose is None else Presence.AWAKE
                 if pose is None:
                     self._destroy(agent_index)
@@ -320,32 +326,32 @@ class Carla(Mirrored):
                 and active[agent_index] != Presence.ABSENT
                 and MODELS[agent.model].max_speed > 0.0
             ):
-                if said[agent_index] in _FREE and agent_index > 0:
+                if controllers[agent_index] in _FREE and agent_index > 0:
                     continue
                 is_walker = MODELS[agent.model].kind == AgentKind.WALKER
                 if (
                     self._traffic is not None
                     and agent_index > 0
-                    and said[agent_index] == Controller.AUTOPILOT
+                    and controllers[agent_index] == Controller.AUTOPILOT
                     and not is_walker
                 ):
                     if active[agent_index] == Presence.AWAKE and agent_index not in self._traffic.driven:
                         command = partial(self._traffic.take, agent_index, self._bodies[agent_index], self._episode)
                         self._ask(f"hand {agent.name} to its Traffic Manager", command)
                     continue
-                apply = self._walk if is_walker else self._control
+                apply = self._control_walker if is_walker else self._control_vehicle
                 yaw, command, controller = (
                     float(poses[agent_index, 2]),
                     control[agent_index],
-                    Controller(int(said[agent_index])),
+                    Controller(int(controllers[agent_index])),
                 )
                 self._ask(f"control {agent.name}", partial(apply, agent_index, command, yaw, controller))
 
-    def _control(self, i: int, control: F32, yaw: float, who: Controller) -> None:
+    def _control_vehicle(self, agent_index: int, control: F32, yaw: float, controller: Controller) -> None:
         import carla
 
         throttle, brake, steer, reverse = (float(value) for value in control)
-        cast("carla.Vehicle", self._bodies[i]).apply_control(
+        cast("carla.Vehicle", self._bodies[agent_index]).apply_control(
             carla.VehicleControl(
                 throttle=min(max(throttle, 0.0), 1.0),
                 steer=-min(max(steer, -1.0), 1.0),
@@ -355,28 +361,28 @@ class Carla(Mirrored):
             )
         )
 
-    def _walk(self, i: int, control: F32, yaw: float, who: Controller) -> None:
+    def _control_walker(self, agent_index: int, control: F32, yaw: float, controller: Controller) -> None:
         import carla
 
-        agent = self._episode.agents[i]
-        turn = float(control[2]) * WALKER_RATE * self.dt if who == Controller.EXTERNAL else 0.0
+        agent = self._episode.agents[agent_index]
+        turn = float(control[2]) * WALKER_RATE * self.dt if controller == Controller.EXTERNAL else 0.0
         direction = carla.Vector3D(math.cos(yaw + turn), -math.sin(yaw + turn), 0.0)
         speed = min(max(float(control[0]), 0.0), 1.0) * MODELS[agent.model].max_speed
-        walker = cast("carla.Walker", self._bodies[i])
+        walker = cast("carla.Walker", self._bodies[agent_index])
         walker.apply_control(carla.WalkerControl(direction=direction, speed=speed, jump=False))
 
     def _tick(self) -> None:
         self._frame = self._ask("advance", lambda: self.world.tick(self.server.timeout))
 
-    def seen(self, name: str, who: Sequence[int]) -> F32 | U8:
-        """What one of CARLA's own sensors shows an agent (scene, number) now; only the ego carries them."""
-        if who[1] != 0:
-            raise ConfigError(f"{self.server}: only the ego carries its sensors, not agent {who[1]}")
+    def sensor_reading(self, name: str, scene_agent: Sequence[int]) -> F32 | U8:
+        """Return the present reading of one of CARLA's own sensors on an agent (scene, number): the ego alone."""
+        if scene_agent[1] != 0:
+            raise ConfigError(f"{self.server}: only the ego carries its sensors, not agent {scene_agent[1]}")
         if self.mirror.ended()[0] != End.RUNNING:
-            return self._carried.eyes[name].empty
-        return self._carried.reading(name, self._frame)
+            return self._ego_sensors.blueprints[name].empty
+        return self._ego_sensors.reading(name, self._frame)
 
-    def _places(self, time: float) -> F32:
+    def _measure_placements(self, time: float) -> F32:
         """Return [1, A, 4] x, y, yaw, speed of the bodies' centres after the tick; absent agents keep their place."""
         world = self.mirror
         placements = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
@@ -388,34 +394,34 @@ class Carla(Mirrored):
                 raise ConfigError(f"{self.server}: {name} is gone: somebody has destroyed it")
             transform, velocity = actor_state.get_transform(), actor_state.get_velocity()
             yaw = -math.radians(transform.rotation.yaw)
-            x = transform.location.x + self._middle[agent_index] * math.cos(yaw)
-            y = -transform.location.y + self._middle[agent_index] * math.sin(yaw)
+            x = transform.location.x + self._centre_offsets[agent_index] * math.cos(yaw)
+            y = -transform.location.y + self._centre_offsets[agent_index] * math.sin(yaw)
             agent = self._episode.agents[agent_index]
             speed = velocity.x * math.cos(yaw) - velocity.y * math.sin(yaw)
             if agent.controller == Controller.TRAJECTORY:  # it is placed, so CARLA knows no speed of it
-                speed = _speed_on(agent.trajectory, time, yaw)
+                speed = _trajectory_speed(agent.trajectory, time, yaw)
             placements[0, agent_index] = x, y, yaw, speed
         if not np.isfinite(placements).all():
             raise ConfigError(f"{self.server}: it tells places that are no numbers")
         return placements.astype(np.float32)
 
-    def _leave(self, said: I32, before: I32) -> None:
-        """Background traffic leaves at the end of its route; who was taken out of the mirror leaves CARLA too."""
+    def _remove_departed(self, controllers: I32, before: I32) -> None:
+        """Remove background traffic at the end of its route, and from CARLA all agents that left the mirror."""
         world = self.mirror
         removed = np.zeros((1, self.agents), bool)
         route = world.state().route[0]
         at_end = world.array("progress")[0] >= route[:, 1] - 3
-        removed[0] = at_end & (said == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
+        removed[0] = at_end & (controllers == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
         if removed.any():
             world.remove(removed)
         for agent_index in list(self._bodies):
             if world.array("active")[0, agent_index] == Presence.ABSENT:
                 self._destroy(agent_index)
 
-    def _felt(self) -> None:
+    def _add_sensor_contacts(self) -> None:
         """Add contacts that only the collision sensor reported: other body shapes, objects of the town."""
         self._ask("look after its sensors", self._events.check)
-        collisions, self._events.hits = self._events.hits, []
+        collisions, self._events.collisions = self._events.collisions, []
         agent_by_body = {body.id: agent_index for agent_index, body in self._bodies.items()}
         touching = {
             agent_by_body.get(body_id, -1 - abs(body_id))
@@ -430,7 +436,9 @@ class Carla(Mirrored):
             if agent_index >= 0 and touched >> agent_index & 1:
                 continue
             episode = self._episode
-            contact = _bit(MODELS[episode.agents[agent_index].model].kind) if agent_index >= 0 else Contact.STATIC
+            contact = (
+                _contact_bit(MODELS[episode.agents[agent_index].model].kind) if agent_index >= 0 else Contact.STATIC
+            )
             world.put("ego.contact", world.array("ego.contact") | int(contact))
             if int(world.array("ego.contact_agent")[0]) == -1:
                 world.put(
@@ -442,8 +450,8 @@ class Carla(Mirrored):
 
     # ------------------------------------------------------------ the end
 
-    def _destroy(self, i: int) -> None:
-        body = self._bodies.pop(i, None)
+    def _destroy(self, agent_index: int) -> None:
+        body = self._bodies.pop(agent_index, None)
         if body is not None:
             self._ask("take somebody out", body.destroy)
 
@@ -451,7 +459,7 @@ class Carla(Mirrored):
         """Remove all spawned bodies and sensors."""
         self._touching = set()
         self._ask("take its collision and lane sensors out", self._events.detach)
-        self._ask("take its sensors out", self._carried.detach)
+        self._ask("take its sensors out", self._ego_sensors.detach)
         for agent_index in list(self._bodies):
             self._destroy(agent_index)
 
@@ -461,24 +469,24 @@ class Carla(Mirrored):
             self._clear()
             if self._traffic is not None:
                 self._ask("leave its Traffic Manager", self._traffic.end)
-            self._ask("change its settings", lambda: self.world.apply_settings(self._found))
-            _KEPT[self.server] = _Kept(self.client, self.world, self.town, self._lights)
+            self._ask("change its settings", lambda: self.world.apply_settings(self._original_settings))
+            _CONNECTIONS[self.server] = _Connection(self.client, self.world, self.town, self._lights)
 
 
-def _same_roads(ours: str, theirs: str, where: str) -> bool:
-    """Whether two OpenDRIVE texts have the same roads, of the same lengths."""
+def _same_roads(town_text: str, server_text: str, server_name: str) -> bool:
+    """Return True if two OpenDRIVE texts have the same roads, of the same lengths."""
 
     def roads(text: str, name: str) -> dict[str, float]:
         elements = parse_xml(text.encode(), name).findall("road")
         return {road.get("id", ""): float(road.get("length", "nan")) for road in elements}
 
-    town_roads, server_roads = roads(ours, "the town here"), roads(theirs, f"the map of {where}")
+    town_roads, server_roads = roads(town_text, "the town here"), roads(server_text, f"the map of {server_name}")
     return town_roads.keys() == server_roads.keys() and all(
         abs(town_roads[name] - server_roads[name]) <= SAME for name in town_roads
     )
 
 
-def _on(rows: Sequence[tuple[float, float, float, float]], time: float) -> Pose | None:
+def _trajectory_pose(rows: Sequence[tuple[float, float, float, float]], time: float) -> Pose | None:
     """Return the pose of a trajectory at a time; None before its first and after its last row."""
     table = np.array(rows)
     if not table[0, 0] - 1e-6 <= time <= table[-1, 0] + 1e-6:
@@ -487,7 +495,7 @@ def _on(rows: Sequence[tuple[float, float, float, float]], time: float) -> Pose 
     return Pose(*(float(np.interp(time, table[:, 0], column)) for column in (table[:, 1], table[:, 2], yaw)))
 
 
-def _speed_on(rows: Sequence[tuple[float, float, float, float]], time: float, yaw: float) -> float:
+def _trajectory_speed(rows: Sequence[tuple[float, float, float, float]], time: float, yaw: float) -> float:
     """Return the speed of a trajectory along its heading in the segment that contains a time, m/s."""
     table = np.array(rows)
     segment = int(np.clip(np.searchsorted(table[:, 0], time, side="left") - 1, 0, len(table) - 2))
@@ -495,6 +503,6 @@ def _speed_on(rows: Sequence[tuple[float, float, float, float]], time: float, ya
     return float((dx * math.cos(yaw) + dy * math.sin(yaw)) / dt)
 
 
-def _bit(kind: AgentKind) -> Contact:
+def _contact_bit(kind: AgentKind) -> Contact:
     contacts = {AgentKind.WALKER: Contact.WALKER, AgentKind.BICYCLE: Contact.CYCLIST, AgentKind.PROP: Contact.STATIC}
     return contacts.get(kind, Contact.VEHICLE)

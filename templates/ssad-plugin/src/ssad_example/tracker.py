@@ -75,7 +75,7 @@ class Nearest:
         tracks = [(scene, track) for scene in now for track in self.tracks[scene]]
         if not tracks:
             return no_tracks()
-        last = Objects.joined([track.last for _, track in tracks])
+        last = Objects.cat([track.last for _, track in tracks])
         velocity = np.stack([track.velocity for _, track in tracks])
         heading = np.arctan2(velocity[:, 1], velocity[:, 0])
         return Tracks(

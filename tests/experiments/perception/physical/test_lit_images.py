@@ -15,7 +15,7 @@ from ssad.core.images import read_image
 from ssad.experiments.perception.physical.lit_images import LitClip, at_hour, lit_clips
 from ssad.recorders.target_images import record_clips
 from ssad.recorders.target_recording import Clips
-from ssad.rendering.camera.render import Weather
+from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.hours import HOURS
 from ssad.scenarios.static.physical.lights import Flashlight, Projector, Shadow
 from ssad.scenarios.static.physical.lights.light import at_values
@@ -30,7 +30,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict
 
 
 def test_an_hour_is_clear_and_has_the_suns_direction() -> None:
-    rain = Weather(0.7, 2.2, 0.95, fog=0.01, wet=0.5, turn=3.0)
+    rain = SceneWeather(0.7, 2.2, 0.95, fog=0.01, wet=0.5, turn=3.0)
     assert at_hour(rain, "recorded") == rain
     for hour in HOURS[1:]:
         shown = at_hour(rain, hour)

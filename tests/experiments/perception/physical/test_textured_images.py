@@ -22,15 +22,15 @@ from ssad.recorders.nuscenes import SENSOR
 from ssad.recorders.target_images import TARGET, clip_views, record_clips
 from ssad.recorders.target_recording import Clips
 from ssad.recorders.viewpoints import look_at
-from ssad.rendering.camera.render import Picture, render
-from ssad.rendering.camera.scene import Layer
-from ssad.rendering.camera.texture import paint_mask, retexture, taps_of
+from ssad.rendering.camera.render import Rendering, render
+from ssad.rendering.camera.scene import TextureLayer
+from ssad.rendering.camera.texture import paint_mask, retexture, texture_taps
 from ssad.rendering.camera.torch_jpeg import jpeg
 from ssad.rendering.camera.torch_sensor import develop
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.physical.textures.carrier import Road
 
-LAYERS = (Layer(0), Layer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
+LAYERS = (TextureLayer(0), TextureLayer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
 CAR = TargetCar("suv", "red", seed=2)
 SIZES: dict[int, int | tuple[int, int]] = {0: 32, 1: (16, 24)}
 
@@ -61,7 +61,7 @@ def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
         picture = render(seen.scene, [seen.wearing(*LAYERS)])
         radiance = torch.tensor(picture.radiance)
         for number, size in SIZES.items():
-            radiance = retexture(taps_of(picture, size, texture=number), textures[number], radiance)
+            radiance = retexture(texture_taps(picture, size, texture=number), textures[number], radiance)
         developed = develop(radiance, float(picture.exposure[0]), SENSOR)
         before = torch.tensor(read_image(folder / "images" / clip.file)).permute(2, 0, 1)[None].float() / 255
         _, y, w, h = next(o["bbox"] for o in seen.objects if o["target"])
@@ -75,26 +75,26 @@ def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def same_metal(tmp_path_factory: pytest.TempPathFactory) -> list[Picture]:
+def same_metal(tmp_path_factory: pytest.TempPathFactory) -> list[Rendering]:
     """A named car in each of two towns, from the same places: behind its right, and before its left from above."""
     out = tmp_path_factory.mktemp("towns") / "clips"
     record_clips(Clips(out, (("Twinford", 1), ("Oldmarket", 1)), (), size=160, behind=8.0, target=CAR), workers=0)
     eyes = (np.array([-6.0, -2.5, 1.8]), np.array([5.0, 3.5, 3.0]))
     found = []
     for seen in clip_views(out):
-        worn = seen.wearing(Layer(0))
-        at = worn.things[0].pose
+        worn = seen.wearing(TextureLayer(0))
+        at = worn.objects[0].pose
         own = [replace(worn, pose=at @ look_at(eye, np.array([0.0, 0.0, 0.7])), focus=None) for eye in eyes]
         found.append(render(seen.scene, own))
     return found
 
 
-def numbered(picture: Picture, size: tuple[int, int]) -> np.ndarray:
+def numbered(picture: Rendering, size: tuple[int, int]) -> np.ndarray:
     """Where in its texture each pixel [B * H * W, 2] shows a car, u and v as its texels say; NaN where none is seen."""
     height, width = size
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     texels = torch.stack([(columns + 0.5) / width, (rows + 0.5) / height, torch.ones(size)]).double()
-    taps = taps_of(picture, size, mask=paint_mask(CAR.mesh(), size), dtype=torch.float64)
+    taps = texture_taps(picture, size, mask=paint_mask(CAR.mesh(), size), dtype=torch.float64)
     nothing = torch.zeros((*picture.tag.shape, 3), dtype=torch.float64)
     shown, full = (retexture(taps, one, nothing).reshape(-1, 3) for one in (texels, torch.ones_like(texels)))
     return (shown / full)[:, :2].numpy()
@@ -114,7 +114,7 @@ def faces_at(places: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [(64, 64), (192, 192), (96, 160)])
-def test_a_texture_lies_on_the_same_faces_in_every_town(same_metal: list[Picture], size: tuple[int, int]) -> None:
+def test_a_texture_lies_on_the_same_faces_in_every_town(same_metal: list[Rendering], size: tuple[int, int]) -> None:
     """Whatever its size: its texels are numbered, and each pixel of the car shows the same ones."""
     here, there = (numbered(picture, size) for picture in same_metal)
     free = np.logical_and(*((picture.tag == TARGET).ravel() for picture in same_metal))
@@ -147,7 +147,7 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
         assert np.array_equal(a.radiance, b.radiance)
         assert np.array_equal(a.fragments, b.fragments)
     with pytest.raises(AssertionError, match="rendered again"):
-        next(textured_clips(folder, (Layer(0, opacity=0.9),)))
+        next(textured_clips(folder, (TextureLayer(0, opacity=0.9),)))
     with monkeypatch.context() as other:
         other.setattr(module, "recording_of", lambda *given: {"seed": 1})
         with pytest.raises(AssertionError, match="rendered again"):
@@ -230,7 +230,9 @@ def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path
     assert rows.mean() > y + h - 2, "nearer than the car"
     assert x < columns.mean() < x + w
     anew = render(seen.scene, [seen.wearing(surface.layer)])
-    radiance = retexture(taps_of(anew, surface.size), torch.full((3, *surface.size), 0.9), torch.tensor(anew.radiance))
+    radiance = retexture(
+        texture_taps(anew, surface.size), torch.full((3, *surface.size), 0.9), torch.tensor(anew.radiance)
+    )
     whole = jpeg(develop(radiance, float(anew.exposure[0]), SENSOR), 92)
     changed = torch.as_tensor(brighter)
     torch.testing.assert_close(white[..., changed], whole[..., changed], rtol=0, atol=1e-5)

@@ -18,8 +18,8 @@ from ssad.core.types import U8
 from ssad.experiments.perception.physical.target_views import TargetClips, drive_of, target_truth
 from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturedClip, seen_part
 from ssad.recorders.target_images import TARGET, ClipView, clip_rows, clip_views
-from ssad.rendering.camera.render import Weather, render
-from ssad.rendering.camera.scene import Scene
+from ssad.rendering.camera.render import SceneWeather, render
+from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import NO_EDIT, SceneEdit, render_with
 from ssad.rendering.hours import at_hour
 from ssad.scenarios.static.physical.lights.light import Target
@@ -39,7 +39,7 @@ class LitClip:
     """
 
     clip: ClipView
-    scene: Scene
+    scene: RenderScene
     cards: int
 
     @property
@@ -53,8 +53,9 @@ class LitClip:
         scene, first_card = self.scene, self.cards + 1
         if edit.cards:
             key = ("cards", *((card.away, card.outline.tobytes()) for card in edit.cards))
-            scene = self.scene.kept(
-                key, lambda: Scene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device)
+            scene = self.scene.cached(
+                key,
+                lambda: RenderScene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device),
             )
         view = edit.on(self.clip.view, TARGET, cards=range(first_card, first_card + len(edit.cards)))
         rendering = render_with(scene, [view], edit.textures, edit.masks)
@@ -120,9 +121,9 @@ def lit_clips(
         UnknownNameError: There is no such hour.
     """
     # Reject an unknown hour before any scene is built.
-    at_hour(Weather(), hour)
+    at_hour(SceneWeather(), hour)
     file_names = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
-    scene_pair: tuple[Scene, Scene] | None = None
+    scene_pair: tuple[RenderScene, RenderScene] | None = None
     for recorded in clip_views(
         folder,
         split=split,
@@ -135,7 +136,7 @@ def lit_clips(
         if scene_pair is None or scene_pair[0] is not recorded.scene:
             scene_pair = (
                 recorded.scene,
-                Scene(recorded.scene.street, [*recorded.scene.meshes, BLIND.mesh()], device=device),
+                RenderScene(recorded.scene.street, [*recorded.scene.meshes, BLIND.mesh()], device=device),
             )
         yield LitClip(recorded, scene_pair[1], len(recorded.scene.meshes))
 

@@ -24,7 +24,7 @@ from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
 from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
 from ssad.recorders.target_recording import Clips
-from ssad.rendering.camera.scene import Decal, Layer
+from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.target import TargetCar, parse_target
 from ssad.scenarios.static.perturbation import Perturbation, TargetImages
@@ -294,7 +294,7 @@ def see_all(
         run_all(pool, see_surfaces, tasks, progress=progress)
 
 
-def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer | Decal, ...]]:
+def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[TextureLayer | TextureDecal, ...]]:
     """Where textures go, each alone, as `see_clips` takes them."""
     return [(surface_of(target, surface).layer,) for surface in surfaces]
 

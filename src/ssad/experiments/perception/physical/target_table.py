@@ -16,7 +16,7 @@ from ssad.experiments.perception.digital.points import named
 from ssad.experiments.perception.open_loop import TableRow
 from ssad.recorders.nuscenes import WEATHERS
 from ssad.recorders.target_recording import AZIMUTHS, ELEVATIONS, Clips
-from ssad.rendering.camera.render import Weather
+from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.hours import at_hour
 from ssad.rendering.target import Target, TargetCar, parse_target
 from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_carrier, make_physical
@@ -438,7 +438,7 @@ def check_lights(table: TargetTable) -> None:
     """Raise ConfigError or UnknownNameError for an attack, an hour or a setting that does not exist."""
     for entry in table.lights:
         attack = make_light(entry.name, entry.options)
-        at_hour(Weather(), entry.hour)
+        at_hour(SceneWeather(), entry.hour)
         if isinstance(attack, Projector):
             attack.training(**entry.settings)
         else:

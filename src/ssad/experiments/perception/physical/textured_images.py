@@ -25,11 +25,11 @@ from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
 from ssad.recorders.target_images import ClipView, clip_rows, clip_views, recording_of
-from ssad.rendering.camera.render import Picture, render
-from ssad.rendering.camera.scene import Decal, Layer
-from ssad.rendering.camera.sensor import SENSOR, Sensor
-from ssad.rendering.camera.texture import Taps, joined, retexture, taps_of
-from ssad.rendering.camera.torch_sensor import Rectangle, Window, large_draws
+from ssad.rendering.camera.render import Rendering, render
+from ssad.rendering.camera.scene import TextureDecal, TextureLayer
+from ssad.rendering.camera.sensor import SENSOR, SensorModel
+from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
+from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, large_draws
 
 KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
@@ -48,7 +48,7 @@ class TexturedClip:
         corner: Row and column at which `radiance` begins in it.
         radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
         exposure: What radiance is multiplied by.
-        fragments: What pixels of the part see of the textures (see `Picture.fragments`).
+        fragments: What pixels of the part see of the textures (see `Rendering.fragments`).
     """
 
     file: str
@@ -66,7 +66,7 @@ class TexturedClip:
         *,
         masks: Mapping[int, Bool] | None = None,
         quality: int | None = 92,
-        sensor: Sensor = SENSOR,
+        sensor: SensorModel = SENSOR,
         device: str | torch.device = "cpu",
     ) -> Wearing:
         """Prepare the image for textures of certain sizes.
@@ -90,14 +90,14 @@ class TexturedClip:
         (top, left), (height, width) = self.corner, self.image.shape[:2]
         rectangle = (top, top + self.radiance.shape[0]), (left, left + self.radiance.shape[1])
         taps = {
-            number: _moved(taps_of(self, texture_size, texture=number, mask=masks.get(number)), rectangle, width)
+            number: _moved(texture_taps(self, texture_size, texture=number, mask=masks.get(number)), rectangle, width)
             for number, texture_size in sizes.items()
         }
-        touched_pixels = torch.cat([texture_taps.pixel for texture_taps in taps.values()])
-        window = Window.around(touched_pixels, (1, height, width), sensor, quality=quality)
+        touched_pixels = torch.cat([lookups.pixel for lookups in taps.values()])
+        window = ChangedWindow.around(touched_pixels, (1, height, width), sensor, quality=quality)
         radiance = _cut(torch.tensor(self.radiance), rectangle, window.read[0])
         recorded_image = torch.tensor(self.image).to(device).permute(2, 0, 1)
-        device_taps = {number: texture_taps.to(device) for number, texture_taps in taps.items()}
+        device_taps = {number: lookups.to(device) for number, lookups in taps.items()}
         return Wearing(window, radiance.to(device), self.exposure, device_taps, recorded_image)
 
 
@@ -113,7 +113,7 @@ class Wearing:
         before: The whole image as recorded, uint8 [3, H, W].
     """
 
-    window: Window
+    window: ChangedWindow
     part: Tensor
     exposure: float
     taps: Mapping[int, Taps]
@@ -156,7 +156,7 @@ class Wearing:
         return cls.developed(pictures, radiance, window, noise)
 
     @staticmethod
-    def lit(pictures: Sequence[Wearing], textures: Mapping[int, Tensor]) -> tuple[Tensor, Window]:
+    def lit(pictures: Sequence[Wearing], textures: Mapping[int, Tensor]) -> tuple[Tensor, ChangedWindow]:
         """The first half of `together`: the radiance [B, h, w, 3] that a window of all pictures reads."""
         first_window, batch_size = pictures[0].window, len(pictures)
         missing = sorted(set(pictures[0].taps) - set(textures))
@@ -164,7 +164,7 @@ class Wearing:
             raise ConfigError(f"no texture {missing[0]}")
         window = first_window
         if batch_size > 1:
-            window = Window.of(
+            window = ChangedWindow.of(
                 [prepared.window.changed[0] for prepared in pictures],
                 (batch_size, *first_window.shape[1:]),
                 first_window.sensor,
@@ -179,13 +179,13 @@ class Wearing:
             window_radiance[target_slices] = prepared.part[source_slices]
         corners = [(read_rectangle[0][0], read_rectangle[1][0]) for read_rectangle in window.read]
         for layer in pictures[0].taps:
-            taps = joined([prepared.taps[layer] for prepared in pictures], corners, image_width, window_size)
+            taps = combine_taps([prepared.taps[layer] for prepared in pictures], corners, image_width, window_size)
             radiance = retexture(taps, textures[layer], radiance)
         return radiance, window
 
     @staticmethod
     def developed(
-        pictures: Sequence[Wearing], radiance: Tensor, window: Window, noise: Sequence[torch.Generator] | None
+        pictures: Sequence[Wearing], radiance: Tensor, window: ChangedWindow, noise: Sequence[torch.Generator] | None
     ) -> Tensor:
         """The second half of `together`: what lens, sensor and JPEG make of it, in the whole pictures."""
         noise_sample = None
@@ -240,7 +240,11 @@ def _moved(taps: Taps, own: Rectangle, width: int) -> Taps:
 
 
 def textured_clips(
-    folder: Path, layers: Sequence[Layer | Decal] = (Layer(0),), *, split: str = "all", device: str = "cpu"
+    folder: Path,
+    layers: Sequence[TextureLayer | TextureDecal] = (TextureLayer(0),),
+    *,
+    split: str = "all",
+    device: str = "cpu",
 ) -> Iterator[TexturedClip]:
     """Yield the images of a recording whose targets have layers, in order; each is rendered once and then stored.
 
@@ -271,7 +275,7 @@ def textured_clips(
         yield TexturedClip(file, row, objects, image, corner, cached["radiance"], exposure, cached["fragments"])
 
 
-def unseen_parts(folder: Path, variants: Sequence[Sequence[Layer | Decal]]) -> list[int]:
+def unseen_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]]) -> list[int]:
     """Return the parts of a recording that are not fully cached for each of several sets of layers.
 
     Raises:
@@ -287,7 +291,9 @@ def unseen_parts(folder: Path, variants: Sequence[Sequence[Layer | Decal]]) -> l
     return list(dict.fromkeys(missing_parts))
 
 
-def see_clips(folder: Path, variants: Sequence[Sequence[Layer | Decal]], *, part: int, device: str = "cpu") -> None:
+def see_clips(
+    folder: Path, variants: Sequence[Sequence[TextureLayer | TextureDecal]], *, part: int, device: str = "cpu"
+) -> None:
     """Render what a part of a recording shows of each of several sets of layers, for `textured_clips`.
 
     Args:
@@ -311,14 +317,14 @@ def see_clips(folder: Path, variants: Sequence[Sequence[Layer | Decal]], *, part
                 safeio.save_npz(cache_folder / f"{recorded.file}.npz", _kept(recorded, layers))
 
 
-def _kept_in(folder: Path, layers: Sequence[Layer | Decal], split: str) -> Path:
+def _kept_in(folder: Path, layers: Sequence[TextureLayer | TextureDecal], split: str) -> Path:
     """Return the cache folder of a set of layers."""
     keys = [_layer_key(layer) for layer in layers]
     # The source is part of the key: another version may render other bits.
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
-def seen_part(picture: Picture) -> dict[str, Any]:
+def seen_part(picture: Rendering) -> dict[str, Any]:
     """What is kept of one rendered picture: the part around what shows textures."""
     height, width = picture.radiance.shape[1:3]
     rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
@@ -333,7 +339,7 @@ def seen_part(picture: Picture) -> dict[str, Any]:
     }
 
 
-def _kept(clip: ClipView, layers: Sequence[Layer | Decal]) -> dict[str, Any]:
+def _kept(clip: ClipView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
     return seen_part(render(clip.scene, [clip.wearing(*layers)]))
 
 
@@ -345,10 +351,10 @@ def _span(places: Any, most: int) -> tuple[int, int]:
     return start, min(int(places.max()) + MARGIN + 1, most)
 
 
-def _layer_key(layer: Layer | Decal) -> tuple[object, ...]:
+def _layer_key(layer: TextureLayer | TextureDecal) -> tuple[object, ...]:
     """Return all properties of a layer or decal that decide its contribution."""
     mask = None if layer.mask is None else (layer.mask.shape, hashlib.sha256(layer.mask.tobytes()).hexdigest())
-    if isinstance(layer, Decal):
+    if isinstance(layer, TextureDecal):
         return layer.texture, layer.pose.tolist(), layer.size, layer.depth, layer.tag, layer.opacity, mask
     return layer.texture, layer.rectangle, layer.opacity, mask
 

@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Geometry:
-    """Arrays of a scene, as in `ssad.rendering.camera.scene.Scene`."""
+    """Arrays of a scene, as in `ssad.rendering.camera.scene.RenderScene`."""
 
     vertices: wp.array(dtype=wp.vec3)
     faces: wp.array2d(dtype=int)
@@ -31,7 +31,7 @@ class Geometry:
 
 @wp.struct
 class Drawn:
-    """Ranges of listed faces, each under one matrix (see `ssad.rendering.camera.scene.Draws`).
+    """Ranges of listed faces, each under one matrix (see `ssad.rendering.camera.scene.DrawCalls`).
 
     Attributes:
         samples: Key of what each sample shows.

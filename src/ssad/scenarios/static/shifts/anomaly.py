@@ -22,9 +22,9 @@ from ssad.core.rotations import quaternion_to_yaw, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8, Bool
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
-from ssad.rendering.camera.render import PLAIN, View, Weather, render
-from ssad.rendering.camera.scene import Scene, Thing
-from ssad.rendering.camera.sensor import Sensor
+from ssad.rendering.camera.render import PLAIN, SceneWeather, View, render
+from ssad.rendering.camera.scene import RenderScene, SceneObject
+from ssad.rendering.camera.sensor import SensorModel
 from ssad.rendering.meshes.mesh import Material, Mesh, build
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, to_batch
@@ -36,8 +36,8 @@ TRIES = 60  # positions to try for an object
 EGO = (5.0, 2.2, 1.4)  # m: length and width of the ego, and distance of its centre ahead of its origin
 CLEAR = 0.5  # m: gap between an object and everything else
 MOVES = 0.5  # s: interval of samples, over which moving boxes sweep the ground
-OVERCAST = Weather(0.9, 0.8, 0.8)  # soft light, since the sun of the image is unknown
-PLAIN_SENSOR = Sensor(blur=0.0, mosaic=False)  # only its radiance is used
+OVERCAST = SceneWeather(0.9, 0.8, 0.8)  # soft light, since the sun of the image is unknown
+PLAIN_SENSOR = SensorModel(blur=0.0, mosaic=False)  # only its radiance is used
 ALBEDO = 0.16  # of a road
 DARKEST = 0.75  # maximum share of the light that a contact shadow takes
 CELL, AROUND = 0.05, 0.8  # m: cell of a contact shadow, and its extent around the object
@@ -161,7 +161,7 @@ class _Model:
         corner: x, y of the corner of `shadow` in that frame, m.
     """
 
-    stage: Scene
+    stage: RenderScene
     paint: tuple[float, float, float]
     shadow: F32
     corner: F64
@@ -171,7 +171,7 @@ class _Model:
 def _model(kind: str, style: str, seed: int, size: tuple[float, float, float]) -> _Model:
     draws = generator("anomaly", kind, style, seed)
     mesh = make_body(kind, style=style, size=size, generator=draws)
-    return _Model(Scene(None, [mesh]), draw_paint(draws), *_contact(mesh))
+    return _Model(RenderScene(None, [mesh]), draw_paint(draws), *_contact(mesh))
 
 
 def _contact(mesh: Mesh) -> tuple[F32, F64]:
@@ -203,8 +203,10 @@ def _road_light() -> F64:
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 30.0
     road_mesh = build(corners, np.array([[0, 1, 2], [0, 2, 3]]), materials=ground)
     camera_pose = np.array([[0.0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, -1, 2.0], [0, 0, 0, 1]])
-    view = View(Camera.typical(8, 8), camera_pose, (Thing(0, np.eye(4), tag=1),), OVERCAST, PLAIN_SENSOR)
-    return np.asarray(render(Scene(None, [road_mesh]), [view], quality=PLAIN).radiance[0].mean((0, 1)), np.float64)
+    view = View(Camera.typical(8, 8), camera_pose, (SceneObject(0, np.eye(4), tag=1),), OVERCAST, PLAIN_SENSOR)
+    return np.asarray(
+        render(RenderScene(None, [road_mesh]), [view], quality=PLAIN).radiance[0].mean((0, 1)), np.float64
+    )
 
 
 # ---------------------------------------------------------------- pictures
@@ -322,7 +324,7 @@ class _Canvas:
         view = View(
             Camera(window_width * supersampling, window_height * supersampling, intrinsic),
             camera_pose,
-            (Thing(0, local_pose, model.paint, 1),),
+            (SceneObject(0, local_pose, model.paint, 1),),
             OVERCAST,
             PLAIN_SENSOR,
         )

@@ -70,7 +70,7 @@ class ShiftedCamera:
         return self.spec.family == "object" or self.spec.places_objects
 
     def _frame(self, sight: Sight, depth: Any, speed: F32, dt: float) -> Frame:
-        key, step = sight.looks.key, sight.moment.step
+        key, step = sight.appearance.key, sight.moment.step
         sample = f"{key}/{step}/{sight.agent}/{self.camera.camera.channel}"
         boxes, ego_velocity = boxes_of(sight, speed) if self._needs_boxes else (TrackedBoxes.empty(), np.zeros(3))
         return Frame(self.camera.camera, key, sample, step * dt, sight.pose, ego_velocity, boxes, depth=depth)
@@ -121,7 +121,10 @@ def boxes_of(sight: Sight, speed: F32) -> tuple[TrackedBoxes, F64]:
     rows = np.flatnonzero(sight.moment.active)
     rows = rows[rows != sight.agent]
     sizes = np.array(
-        [(model.length, model.width, model.height) for model in (MODELS[sight.looks.models[agent]] for agent in rows)]
+        [
+            (model.length, model.width, model.height)
+            for model in (MODELS[sight.appearance.models[agent]] for agent in rows)
+        ]
     )
     sizes = sizes.reshape(-1, 3).astype(np.float64)
     centre = np.column_stack([pose[rows, :2], 0.5 * sizes[:, 2]]).reshape(-1, 3)

@@ -16,10 +16,10 @@ from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.rotations import upright_pose
 from ssad.rendering.camera.photometry import per_lux
-from ssad.rendering.camera.render import View, Weather, render
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.render import SceneWeather, View, render
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.camera.scene_edit import SceneEdit
-from ssad.rendering.camera.sensor import Sensor
+from ssad.rendering.camera.sensor import SensorModel
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 from ssad.scenarios.static.physical.lights import (
@@ -43,7 +43,7 @@ TAG = 5
 TARGET = Target(4.0, 2.0, 1.5)
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 CAMERA = Camera(128, 96, np.array([[220.0, 0, 64.0], [0, 220.0, 48.0], [0, 0, 1]]))
-PLAIN = Sensor(blur=0.0, mosaic=False)
+PLAIN = SensorModel(blur=0.0, mosaic=False)
 SEARCHED: tuple[LightAttack, ...] = (Shadow(), Laser(), Flashlight())
 SETTINGS: dict[str, dict[str, float]] = {
     "shadow": {"left_a": -0.8, "up_a": 0.1, "left_b": 0.8, "up_b": 0.2, "left_c": 0.1, "up_c": 1.3},
@@ -64,12 +64,12 @@ SETTINGS: dict[str, dict[str, float]] = {
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> RenderScene:
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) * 60
     ground = build(corners, np.array([[0, 1, 2], [0, 2, 3]]), materials=GREY)
     block = meshes.box((4.0, 2.0, 1.5), material=GREY, centre=(0.0, 0.0, 0.75))
     cards = [mesh for name in ("shadow",) for mesh in edit_of(name).meshes()]
-    return Scene(None, [ground, block, BLIND.mesh(), *cards])
+    return RenderScene(None, [ground, block, BLIND.mesh(), *cards])
 
 
 def edit_of(name: str) -> SceneEdit:
@@ -77,24 +77,28 @@ def edit_of(name: str) -> SceneEdit:
     return attack.edit(SETTINGS[name], TARGET)  # type: ignore[no-any-return]
 
 
-def view(weather: Weather) -> View:
+def view(weather: SceneWeather) -> View:
     """From 10 m behind a block that stands turned in the world."""
     turn = upright_pose(3.0, -2.0, 0.7)
     ahead = FORWARD.copy()
     ahead[:3, 3] = -12.0, 0.0, 1.6
     eye = turn @ ahead
-    return View(CAMERA, eye, (Thing(0, np.eye(4)), Thing(1, turn, tag=TAG)), weather, PLAIN)
+    return View(CAMERA, eye, (SceneObject(0, np.eye(4)), SceneObject(1, turn, tag=TAG)), weather, PLAIN)
 
 
-HOURS = {"shadow": Weather(0.5, 0.7 + np.pi + 0.4, 0.0), "laser": Weather(-0.3), "flashlight": Weather(-0.3)}
+HOURS = {
+    "shadow": SceneWeather(0.5, 0.7 + np.pi + 0.4, 0.0),
+    "laser": SceneWeather(-0.3),
+    "flashlight": SceneWeather(-0.3),
+}
 
 
-def lit(scene: Scene, name: str) -> LitPicture:
+def lit(scene: RenderScene, name: str) -> LitPicture:
     return lit_picture(scene, view(HOURS[name]), TAG, slice(0, 96), slice(0, 128), blind=2)
 
 
 @pytest.mark.parametrize("attack", SEARCHED, ids=lambda one: str(one.name))
-def test_the_quick_model_is_what_is_rendered(scene: Scene, attack: LightAttack) -> None:
+def test_the_quick_model_is_what_is_rendered(scene: RenderScene, attack: LightAttack) -> None:
     """But for shadow maps and edges: on the target, the rest of the light is the same within a few percent."""
     picture, given = lit(scene, attack.name), edit_of(attack.name)
     seen = given.on(view(HOURS[attack.name]), TAG, cards=range(3, 3 + len(given.cards)))
@@ -109,7 +113,7 @@ def test_the_quick_model_is_what_is_rendered(scene: Scene, attack: LightAttack) 
     assert (np.abs(image - full.image[0]).max(-1) < 4).mean() > 0.93
 
 
-def test_a_shadow_takes_what_the_sun_gives_and_no_more(scene: Scene) -> None:
+def test_a_shadow_takes_what_the_sun_gives_and_no_more(scene: RenderScene) -> None:
     picture = lit(scene, "shadow")
     change = Shadow().change(at_values(SETTINGS["shadow"]), picture, TARGET)[0]
     assert float(change.max()) <= 0.0
@@ -120,7 +124,7 @@ def test_a_shadow_takes_what_the_sun_gives_and_no_more(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("attack", [Laser(), Flashlight()], ids=lambda one: str(one.name))
-def test_a_lamp_gives_no_more_light_than_its_power(scene: Scene, attack: LightAttack) -> None:
+def test_a_lamp_gives_no_more_light_than_its_power(scene: RenderScene, attack: LightAttack) -> None:
     """What reaches a plane across the beam, in lumen; and no settings exceed the device."""
     values = SETTINGS[attack.name]
     (lamp,) = attack.edit(values, TARGET).lamps
@@ -139,7 +143,7 @@ def test_a_lamp_gives_no_more_light_than_its_power(scene: Scene, attack: LightAt
         radiance=torch.zeros_like(points),
     )
     light = attack.change(at_values(values), plane, TARGET)[0].numpy()
-    lumens = (light @ [0.2126, 0.7152, 0.0722]).sum() * (x[1] - x[0]) * (y[1] - y[0]) / per_lux(Weather(-0.3))
+    lumens = (light @ [0.2126, 0.7152, 0.0722]).sum() * (x[1] - x[0]) * (y[1] - y[0]) / per_lux(SceneWeather(-0.3))
     power = attack.power(values)
     assert power is not None
     assert lumens == pytest.approx(power, rel=0.05)

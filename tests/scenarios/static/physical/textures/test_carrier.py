@@ -12,7 +12,7 @@ from ssad.core.errors import ConfigError
 from ssad.recorders.viewpoints import look_at
 from ssad.rendering.camera.render import View, render
 from ssad.rendering.camera.rig import RIG, rig_camera
-from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.scene import RenderScene, SceneObject
 from ssad.rendering.camera.texture import PRINTABLE
 from ssad.rendering.meshes.mesh import Material, Mesh, box
 from ssad.rendering.target import TargetCar, TargetSign, TargetWalker
@@ -95,8 +95,8 @@ def test_a_patch_lies_on_the_rear_of_every_car_in_its_size(style: str) -> None:
     behind = np.eye(4)
     behind[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x right, y down, z ahead
     behind[:3, 3] = low[0] - away, 0.0, height
-    view = View(camera, behind, (Thing(0, np.eye(4), tag=1, layers=(surface.layer,)),))
-    picture = render(Scene(None, [mesh]), [view])
+    view = View(camera, behind, (SceneObject(0, np.eye(4), tag=1, layers=(surface.layer,)),))
+    picture = render(RenderScene(None, [mesh]), [view])
     assert set(np.unique(picture.fragments["texture"])) == {0}
     rows, columns = np.divmod(picture.fragments["place"].astype(int), camera.width)
     pixel = camera.intrinsic[0, 0] / away
@@ -133,12 +133,12 @@ def test_a_patch_lies_on_its_panel_and_nowhere_else(
     mesh = target.mesh()
     surface = Patch(panel, width=size[0], height=size[1]).on(mesh)
     own = np.isin(mesh.panel, mesh.panel_indices(panel))
-    scene = Scene(None, [faces_of(mesh, own), faces_of(mesh, ~own)])
+    scene = RenderScene(None, [faces_of(mesh, own), faces_of(mesh, ~own)])
     camera, middle = rig_camera(CHANNEL, 320), np.array([0.0, 0.0, target.full_size[2] / 2])
     eyes = [look_at(middle + 2.0 * max(target.full_size) * np.array(one), middle) for one in FROM.values()]
     found = []
     for wearer in (0, 1):
-        things = tuple(Thing(k, np.eye(4), tag=k + 1, layers=(surface.layer,) * (k == wearer)) for k in (0, 1))
+        things = tuple(SceneObject(k, np.eye(4), tag=k + 1, layers=(surface.layer,) * (k == wearer)) for k in (0, 1))
         found.append(render(scene, [View(camera, eye, things) for eye in eyes]).fragments)
     on_panel, elsewhere = found
     assert not len(elsewhere), "on no other face"

@@ -85,6 +85,6 @@ def test_what_cannot_be_printed_ends_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="dots; from 1 to 16384"):
         export_texture(tmp_path, sign, dots=100_000)
     assert export_texture(tmp_path, sign, dots=100)
-    assert sign.live(1).attacked(("car",), "key") == "stop_sign"
+    assert sign.live(1).attacked_model(("car",), "key") == "stop_sign"
     with pytest.raises(ConfigError, match="8 x 8 texels, a patch on this body 4 x 4"):
         replace(sign, options=options | {"texels": 4}).on(TargetSign().mesh())

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ssad.core.detections import Dense, Truth
 from ssad.core.errors import ConfigError, FormatError
-from ssad.rendering.camera.scene import Layer
+from ssad.rendering.camera.scene import TextureLayer
 from ssad.scenarios.static.digital import Aim, make_objective
 from ssad.scenarios.static.digital.objectives import Hide, Situation
 from ssad.scenarios.static.physical import make_physical
@@ -32,7 +32,7 @@ from ssad.scenarios.static.physical.textures.optimise import (
 from ssad.scenarios.static.physical.textures.printing import NOMINAL, Expectation, conspicuousness
 from tests.scenarios.static.digital.toy_detector import CELL, ToyDetector, pattern, toy_scene
 
-SURFACE = Surface(Layer(0), (CELL, CELL), np.ones((CELL, CELL), bool), (1.0, 1.0))
+SURFACE = Surface(TextureLayer(0), (CELL, CELL), np.ones((CELL, CELL), bool), (1.0, 1.0))
 GAIN = 0.2
 PLAIN = TextureAttack("plain", "hide", epochs=12, rate=0.1, batch=2, smooth=0.0, printed=0.0, expectation=NOMINAL)
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
-from ssad.rendering.agent_edit import LiveAttack
-from ssad.rendering.camera.render import Weather
+from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.hours import at_hour
 from ssad.rendering.meshes.mesh import Mesh
@@ -63,7 +63,7 @@ class Shining:
             raise ConfigError(f"{self.attack}: there is no picture that it shows")
         return light.edit(self.colour, target)
 
-    def live(self, agent: int) -> LiveAttack:
+    def live(self, agent: int) -> AgentEdit:
         """Return the edit in which it shines on an agent of the closed loop.
 
         Raises:
@@ -72,7 +72,7 @@ class Shining:
         car = parse_target(self.target)
         if not isinstance(car, TargetCar):
             raise ConfigError(f"this light is made for {self.target}; only cars drive")
-        return LiveAttack(self.edit, car, agent)
+        return AgentEdit(self.edit, car, agent)
 
 
 def export_light(out: Path, made: Shining, *, name: str = "") -> list[Path]:
@@ -136,7 +136,7 @@ def load_light(folder: Path) -> Shining:
         )
         # Both calls only validate: a bad name should fail here, not in the middle of a drive.
         make_light(light.attack, light.options)
-        at_hour(Weather(), light.hour)
+        at_hour(SceneWeather(), light.hour)
         return light
     except (KeyError, TypeError) as error:
         raise FormatError(f"{folder / 'light.json'}: no exported light ({error}); export it again") from None

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssad.core.schema import VALUES, Least, Number, Part, Span
 from ssad.core.types import F64
-from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical.lights.lamps import added_light
 from ssad.scenarios.static.physical.lights.light import Away, Ranges, Target, aimed, at_values, numbers
@@ -77,7 +77,7 @@ class Flashlight:
 
     def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
         """Return the radiance that the spot light adds to an image."""
-        return added_light(Lamp(_IDENTITY, 1.0, soft=self.soft), picture, **self._lamp(values, target))
+        return added_light(SceneLamp(_IDENTITY, 1.0, soft=self.soft), picture, **self._lamp(values, target))
 
     def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
         """Return the spot light as a scene edit."""
@@ -92,8 +92,8 @@ class Flashlight:
 _IDENTITY: F64 = numbers(torch.eye(4, dtype=torch.float64)[None])
 
 
-def lamp_of(found: Mapping[str, F64], **more: Any) -> Lamp:
+def lamp_of(found: Mapping[str, F64], **more: Any) -> SceneLamp:
     """A lamp with a pose, a power, a spread and a colour."""
     spread_x, spread_y = found["spread"].tolist()
     red, green, blue = found["colour"].tolist()
-    return Lamp(found["pose"], float(found["power"]), (spread_x, spread_y), (red, green, blue), **more)
+    return SceneLamp(found["pose"], float(found["power"]), (spread_x, spread_y), (red, green, blue), **more)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.torch_lamp import lamp_light
 from ssad.scenarios.static.physical.lights.lit_image import LitPicture
 
 
 def added_light(
-    lamp: Lamp, picture: LitPicture, *, pose: Tensor, power: Tensor, spread: Tensor, colour: Tensor
+    lamp: SceneLamp, picture: LitPicture, *, pose: Tensor, power: Tensor, spread: Tensor, colour: Tensor
 ) -> Tensor:
     """What a lamp adds to the radiance of a picture under N settings [N, h, w, 3], without shadows; differentiable.
 

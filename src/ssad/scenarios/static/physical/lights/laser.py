@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ssad.core.schema import VALUES, Above, Least, Number, Span
-from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical.lights.flashlight import _IDENTITY, lamp_of
 from ssad.scenarios.static.physical.lights.lamps import added_light
@@ -79,7 +79,7 @@ class Laser:
 
     def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
         """Return the radiance that the laser adds to an image."""
-        return added_light(Lamp(_IDENTITY, 1.0, square=True), picture, **self._lamp(values, target))
+        return added_light(SceneLamp(_IDENTITY, 1.0, square=True), picture, **self._lamp(values, target))
 
     def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
         """Return the laser as a scene edit."""

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from ssad.core.types import F64
 from ssad.rendering.camera.photometry import per_lux
-from ssad.rendering.camera.render import View, light_of, render
-from ssad.rendering.camera.scene import Scene
-from ssad.rendering.camera.scene_edit import Card, SceneEdit
-from ssad.rendering.camera.sensor import Sensor
+from ssad.rendering.camera.render import View, render, scene_light
+from ssad.rendering.camera.scene import RenderScene
+from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
+from ssad.rendering.camera.sensor import SensorModel
 from ssad.rendering.camera.torch_sensor import develop
 
-BLIND: Final = Card(np.array([[0.0, y, z] for y, z in ((-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0))]))
+BLIND: Final = ShadowCard(np.array([[0.0, y, z] for y, z in ((-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0))]))
 """Keeps the whole sun off a target."""
 
 
@@ -56,7 +56,7 @@ class LitPicture:
     exposure: float
     per_lux: float
     fog: float
-    sensor: Sensor
+    sensor: SensorModel
 
     def show(self, change: Tensor) -> Tensor:
         """Return images with more or less light in the crop around the target.
@@ -79,7 +79,14 @@ class LitPicture:
 
 
 def lit_picture(
-    scene: Scene, view: View, tag: int, rows: slice, columns: slice, *, blind: int, device: str | torch.device = "cpu"
+    scene: RenderScene,
+    view: View,
+    tag: int,
+    rows: slice,
+    columns: slice,
+    *,
+    blind: int,
+    device: str | torch.device = "cpu",
 ) -> LitPicture:
     """Render a view once, as a function of the light on a target.
 
@@ -95,8 +102,8 @@ def lit_picture(
     picture = render(scene, [view], surface=True)
     surface, crop = picture.surface, (0, rows, columns)
     assert surface is not None
-    pose = next(scene_object.pose for scene_object in view.things if scene_object.tag == tag)
-    sun = np.array(light_of(view.weather)[0][0])
+    pose = next(scene_object.pose for scene_object in view.objects if scene_object.tag == tag)
+    sun = np.array(scene_light(view.weather)[0][0])
     # Two renderings, with and without the sun on the target, give the sun's share.
     shaded = picture.radiance
     if sun[2] > 0.0:

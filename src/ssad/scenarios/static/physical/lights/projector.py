@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ssad.core.errors import ConfigError
 from ssad.core.schema import VALUES, Least, Number, Two, checked
-from ssad.rendering.camera.lamps import Lamp
-from ssad.rendering.camera.scene import Layer
+from ssad.rendering.camera.lamps import SceneLamp
+from ssad.rendering.camera.scene import TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.camera.texture import to_linear
 from ssad.scenarios.static.physical.lights.light import Away, Target, aimed, numbers
@@ -55,7 +55,7 @@ class Projector:
     name: str = "projector"
     search: str = field(default="gradient", init=False)
 
-    def lamp(self, target: Target) -> Lamp:
+    def lamp(self, target: Target) -> SceneLamp:
         """Return the projector as a lamp in the target's frame, power in lumen; it shows texture 0."""
         position = [
             target.rear - self.distance * float(np.cos(self.aside)),
@@ -72,14 +72,14 @@ class Projector:
             0.5 * self.size[0] * target.width * float(np.cos(self.aside)) / range_to_rear,
             0.5 * self.size[1] * target.height / range_to_rear,
         )
-        return Lamp(pose, self.lumens, spread, square=True, texture=0)
+        return SceneLamp(pose, self.lumens, spread, square=True, texture=0)
 
     def surface(self, target: Target) -> Surface:
         """Return the surface to train; all texels are visible."""
         width, height = self.size[0] * target.width, self.size[1] * target.height
         longest = max(width, height)
         size = max(1, round(self.texels * height / longest)), max(1, round(self.texels * width / longest))
-        return Surface(Layer(0), size, np.ones(size, bool), (width, height))
+        return Surface(TextureLayer(0), size, np.ones(size, bool), (width, height))
 
     def light_of(self, colour: Tensor) -> Tensor:
         """Return the transmitted share of the light [3, H, W] for an image in sRGB."""

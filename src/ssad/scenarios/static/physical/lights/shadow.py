@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ssad.core.schema import VALUES, Least, Number
 from ssad.core.types import F64
-from ssad.rendering.camera.scene_edit import Card, SceneEdit
+from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
 from ssad.scenarios.static.physical.lights.light import Ranges, Target
 from ssad.scenarios.static.physical.lights.lit_image import LitPicture
 
@@ -79,7 +79,7 @@ class Shadow:
 
     def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
         """Return the card as a scene edit."""
-        return SceneEdit(cards=(Card(self.outline(values, target), self.away),))
+        return SceneEdit(cards=(ShadowCard(self.outline(values, target), self.away),))
 
     def power(self, values: Mapping[str, float]) -> None:
         """Return None, since a card emits no light."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.core.schema import VALUES, Above, Least, Part, Two
 from ssad.core.types import F64, Bool
-from ssad.rendering.camera.scene import Decal, Layer
+from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.texture import paint_mask, printable, to_linear
 from ssad.rendering.meshes.mesh import Mesh, Rectangle
 from ssad.rendering.street.palette import ASPHALT
@@ -34,7 +34,7 @@ class Surface:
         metres: Width and height that the whole texture covers, m; for a camouflage those of the whole atlas.
     """
 
-    layer: Layer | Decal
+    layer: TextureLayer | TextureDecal
     size: tuple[int, int]
     mask: Bool
     metres: tuple[float, float]
@@ -42,7 +42,7 @@ class Surface:
     @property
     def place(self) -> tuple[float, ...]:
         """Position as plain numbers: u0, v0, u1, v1 on the atlas, or the pose and size of a decal."""
-        if isinstance(self.layer, Layer):
+        if isinstance(self.layer, TextureLayer):
             return self.layer.rectangle
         return (*self.layer.pose.ravel().tolist(), *self.layer.size)
 
@@ -167,7 +167,7 @@ class Road:
         pose[0, 3] = lowest[0] - self.behind - self.length / 2
         longest = max(self.width, self.length)
         size = max(1, round(self.texels * self.length / longest)), max(1, round(self.texels * self.width / longest))
-        decal = Decal(0, pose, (self.width, self.length), tag=0)
+        decal = TextureDecal(0, pose, (self.width, self.length), tag=0)
         return Surface(decal, size, np.ones(size, np.bool_), (self.width, self.length))
 
 
@@ -175,7 +175,7 @@ def _surface(mesh: Mesh, rectangle: Rectangle, size: tuple[int, int], metres: tu
     mask = paint_mask(mesh, size, rectangle)
     if not mask.any():
         raise ConfigError("no face of the body lies under the texture; choose another place")
-    return Surface(Layer(0, rectangle), size, mask, metres)
+    return Surface(TextureLayer(0, rectangle), size, mask, metres)
 
 
 def metres_of(mesh: Mesh, panel: str | None = None) -> tuple[float, float]:
@@ -215,7 +215,7 @@ def covered(surface: Surface, mesh: Mesh, paint: tuple[float, float, float]) -> 
         mesh: Mesh of the target.
         paint: Linear RGB of the target's paint; faces without paint have the colour of their material.
     """
-    if isinstance(surface.layer, Decal):
+    if isinstance(surface.layer, TextureDecal):
         return torch.tensor(ASPHALT)
     u0, v0, u1, v1 = surface.layer.rectangle
     u_centre, v_centre = mesh.uv.astype(np.float64).mean(1).T

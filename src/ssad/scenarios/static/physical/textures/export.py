@@ -17,8 +17,8 @@ from torch import Tensor
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.types import U8
-from ssad.rendering.agent_edit import LiveAttack
-from ssad.rendering.camera.scene import Decal
+from ssad.rendering.agent_edit import AgentEdit
+from ssad.rendering.camera.scene import TextureDecal
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.meshes.obj_writer import write_obj
@@ -68,13 +68,13 @@ class Print:
         """Return the edit of a scene in which the body has the texture."""
         surface = self.on(mesh)
         textures, masks = {0: albedo_of(self.colour)}, {0: surface.mask}
-        if isinstance(surface.layer, Decal):
+        if isinstance(surface.layer, TextureDecal):
             return SceneEdit(decals=(surface.layer,), textures=textures, masks=masks)
         return SceneEdit((surface.layer,), textures=textures, masks=masks)
 
-    def live(self, agent: int) -> LiveAttack:
+    def live(self, agent: int) -> AgentEdit:
         """An agent of the closed loop, a car or a walker, wears it, or every stop sign."""
-        return LiveAttack(self.edit, parse_target(self.target), agent)
+        return AgentEdit(self.edit, parse_target(self.target), agent)
 
 
 def load_print(folder: Path) -> Print:
@@ -162,7 +162,7 @@ def _resized(texels: Any, size: tuple[int, int]) -> U8:
 
 def _rectangle(surface: Surface) -> tuple[float, float, float, float]:
     """Return the rectangle of a texture in the atlas; an empty one if it lies beside the target."""
-    return (0.0, 0.0, 0.0, 0.0) if isinstance(surface.layer, Decal) else surface.layer.rectangle
+    return (0.0, 0.0, 0.0, 0.0) if isinstance(surface.layer, TextureDecal) else surface.layer.rectangle
 
 
 def _atlas(texels: Any, surface: Surface, target: Target) -> U8:

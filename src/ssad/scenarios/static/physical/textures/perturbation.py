@@ -18,7 +18,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.types import F32, F64, AgentKind, Episode
-from ssad.rendering.agent_edit import SIGN, LiveAttack
+from ssad.rendering.agent_edit import SIGN, AgentEdit
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.target import TargetSign, TargetWalker, class_of_target, parse_target
@@ -99,7 +99,7 @@ class Texture(Perturbation):
         """Return the suite in which an agent, or every stop sign, wears the texture."""
         return suite.with_agent_edit(self.worn_by(target))
 
-    def worn_by(self, agent: int) -> LiveAttack:
+    def worn_by(self, agent: int) -> AgentEdit:
         """Return the edit in which an agent wears the texture; the agent is ignored for signs.
 
         A patch has its trained size, or a smaller one if the body has no room for it.
