@@ -120,7 +120,7 @@ class OpenLoopKind(Kind):
         Column("NDS", "nuScenes detection score", "", "higher"),
         Column("AP_car", "average precision of cars", "", "higher"),
     )
-    patience = 2
+    patience: ClassVar[int | None] = 2
 
     def check(self, suite: Any) -> None:
         """Raise SSADError for wrong perturbations of a suite, before detectors are built."""

@@ -66,7 +66,7 @@ class Events:
         """Raise ConfigError if a sensor no longer exists: its missing events would pass for a clean drive."""
         for name, sensor in self._sensors.items():
             if not sensor.is_alive:
-                raise ConfigError(f"{self.where}: the ego's {name} is gone: somebody has destroyed it")
+                raise ConfigError(f"{self.server_name}: the ego's {name} is gone: somebody has destroyed it")
 
     @property
     def measured(self) -> dict[str, Any]:

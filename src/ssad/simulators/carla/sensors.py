@@ -218,13 +218,13 @@ class EgoSensors:
                 # Measurements of earlier frames that were never read are skipped.
                 measured_frame, encoded = self._queues[name].get(timeout=self.timeout)
             except (Empty, KeyError):
-                raise ConfigError(f"{self.where}: its sensor '{name}' sends nothing of frame {frame}") from None
+                raise ConfigError(f"{self.server_name}: its sensor '{name}' sends nothing of frame {frame}") from None
             if measured_frame == frame:
                 break
         try:
             value = self.blueprints[name].read(encoded)
         except ValueError as error:
-            raise ConfigError(f"{self.where}: its sensor '{name}' sends something else: {error}") from None
+            raise ConfigError(f"{self.server_name}: its sensor '{name}' sends something else: {error}") from None
         self._latest_readings[name] = frame, value
         return value
 

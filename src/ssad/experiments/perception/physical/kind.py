@@ -52,7 +52,7 @@ class Physical(OpenLoopKind):
     name = "physical"
     families: ClassVar = {"attacks": "texture", "lights": "light"}
     suite = PhysicalSuite
-    patience = None
+    patience: ClassVar[int | None] = None
     columns = (
         Column("AP50", "AP50", "", "lower"),
         Column("AP50_25", "AP50 above 0.25", "", "lower"),
