@@ -32,7 +32,7 @@ from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
-from ssad.detectors.on_scenes import box_table, detect, detect_2d, numbers
+from ssad.detectors.on_scenes import box_table, detect, detect_2d, score_figures
 from ssad.metrics.detection import BoxTable, filter_boxes, match, scene_intervals
 from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
 from ssad.recorders.target_images import clip_views
@@ -282,10 +282,10 @@ def solid_tables(name: str, root: Path, device: str) -> dict[str, Any]:
         seen = filter_boxes(box_table(boxes, truth), racks=truth.racks)
         matches = match(real, seen, samples=len(truth.samples))
         scores = matches.scores()
-        result.setdefault("by light", {})[group] = numbers(scores, few=True) | {"scenes": len(members)}
+        result.setdefault("by light", {})[group] = score_figures(scores, summary_only=True) | {"scenes": len(members)}
         if group != "all":
             continue
-        result |= numbers(scores) | {
+        result |= score_figures(scores) | {
             "errors": scores.label_tp_errors,
             "truth": dict(Counter(CLASSES[int(k)] for k in real.label)),
         }

@@ -31,7 +31,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.mono3d.multi_camera import merge_cameras
-from ssad.detectors.on_scenes import SampleBoxes, box_table, numbers
+from ssad.detectors.on_scenes import SampleBoxes, box_table, score_figures
 from ssad.metrics.detection import filter_boxes, match
 from ssad.training.detector import parse_changes
 
@@ -111,7 +111,7 @@ def main() -> None:
                 parts = pool.map(boxes_of, [(config, k, given.workers) for k in range(given.workers)], chunksize=1)
                 seen = box_table([one for part in parts for one in part], truth)
                 seen = filter_boxes(seen, racks=truth.racks)
-                tried[values] = numbers(match(real, seen, samples=len(truth.samples)).scores())
+                tried[values] = score_figures(match(real, seen, samples=len(truth.samples)).scores())
                 tried[values]["duplicates"] = pairs(real, seen)["duplicates a sample"]
             return tried[values]["mAP"] + tried[values]["NDS"]
 

@@ -34,7 +34,7 @@ from ssad.recorders.target_recording import Clips
 from ssad.rendering.camera.texture import to_linear
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Hide
-from ssad.scenarios.static.physical import Patch, View, albedo_of, control, make_physical, train_texture
+from ssad.scenarios.static.physical import Patch, TextureView, albedo_of, control, make_physical, train_texture
 from ssad.scenarios.static.physical.textures.inks import printable_colours
 from ssad.scenarios.static.physical.textures.printing import NOMINAL
 
@@ -111,7 +111,7 @@ def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: s
 
 
 def shown(
-    views: Sequence[tuple[str, View]], colours: Sequence[Tensor], look: Callable[[Tensor], Tensor], device: str
+    views: Sequence[tuple[str, TextureView]], colours: Sequence[Tensor], look: Callable[[Tensor], Tensor], device: str
 ) -> Iterator[tuple[str, Tensor, Truth]]:
     """Drive, picture and truth, each under its texture."""
     with torch.no_grad():
@@ -130,7 +130,7 @@ def measure(name: str, *, count: int, epochs: int, batch: int, home: Path, devic
     attack = make_physical("adv-patch", **settings)
     begin = time.perf_counter()
 
-    def train(pictures: list[View]) -> Tensor:
+    def train(pictures: list[TextureView]) -> Tensor:
         return train_texture(
             attack,
             detector,
@@ -138,7 +138,7 @@ def measure(name: str, *, count: int, epochs: int, batch: int, home: Path, devic
             pictures,
             start=control("grey", surface.size),
             printable=printable_colours(),
-            shown=variant.shown,
+            appearance=variant.shown,
             key=("patch", name),
             device=device,
         ).colour

@@ -31,7 +31,7 @@ from ssad.recorders.target_recording import Clips
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
-from ssad.scenarios.static.physical import Camouflage, Expectation, View, albedo_of, control
+from ssad.scenarios.static.physical import Camouflage, Expectation, TextureView, albedo_of, control
 from ssad.scenarios.static.physical.textures.optimise import TARGET
 from ssad.scenarios.static.physical.zoom import around_target
 
@@ -50,7 +50,9 @@ def clock(device: str) -> float:
 STAGES = ("print", "light", "sensor", "detector", "sensor_back", "texture_back")
 
 
-def step(detector: Any, views: list[View], colour: torch.Tensor, window: int | None, device: str) -> tuple[float, ...]:
+def step(
+    detector: Any, views: list[TextureView], colour: torch.Tensor, window: int | None, device: str
+) -> tuple[float, ...]:
     """Ms of each of `STAGES` in one step."""
     draws, pictures = [torch.Generator().manual_seed(k) for k in range(len(views))], [view.picture for view in views]
     times, truths = [clock(device)], [view.truth for view in views]

@@ -12,7 +12,7 @@ from torchvision.ops import generalized_box_iou_loss, sigmoid_focal_loss
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, sums, suppress
+from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, sum_by_image, suppress
 
 STRIDE = 8
 
@@ -91,7 +91,7 @@ class OwnDetector(nn.Module):
         each = sigmoid_focal_loss(dense.logit, wanted).sum(-1) * (label != -2)
         image, place = (label >= 0).nonzero(as_tuple=True)
         near = generalized_box_iou_loss(dense.box[image, place], assignment.extra["box"][image, place])
-        parts = {"class": each.sum(1), "box": sums(near, image, count)}
+        parts = {"class": each.sum(1), "box": sum_by_image(near, image, count)}
         places = (label >= 0).sum(1)
         if reduction == "image":
             return {name: value / places.clamp(min=1) for name, value in parts.items()}

@@ -13,17 +13,17 @@ from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.datasets.nuscenes.camera_truth import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.image_scores import (
-    PictureMatches,
-    gather_pictures,
-    match_pictures,
-    picture_figures,
-    read_picture_truth,
+    ImageMatches,
+    gather_images,
+    image_figures,
+    match_images,
+    read_image_truth,
 )
 from ssad.metrics.detection2d import Boxes2D, average_precision
 
 
 @pytest.fixture(scope="module")
-def matched(tiny_set: Path) -> tuple[PictureMatches, float]:
+def matched(tiny_set: Path) -> tuple[ImageMatches, float]:
     """Every second box, shaken and scored at random, and false ones; beside AP50 of all images as one list."""
     chance = np.random.default_rng(0)
     with NuScenes(tiny_set) as data:
@@ -48,7 +48,7 @@ def matched(tiny_set: Path) -> tuple[PictureMatches, float]:
                 score = chance.random(len(label))
                 flat.append((truth, label, box, score))
                 own.append(Detections(torch.from_numpy(score), torch.from_numpy(label), torch.from_numpy(box).double()))
-        found += gather_pictures(scene.samples, by_sample, own, MMDET3D_CLASSES)
+        found += gather_images(scene.samples, by_sample, own, MMDET3D_CLASSES)
     real = Boxes2D(
         np.repeat(np.arange(len(flat)), [len(t.label) for t, *_ in flat]).astype(np.int32),
         np.concatenate([t.label.numpy() for t, *_ in flat]).astype(np.int32),
@@ -60,21 +60,21 @@ def matched(tiny_set: Path) -> tuple[PictureMatches, float]:
         np.concatenate([box for *_, box, _ in flat]),
         np.concatenate([score for *_, score in flat]),
     )
-    truth = read_picture_truth(tiny_set, "v1.0-mini", names, tuple(tokens))
+    truth = read_image_truth(tiny_set, "v1.0-mini", names, tuple(tokens))
     expected = float(np.nanmean(average_precision(real, boxes, labels=len(MMDET3D_CLASSES))))
-    return match_pictures(found, truth, MMDET3D_CLASSES), expected
+    return match_images(found, truth, MMDET3D_CLASSES), expected
 
 
-def test_it_is_the_ap_of_all_images_as_one_list(matched: tuple[PictureMatches, float]) -> None:
+def test_it_is_the_ap_of_all_images_as_one_list(matched: tuple[ImageMatches, float]) -> None:
     matches, expected = matched
     assert 0.2 < expected < 0.9
     assert matches.scores().mean_ap == pytest.approx(expected, abs=1e-12)
-    figures = picture_figures(matches.scores())
+    figures = image_figures(matches.scores())
     assert figures["mAP"] == pytest.approx(expected, abs=1e-6)
-    assert set(picture_figures(matches.scores(), few=True)) <= {"mAP", "AP_car"}
+    assert set(image_figures(matches.scores(), is_summary=True)) <= {"mAP", "AP_car"}
 
 
-def test_weights_repeat_samples(matched: tuple[PictureMatches, float]) -> None:
+def test_weights_repeat_samples(matched: tuple[ImageMatches, float]) -> None:
     matches, expected = matched
     assert matches.scores(np.full(matches.samples, 2)).mean_ap == pytest.approx(expected, abs=0.02)
     first = np.zeros(matches.samples, np.int64)
@@ -90,6 +90,6 @@ def test_classes_are_told_by_names_and_strangers_are_left_out() -> None:
         token = "a"
 
     one = Detections(torch.tensor([0.9, 0.8, 0.7]), torch.tensor([0, 1, 2]), torch.zeros(3, 4))
-    (found,) = gather_pictures([Sample()], {"a": [None]}, [one], ("kiosk", "pedestrian", "car"))  # type: ignore[list-item]
+    (found,) = gather_images([Sample()], {"a": [None]}, [one], ("kiosk", "pedestrian", "car"))  # type: ignore[list-item]
     assert [MMDET3D_CLASSES[k] for k in found.boxes.label] == ["pedestrian", "car"]
     assert found.boxes.score.tolist() == pytest.approx([0.8, 0.7])

@@ -114,7 +114,7 @@ BAD = {
 @pytest.mark.parametrize("text", BAD)
 def test_what_is_no_picture_is_one_line(text: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        as_images(BAD[text], where="input")
+        as_images(BAD[text], origin="input")
     assert text in str(caught.value)
     assert str(caught.value).startswith("input")
 

@@ -84,7 +84,7 @@ def perfect(detector: Mono3D, truth: Truth, size: tuple[int, int]) -> tuple[Dens
     blank = Mono3D(config).dense(torch.zeros(1, 3, *size), truth.intrinsic[None].float())  # for the shapes
     k = truth.intrinsic[None]
     blank = replace(blank, maps={name: [m.double() for m in maps] for name, maps in blank.maps.items()})
-    blank.maps["intrinsic"][0] = detector._inside(k, size, detector._scale(size, k))
+    blank.maps["intrinsic"][0] = detector._scale_intrinsic(k, size, detector._scale(size, k))
     found = detector.assign(blank, [truth])
     label, reg = found.label[0], found.extra["reg"][0].clone()
     owned = label >= 0

@@ -19,8 +19,8 @@ from ssad.rendering.onboard import DAY, Onboard
 from ssad.rendering.target import parse_target
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import make_carrier
-from ssad.scenarios.static.physical.lights.export import Shining
-from ssad.scenarios.static.physical.textures.export import Print
+from ssad.scenarios.static.physical.lights.export import LightSetup
+from ssad.scenarios.static.physical.textures.export import PrintedTexture
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -49,13 +49,13 @@ class Watcher:
 def worn(carrier: str, target: str, value: float) -> AgentEdit:
     """A texture of one grey."""
     size = make_carrier(carrier, {}).on(parse_target(target).mesh()).size
-    return Print(torch.full((3, *size), value), carrier, {}, target).live(1)
+    return PrintedTexture(torch.full((3, *size), value), carrier, {}, target).live(1)
 
 
 def shadow() -> AgentEdit:
     """On the rear of a white car."""
     corners = {"left_a": -1.5, "up_a": 0.2, "left_b": 1.5, "up_b": 0.2, "left_c": 0.0, "up_c": 1.6}
-    return Shining("shadow", {}, "sun_behind", "sedan:white:0", corners).live(1)
+    return LightSetup("shadow", {}, "sun_behind", "sedan:white:0", corners).live(1)
 
 
 @pytest.mark.parametrize(

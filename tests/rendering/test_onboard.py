@@ -377,7 +377,7 @@ def test_signs_wear_a_texture_in_the_loop() -> None:
     (scenario, *_) = [s for s in load_scenarios("stop-signs") if s.town == "Larkhill"]
     simulator = World([build_episode(scenario, graph, seed=1)], {"Larkhill": graph})
     camera = rig_camera("CAM_FRONT", 320)
-    onboards = [Onboard(), Onboard(attack=Texture("grey-sign").worn_by(0))]
+    onboards = [Onboard(), Onboard(attack=Texture("grey-sign").agent_edit(0))]
     plain, grey = (o.camera(camera)(simulator, np.array([[0, 0]], np.int32))[0] for o in onboards)
     changed = (plain != grey).any(0)
     assert 0 < changed.sum() < 0.02 * changed.size

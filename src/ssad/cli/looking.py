@@ -40,7 +40,7 @@ def detect(
 
     from ssad.core.machine import pick_device
     from ssad.detectors import make_detector
-    from ssad.detectors.detect import detect_dataset, detect_pictures, is_dataset
+    from ssad.detectors.detect import detect_dataset, detect_images, is_dataset
     from ssad.engine.progress import Live
 
     folders = [source for source in sources if is_dataset(source)]
@@ -60,7 +60,7 @@ def detect(
         detector or ("fcos3d-light" if folders else "yolov5n"), weights=weights, device=compute_device
     )
     if not folders:
-        for picture in detect_pictures(network, sources, out, threshold=threshold, focal=focal, device=compute_device):
+        for picture in detect_images(network, sources, out, threshold=threshold, focal=focal, device=compute_device):
             print(f"{picture.path}: {picture.count} boxes{''.join(f'; {note}' for note in picture.notes)}")
         print(f"boxes: {out / 'detections.json'}")
         return

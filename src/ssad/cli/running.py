@@ -259,9 +259,9 @@ def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any
     from ssad.rendering.hours import at_hour
     from ssad.rendering.onboard import DAY
     from ssad.report.video import save_frames
-    from ssad.scenarios.static.physical.lights.export import load_worn
+    from ssad.scenarios.static.physical.lights.export import load_exported_attack
 
-    attack, film_detector = load_worn(wear), None if detector == "none" else make_detector(detector)
+    attack, film_detector = load_exported_attack(wear), None if detector == "none" else make_detector(detector)
     target_kind = attack.live(1).kind
 
     def film(trace: Any, graph: Any, path: Path) -> Path:

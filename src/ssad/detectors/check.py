@@ -18,7 +18,9 @@ from ssad.detectors.check_geometry import check_boxes, check_places, check_solid
 from ssad.detectors.check_gradients import check_loss_signs, check_slopes, check_small_changes
 
 RTOL = 2e-3
-FEW = 0.01  # share of places that may differ in a batch: choices between values that are equal but for rounding
+MAX_DIFFERING = (
+    0.01  # share of places that may differ in a batch: choices between values that are equal but for rounding
+)
 
 
 class DetectorCheckError(AssertionError):
@@ -48,7 +50,7 @@ def find_faults(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[i
 
 
 def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[int, int] = (96, 128)) -> Iterator[str]:
-    """As `find_faults`, one by one as they are found, the cheap parts first: who waits for one need not try the rest.
+    """Yield the faults of `find_faults` one by one, the cheap checks first, so that a caller can stop at the first.
 
     Args:
         detector: What may keep to `ssad.core.protocols.Detector`.
@@ -174,7 +176,7 @@ def _check_predict(trial: CheckCase) -> None:
     for detections in batch_detections:
         any_detection |= len(detections.score) > 0
         for holds, promise in promises(
-            detections, classes=len(trial.detector.classes), three=trial.three, least=threshold
+            detections, classes=len(trial.detector.classes), is_3d=trial.three, min_score=threshold
         ):
             need(holds, promise)
     need(any_detection, "predict finds something when the threshold is low")
@@ -192,21 +194,26 @@ def _check_predict(trial: CheckCase) -> None:
     need(len(trial.predict(images.double(), threshold=threshold)) == BATCH, "float64 images are taken")
 
 
-def promises(found: Detections, *, classes: int, three: bool, least: float = 0.0) -> Iterator[tuple[bool, str]]:
-    """What a detector promises of its detections in one image, and whether it is kept; shapes first."""
-    count = len(found.score)
-    yield found.score.shape == found.label.shape == (count,), "score and label of Detections are [N]"
-    yield found.box.shape == (count, 4), "Detections.box is [N, 4]"
-    yield (found.solid is not None) == three, 'Detections.solid is there for task "3d" and only then'
-    yield not found.label.is_floating_point(), "labels are whole numbers"
-    yield bool(((found.score >= least) & (found.score <= 1)).all()), "scores lie between the threshold and 1"
-    yield bool((found.score.diff() <= 0).all()), "detections come best first"
-    yield bool(((found.label >= 0) & (found.label < classes)).all()), "labels are within classes"
-    is_ordered = bool((found.box[:, 2:] >= found.box[:, :2]).all()) and bool(found.box.isfinite().all())
+def promises(
+    detections: Detections, *, classes: int, is_3d: bool, min_score: float = 0.0
+) -> Iterator[tuple[bool, str]]:
+    """Yield the promises about the detections in one image, each with True if it is kept; shapes first."""
+    count = len(detections.score)
+    yield detections.score.shape == detections.label.shape == (count,), "score and label of Detections are [N]"
+    yield detections.box.shape == (count, 4), "Detections.box is [N, 4]"
+    yield (detections.solid is not None) == is_3d, 'Detections.solid is there for task "3d" and only then'
+    yield not detections.label.is_floating_point(), "labels are whole numbers"
+    yield (
+        bool(((detections.score >= min_score) & (detections.score <= 1)).all()),
+        "scores lie between the threshold and 1",
+    )
+    yield bool((detections.score.diff() <= 0).all()), "detections come best first"
+    yield bool(((detections.label >= 0) & (detections.label < classes)).all()), "labels are within classes"
+    is_ordered = bool((detections.box[:, 2:] >= detections.box[:, :2]).all()) and bool(detections.box.isfinite().all())
     yield is_ordered, "boxes are x1, y1, x2, y2, finite, x1 <= x2 and y1 <= y2"
-    yield not found.score.requires_grad and not found.box.requires_grad, "predict keeps no gradient"
-    if found.solid is not None:
-        yield from _solid_promises(found.solid, count)
+    yield not detections.score.requires_grad and not detections.box.requires_grad, "predict keeps no gradient"
+    if detections.solid is not None:
+        yield from _solid_promises(detections.solid, count)
 
 
 def _solid_promises(solid: Solids, count: int) -> Iterator[tuple[bool, str]]:
@@ -245,7 +252,7 @@ def _check_batch(trial: CheckCase) -> None:
             ):
                 agrees = (
                     single_values.shape == batch_values[image_index].shape
-                    and _apart(batch_values[image_index], single_values) <= FEW
+                    and _share_of_differences(batch_values[image_index], single_values) <= MAX_DIFFERING
                 )
                 trial.need(agrees, f"Dense.{name} of an image does not depend on its batch")
     threshold = usual_threshold(trial, images)
@@ -253,26 +260,26 @@ def _check_batch(trial: CheckCase) -> None:
     for image_index in range(BATCH):
         (single_detections,) = trial.predict(images[image_index : image_index + 1], threshold=threshold)
         trial.need(
-            _alike(batch_detections[image_index], single_detections),
+            _detections_agree(batch_detections[image_index], single_detections),
             "detections of an image do not depend on its batch",
         )
 
 
-def _apart(a: Tensor, b: Tensor) -> float:
-    """The share of rows that differ by more than rounding."""
-    differs = (a - b).abs() > RTOL * (1 + b.abs())
+def _share_of_differences(expected: Tensor, actual: Tensor) -> float:
+    """Return the share of rows that differ by more than rounding."""
+    differs = (expected - actual).abs() > RTOL * (1 + actual.abs())
     return float(differs.reshape(len(differs), -1).any(-1).double().mean()) if differs.numel() else 0.0
 
 
-def _alike(a: Detections, b: Detections) -> bool:
-    """Whether the best detections are the same but for rounding; of nearly equal scores any may suppress others."""
-    count = min(10, len(a.score), len(b.score))
+def _detections_agree(first: Detections, second: Detections) -> bool:
+    """Return True if the best detections agree but for rounding; of nearly equal scores, any may suppress others."""
+    count = min(10, len(first.score), len(second.score))
     if count == 0:
-        return len(a.score) == len(b.score)
-    if not torch.allclose(a.score[:count], b.score[:count], rtol=RTOL, atol=1e-5):
+        return len(first.score) == len(second.score)
+    if not torch.allclose(first.score[:count], second.score[:count], rtol=RTOL, atol=1e-5):
         return False
-    is_near = (a.box[:count, None] - b.box).abs().amax(-1) < 2.0  # pixels
-    is_match = is_near & (a.label[:count, None] == b.label)
+    is_near = (first.box[:count, None] - second.box).abs().amax(-1) < 2.0  # pixels
+    is_match = is_near & (first.label[:count, None] == second.label)
     return float(is_match.any(1).double().mean()) > 0.6
 
 
@@ -371,15 +378,15 @@ def _check_refusals(trial: CheckCase) -> None:
     intrinsic = trial.lens(1)
     dense = trial.dense(images)
 
-    def expect_refusal(what: str, call: Callable[[], object]) -> None:
+    def expect_refusal(description: str, call: Callable[[], object]) -> None:
         try:
             call()
         except ConfigError as error:
-            trial.need("\n" not in str(error), f"{what}: refused in one line")
+            trial.need("\n" not in str(error), f"{description}: refused in one line")
         except Exception as error:  # any other exception is the fault in question
-            trial.need(False, f"{what}: refused with ConfigError, not {type(error).__name__}")
+            trial.need(False, f"{description}: refused with ConfigError, not {type(error).__name__}")
         else:
-            trial.need(False, f"{what}: refused with ConfigError")
+            trial.need(False, f"{description}: refused with ConfigError")
 
     for description, bad_images in (
         ("greyscale images", images[:, :1]),

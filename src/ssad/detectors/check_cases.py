@@ -29,22 +29,22 @@ class CheckCase:
     intrinsic: Tensor | None
     faults: list[str] = field(default_factory=list)
 
-    def need(self, ok: bool, promise: str) -> bool:
-        """A fault if a promise is broken; whether it is kept."""
-        if not ok and promise not in self.faults:
+    def need(self, is_kept: bool, promise: str) -> bool:
+        """Record a fault if a promise is broken; return True if it is kept."""
+        if not is_kept and promise not in self.faults:
             self.faults.append(promise)
-        return ok
+        return is_kept
 
     @contextmanager
-    def guarded(self, what: str) -> Iterator[None]:
-        """Errors become faults; the detector's state must be afterwards what it was."""
-        before = State(self.detector)
+    def guarded(self, action: str) -> Iterator[None]:
+        """Turn errors into faults, and record a fault if the block changes the state of the detector."""
+        state_before = DetectorState(self.detector)
         try:
             yield
         except Exception as error:  # a third-party detector may raise anything
-            self.faults.append(f"{what}: no error, but {describe(error)}")
-        for changed in before.changed(self.detector):
-            self.need(False, f"no call changes the detector or the program; {what} changes {changed}")
+            self.faults.append(f"{action}: no error, but {describe(error)}")
+        for change in state_before.changed(self.detector):
+            self.need(False, f"no call changes the detector or the program; {action} changes {change}")
 
     @property
     def three(self) -> bool:
@@ -130,10 +130,10 @@ def usual_threshold(trial: CheckCase, images: Tensor) -> float:
     return 0.0
 
 
-def noise(like: Tensor, amplitude: float) -> Tensor:
-    """Return random numbers within plus and minus `amplitude`, shaped as `like`; the same in every run."""
-    generator = torch.Generator().manual_seed(seed32("check_detector noise", *like.shape))
-    return amplitude * (2 * torch.rand(like.shape, generator=generator) - 1).to(like)
+def noise(template: Tensor, amplitude: float) -> Tensor:
+    """Return random numbers within plus and minus `amplitude`, shaped as `template`; the same in every run."""
+    generator = torch.Generator().manual_seed(seed32("check_detector noise", *template.shape))
+    return amplitude * (2 * torch.rand(template.shape, generator=generator) - 1).to(template)
 
 
 def modules_of(detector: Any) -> list[nn.Module]:
@@ -143,7 +143,7 @@ def modules_of(detector: Any) -> list[nn.Module]:
     return [value for value in getattr(detector, "__dict__", {}).values() if isinstance(value, nn.Module)]
 
 
-class State:
+class DetectorState:
     """All state of a detector and of PyTorch's settings that calls must leave unchanged."""
 
     def __init__(self, detector: Any) -> None:
@@ -170,7 +170,7 @@ class State:
 
     def changed(self, detector: Any) -> list[str]:
         """Return a description of each difference from the recorded state."""
-        current = State(detector)
+        current = DetectorState(detector)
         changes = []
         for aspect, old_flags, new_flags in (
             ("training mode", self.modes, current.modes),

@@ -15,12 +15,12 @@ from ssad.core.tensor_boxes import area, iou, solid_corners
 from ssad.detectors.check_cases import CheckCase, usual_threshold
 from ssad.detectors.mono3d.decode import hull, project
 
-BEST = 20  # detections compared in an image
-FEW = 5  # of these, the number used as truth
+MAX_COMPARED = 20  # detections compared in an image
+TRUTH_COUNT = 5  # of these, the number used as truth
 NEAR = 1.5  # pixels between a detection and the place that it comes from: room for rounding
 SIDES = ("length", "height", "width")
-FITS = 0.9  # overlap of a box and the hull of a solid that belong together
-CLEARLY = {"yaw": 1.08, "size": 1.08, "centre": 1.25}  # ratio of losses; for another centre other places answer
+MIN_FIT = 0.9  # overlap of a box and the hull of a solid that belong together
+CLEAR_RATIOS = {"yaw": 1.08, "size": 1.08, "centre": 1.25}  # ratio of losses; for another centre other places answer
 TRAINED = 0.4  # ratio of the losses of a detector's own detections to those of absent objects
 
 
@@ -57,7 +57,7 @@ def check_boxes(trial: CheckCase) -> None:
         dense = trial.dense(images)
     box, place = dense.box.double(), dense.place.double()
     centre = (box[..., :2] + box[..., 2:]) / 2
-    slope, crossed_slope = _follows(centre, place), _follows(centre, place.flip(-1))
+    slope, crossed_slope = _centre_slope(centre, place), _centre_slope(centre, place.flip(-1))
     in_pixels = bool((centre.abs() > 2).any()) and slope < 2
     trial.need(
         in_pixels, "Dense.box is in pixels of the picture, not in shares of it or in pixels of the network's input"
@@ -69,7 +69,8 @@ def check_boxes(trial: CheckCase) -> None:
         trial.predict(images, threshold=usual_threshold(trial, images)), box, strict=True
     ):
         detected_boxes, place_boxes = (
-            _cut(candidate_boxes, trial.size) for candidate_boxes in (detections.box[:BEST].double(), image_boxes)
+            _clip(candidate_boxes, trial.size)
+            for candidate_boxes in (detections.box[:MAX_COMPARED].double(), image_boxes)
         )
         if len(detected_boxes) and len(place_boxes):
             distances.append((detected_boxes[:, None] - place_boxes).abs().amax(-1).amin(-1))
@@ -77,16 +78,16 @@ def check_boxes(trial: CheckCase) -> None:
     trial.need(agrees, "the boxes of predict are among those of dense, in the same pixels")
 
 
-def _follows(middle: Tensor, place: Tensor) -> float:
-    """By how many pixels the middles [B, P, 2] of boxes move if the places [P, 2] move by one; 0 if these do not."""
+def _centre_slope(centres: Tensor, place: Tensor) -> float:
+    """Return how far the centres [B, P, 2] of boxes move per pixel of the places [P, 2]; 0 if these coincide."""
     deviation = place - place.mean(0)
     spread = deviation.square().mean(0)
     if not bool((spread > 0).all()):
         return 0.0
-    return float(((middle - middle.mean(1, keepdim=True)) * deviation).mean((0, 1)).div(spread).mean())
+    return float(((centres - centres.mean(1, keepdim=True)) * deviation).mean((0, 1)).div(spread).mean())
 
 
-def _cut(box: Tensor, size: tuple[int, int]) -> Tensor:
+def _clip(box: Tensor, size: tuple[int, int]) -> Tensor:
     """Clip boxes [..., 4] to the image."""
     return box.clamp_min(0).minimum(box.new_tensor([size[1], size[0]] * 2))
 
@@ -95,7 +96,7 @@ def _cut(box: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class Convention:
     """Another convention that 3D boxes may follow.
 
     Attributes:
@@ -146,8 +147,8 @@ YAWS: dict[str, Callable[[Solids], Tensor]] = {
     "of the opposite sign and 90 degrees off": lambda solid: -solid.yaw - math.pi / 2,
     "counted from the line of sight": lambda solid: solid.yaw + _ray(solid),
 }
-READINGS = sorted(
-    (Reading(*parts) for parts in product(YAWS, permutations(range(3)), (0.0, -0.5, 0.5))),
+CONVENTIONS = sorted(
+    (Convention(*parts) for parts in product(YAWS, permutations(range(3)), (0.0, -0.5, 0.5))),
     key=lambda reading: len(reading.changed),
 )
 
@@ -158,59 +159,61 @@ def check_solids(trial: CheckCase) -> None:
     batch_detections = trial.predict(images, threshold=usual_threshold(trial, images))
     if not trial.three or any(entry.solid is None for entry in batch_detections):
         return
-    overlaps = [_fit(trial, batch_detections, convention) for convention in READINGS]
+    overlaps = [_mean_overlap(trial, batch_detections, convention) for convention in CONVENTIONS]
     best_overlap = max(overlaps)
     better_convention = None
-    if best_overlap > FITS:
+    if best_overlap > MIN_FIT:
         if 1 - overlaps[0] > 5 * (1 - best_overlap) + 0.005:
             ties = [
-                convention for convention, entry in zip(READINGS, overlaps, strict=True) if entry > best_overlap - 0.002
+                convention
+                for convention, entry in zip(CONVENTIONS, overlaps, strict=True)
+                if entry > best_overlap - 0.002
             ]
             # Several conventions may fit equally well; report the simplest, and let the losses decide among those.
             simplest = [convention for convention in ties if len(convention.changed) == len(ties[0].changed)]
-            better_convention = min(simplest, key=_losses(trial, images, batch_detections))
+            better_convention = min(simplest, key=_loss_of_convention(trial, images, batch_detections))
     else:  # the boxes are not hulls, but predicted
         better_convention = _better_for_losses(trial, images, batch_detections)
         if (
             better_convention is not None
             and better_convention.up != 0
-            and not _shown(overlaps[0], _fit(trial, batch_detections, better_convention))
+            and not _is_better_centre(overlaps[0], _mean_overlap(trial, batch_detections, better_convention))
         ):
             better_convention = None
     promise = "solids have the centre of gravity, length, height, width and yaw of ssad.core.detections"
     trial.need(better_convention is None, f"{promise}; these fit better if read otherwise: {better_convention}")
 
 
-def _shown(documented: float, other: float) -> bool:
-    """Whether boxes show another centre: the losses do not tell enough, since for that other places answer."""
-    return other > 0.5 and other > documented + 0.1
+def _is_better_centre(documented: float, alternative: float) -> bool:
+    """Return True if boxes show another centre; losses do not decide, since other places answer for it."""
+    return alternative > 0.5 and alternative > documented + 0.1
 
 
-def _fit(trial: CheckCase, everything: list[Detections], reading: Reading) -> float:
-    """Mean overlap of the boxes with the hulls of the solids."""
+def _mean_overlap(trial: CheckCase, batch_detections: list[Detections], reading: Convention) -> float:
+    """Return the mean overlap of the boxes with the hulls of the solids."""
     intrinsic = trial.lens(1)
     image_overlaps = []
-    for detections in everything:
+    for detections in batch_detections:
         if detections.solid is None or intrinsic is None:
             continue
         solid = reading.apply(detections.solid)
         hulls = hull(project(solid_corners(solid.centre, solid.size_lhw, solid.yaw), intrinsic[0].to(solid.centre)))
-        box, hulls = _cut(detections.box[:BEST], trial.size), _cut(hulls[:BEST], trial.size)
+        box, hulls = _clip(detections.box[:MAX_COMPARED], trial.size), _clip(hulls[:MAX_COMPARED], trial.size)
         is_visible = area(box) > 4
         image_overlaps.append(iou(box[is_visible], hulls[is_visible], least=1e-6))
     overlap = torch.cat(image_overlaps) if image_overlaps else torch.zeros(0)
     return float(overlap.double().mean()) if len(overlap) else 0.0
 
 
-def _better_for_losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> Reading | None:
-    """The reading of the detections, other than the documented one, with which they are clearly more the truth.
+def _better_for_losses(trial: CheckCase, images: Tensor, batch_detections: list[Detections]) -> Convention | None:
+    """Return the other convention under which the detections clearly fit the losses better.
 
-    None as well if no reading is: the losses of weights that are not trained are as large for one truth as for another.
+    None if there is none, or if the weights are untrained: their losses are as large for one truth as for another.
     """
-    loss = _losses(trial, images, everything)
-    documented, *others = (convention for convention in READINGS if len(convention.changed) <= 1)
-    best_convention = min(others, key=loss)
-    is_better = math.isfinite(loss(documented)) and loss(documented) > CLEARLY[best_convention.changed[0]] * loss(
+    loss = _loss_of_convention(trial, images, batch_detections)
+    documented, *alternatives = (convention for convention in CONVENTIONS if len(convention.changed) <= 1)
+    best_convention = min(alternatives, key=loss)
+    is_better = math.isfinite(loss(documented)) and loss(documented) > CLEAR_RATIOS[best_convention.changed[0]] * loss(
         best_convention
     )
     with torch.no_grad():
@@ -220,14 +223,16 @@ def _better_for_losses(trial: CheckCase, images: Tensor, everything: list[Detect
     return best_convention if is_better and is_trained else None
 
 
-def _losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> Callable[[Reading], float]:
-    """The sum of the losses if the best detections, read in a way, were true; infinite if no place answers for them."""
+def _loss_of_convention(
+    trial: CheckCase, images: Tensor, batch_detections: list[Detections]
+) -> Callable[[Convention], float]:
+    """Return a function from a convention to the losses with the best detections as truth; infinite without a place."""
     with torch.no_grad():
         dense = trial.dense(images)
 
-    def loss(reading: Reading) -> float:
+    def loss(reading: Convention) -> float:
         # Detections serve as truth: the documented convention fits them best if the detector follows it.
-        truth = [_truth(detections, reading, trial) for detections in everything]
+        truth = [_detections_as_truth(detections, reading, trial) for detections in batch_detections]
         assignment = trial.detector.assign(dense, truth)
         if not bool((assignment.label >= 0).any()):
             return math.inf
@@ -237,12 +242,12 @@ def _losses(trial: CheckCase, images: Tensor, everything: list[Detections]) -> C
     return loss
 
 
-def _truth(found: Detections, reading: Reading, trial: CheckCase) -> Truth:
-    """The best detections as truth."""
+def _detections_as_truth(detections: Detections, reading: Convention, trial: CheckCase) -> Truth:
+    """Return the best detections as truth."""
     intrinsic = trial.lens(1)
-    assert found.solid is not None
+    assert detections.solid is not None
     assert intrinsic is not None
-    solid = reading.apply(found.solid)
+    solid = reading.apply(detections.solid)
     fields = (solid.centre, solid.size_lhw, solid.yaw, solid.velocity, solid.attribute)
-    solids = Solids(*(field_values[:FEW] for field_values in fields))
-    return Truth(found.label[:FEW], _cut(found.box[:FEW], trial.size), solids, intrinsic[0])
+    solids = Solids(*(field_values[:TRUTH_COUNT] for field_values in fields))
+    return Truth(detections.label[:TRUTH_COUNT], _clip(detections.box[:TRUTH_COUNT], trial.size), solids, intrinsic[0])

@@ -63,8 +63,8 @@ class _Probe:
     def __init__(self, trial: CheckCase, number: int) -> None:
         self.trial = trial
         self.images = trial.images()[number : number + 1]
-        self.leaf = self.images.clone().requires_grad_()
-        dense = trial.dense(self.leaf)
+        self.differentiable_images = self.images.clone().requires_grad_()
+        dense = trial.dense(self.differentiable_images)
         self.assignment = trial.detector.assign(dense, trial.truth(((2, 0, 1)[number],)))
         self.values = self._values(dense)
 
@@ -81,16 +81,18 @@ class _Probe:
         losses = self.trial.detector.losses(dense, self.assignment)
         return outputs | {f'losses["{name}"]': loss.double().sum() for name, loss in losses.items()}
 
-    def at(self, pictures: Tensor) -> dict[str, Tensor]:
-        """The numbers for another picture and the same assignment."""
+    def at(self, images: Tensor) -> dict[str, Tensor]:
+        """Return the numbers for another image and the same assignment."""
         with torch.no_grad():
-            return self._values(self.trial.dense(pictures.to(self.images.dtype)))
+            return self._values(self.trial.dense(images.to(self.images.dtype)))
 
     def gradient(self, name: str) -> Tensor:
         """Return the gradient to the image; zeros where a number has none."""
         if not self.values[name].requires_grad:
             return torch.zeros_like(self.images)
-        (gradient,) = torch.autograd.grad(self.values[name], self.leaf, retain_graph=True, materialize_grads=True)
+        (gradient,) = torch.autograd.grad(
+            self.values[name], self.differentiable_images, retain_graph=True, materialize_grads=True
+        )
         return gradient
 
     def ratio(self, name: str) -> float:
@@ -112,9 +114,9 @@ class _Probe:
         return measured_ratio
 
 
-def _differs(other: Tensor, value: Tensor) -> bool:
-    """Whether a value has changed by more than rounding."""
-    return bool((other - value).abs() > 10 * ROUNDING * value.abs())
+def _differs(changed: Tensor, value: Tensor) -> bool:
+    """Return True if a value has changed by more than rounding."""
+    return bool((changed - value).abs() > 10 * ROUNDING * value.abs())
 
 
 def check_small_changes(trial: CheckCase) -> None:
@@ -141,7 +143,9 @@ def check_loss_signs(trial: CheckCase) -> None:
         dense = trial.dense(trial.images())
         truth = trial.truth((2, 1, 1))
         assignment = detector.assign(dense, truth)
-        favoured, disfavoured = (_labelled(dense, assignment, truth, largest=largest) for largest in (True, False))
+        favoured, disfavoured = (
+            _relabelled_truth(dense, assignment, truth, largest=largest) for largest in (True, False)
+        )
         case_losses = [
             {name: float(loss.sum()) for name, loss in detector.losses(dense, detector.assign(dense, case)).items()}
             for case in (favoured, disfavoured, truth, trial.truth((0, 0, 0)))
@@ -157,13 +161,13 @@ def check_loss_signs(trial: CheckCase) -> None:
     trial.need(rises, "the losses are lower for the classes that Dense.logit favours than for those it does not")
 
 
-def _labelled(dense: Dense, owned: Assignment, truth: list[Truth], *, largest: bool) -> list[Truth]:
-    """The truth with the classes whose logits are largest (or least) at the places that answer for each object."""
+def _relabelled_truth(dense: Dense, assignment: Assignment, truth: list[Truth], *, largest: bool) -> list[Truth]:
+    """Return the truth with the classes of the largest (or smallest) logits at the places of each object."""
     relabelled = []
     for image_index, image_truth in enumerate(truth):
         labels = []
         for object_index in range(len(image_truth.label)):
-            is_owned = owned.owner[image_index] == object_index
+            is_owned = assignment.owner[image_index] == object_index
             mean_logit = dense.logit[image_index][is_owned if bool(is_owned.any()) else slice(None)].double().mean(0)
             labels.append(int(mean_logit.argmax() if largest else mean_logit.argmin()))
         relabelled.append(

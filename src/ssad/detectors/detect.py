@@ -29,7 +29,7 @@ MODALITIES = dict.fromkeys(("use_lidar", "use_radar", "use_map", "use_external")
 
 
 @dataclass(frozen=True, slots=True)
-class Marked:
+class DrawnImage:
     """Image with its detections.
 
     Attributes:
@@ -43,30 +43,32 @@ class Marked:
     notes: tuple[str, ...]
 
 
-def draw_found(picture: U8, found: Detections, classes: Sequence[str], intrinsic: F64) -> U8:
-    """A picture with boxes, each with its class and score.
+def draw_detections(image: U8, detections: Detections, classes: Sequence[str], intrinsic: F64) -> U8:
+    """Return an image with boxes, each with its class and score.
 
     Args:
-        picture: RGB [H, W, 3].
-        found: What was found in it.
+        image: RGB [H, W, 3].
+        detections: Detections in the image.
         classes: Names of the labels.
         intrinsic: Camera matrix [3, 3], for boxes in space.
     """
-    canvas = np.ascontiguousarray(picture).copy()
-    width = max(1, round(picture.shape[1] / 640))
-    if found.solid is None:
-        draw_flat(canvas, found.box, 1.0, colour=FOUND, width=width)
+    canvas = np.ascontiguousarray(image).copy()
+    width = max(1, round(image.shape[1] / 640))
+    if detections.solid is None:
+        draw_flat(canvas, detections.box, 1.0, colour=FOUND, width=width)
     else:
-        draw_solids(canvas, found.solid, intrinsic, 1.0, colour=FOUND, width=width)
-    font_scale = 0.4 * max(1.0, picture.shape[1] / 960)
-    for box, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
+        draw_solids(canvas, detections.solid, intrinsic, 1.0, colour=FOUND, width=width)
+    font_scale = 0.4 * max(1.0, image.shape[1] / 960)
+    for box, label, score in zip(
+        detections.box.tolist(), detections.label.tolist(), detections.score.tolist(), strict=True
+    ):
         left, box_top = (
             round(min(max(coordinate, 0), limit - 1))
-            for coordinate, limit in zip(box[:2], picture.shape[1::-1], strict=True)
+            for coordinate, limit in zip(box[:2], image.shape[1::-1], strict=True)
         )
         caption = f"{classes[label]} {score:.2f}"
         (text_width, text_height), _ = cv2.getTextSize(caption, cv2.FONT_HERSHEY_SIMPLEX, font_scale, 1)
-        left, top = min(left, max(picture.shape[1] - text_width - 4, 0)), max(box_top - text_height - 6, 0)
+        left, top = min(left, max(image.shape[1] - text_width - 4, 0)), max(box_top - text_height - 6, 0)
         cv2.rectangle(canvas, (left, top), (left + text_width + 4, top + text_height + 6), (0, 0, 0), -1)
         cv2.putText(
             canvas,
@@ -81,7 +83,7 @@ def draw_found(picture: U8, found: Detections, classes: Sequence[str], intrinsic
     return canvas
 
 
-def detect_pictures(
+def detect_images(
     detector: Detector,
     files: Sequence[Path],
     out: Path,
@@ -89,7 +91,7 @@ def detect_pictures(
     threshold: float = 0.3,
     focal: float | None = None,
     device: str = "cpu",
-) -> list[Marked]:
+) -> list[DrawnImage]:
     """Draw the detections in images, and write all boxes to OUT/detections.json.
 
     Args:
@@ -130,25 +132,30 @@ def detect_pictures(
         path = out / f"{file.stem}.jpg"
         if path.exists() and path.samefile(file):
             raise ConfigError(f"{path} would be written over the picture that is looked at; give another OUT")
-        save_picture(path, draw_found(image, detections, detector.classes, intrinsic))
+        save_picture(path, draw_detections(image, detections, detector.classes, intrinsic))
         rows_by_file[file.name] = _rows(detections, detector.classes)
         annotated_images.append(
-            Marked(path, len(detections.score), (*loaded.notes, *(assumptions if intrinsic_batch is not None else ())))
+            DrawnImage(
+                path, len(detections.score), (*loaded.notes, *(assumptions if intrinsic_batch is not None else ()))
+            )
         )
     write_atomic(out / "detections.json", dump_json(rows_by_file, indent=1) + "\n")
     return annotated_images
 
 
-def _rows(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Boxes as plain data: x0, y0, x1, y1 in pixels; in space centre (m, camera frame), size l, h, w (m), yaw."""
+def _rows(detections: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Return boxes as plain data: x0, y0, x1, y1 (pixels); for 3D centre (m, camera frame), size l, h, w (m), yaw."""
     rows: list[dict[str, Any]] = []
     for index, (box, label, score) in enumerate(
-        zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True)
+        zip(detections.box.tolist(), detections.label.tolist(), detections.score.tolist(), strict=True)
     ):
         row = {"class": classes[label], "score": round(score, 4), "box": [round(coordinate, 2) for coordinate in box]}
-        if found.solid is not None:
-            row |= {"centre": found.solid.centre[index].tolist(), "size_lhw": found.solid.size_lhw[index].tolist()}
-            row["yaw"] = float(found.solid.yaw[index])
+        if detections.solid is not None:
+            row |= {
+                "centre": detections.solid.centre[index].tolist(),
+                "size_lhw": detections.solid.size_lhw[index].tolist(),
+            }
+            row["yaw"] = float(detections.solid.yaw[index])
         rows.append(row)
     return rows
 
@@ -161,7 +168,7 @@ def detect_dataset(
     split: str | None = None,
     manifest: str = "clean",
     device: str = "cpu",
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda completed, total: None,
 ) -> tuple[Path, int, int]:
     """Write the official results file of the nuScenes detection task for a data set: OUT/results.json.
 
@@ -170,8 +177,8 @@ def detect_dataset(
         data: The data set.
         out: Folder.
         split: Only the scenes of this split; None: all scenes.
-        manifest: What `ssad score` knows the data by; see `ssad.recorders.shifted.manifest.manifest_digest`.
-        device: Where the detector is.
+        manifest: Identity of the data for `ssad score`; see `ssad.recorders.shifted.manifest.manifest_digest`.
+        device: Device of the detector.
         progress: Called with the number of scenes that are done, and of all.
 
     Returns:
@@ -199,12 +206,12 @@ def detect_dataset(
     return path, len(results), sum(map(len, results.values()))
 
 
-def results_rows(found: SampleBoxes) -> list[dict[str, Any]]:
-    """The boxes of a sample as the official file has them."""
-    boxes = found.boxes
+def results_rows(sample: SampleBoxes) -> list[dict[str, Any]]:
+    """Return the boxes of a sample as rows of the official file."""
+    boxes = sample.boxes
     return [
         {
-            "sample_token": found.token,
+            "sample_token": sample.token,
             "translation": boxes.centre[row_index].tolist(),
             "size": boxes.size_wlh[row_index].tolist(),
             "rotation": boxes.rotation[row_index].tolist(),

@@ -42,7 +42,7 @@ def clear_detections(detector: Detector, image: Tensor, intrinsic: Tensor | None
 
 
 @torch.no_grad()
-def marked(detector: Detector, image: Tensor, intrinsic: Tensor | None = None) -> U8:
+def draw_clear_detections(detector: Detector, image: Tensor, intrinsic: Tensor | None = None) -> U8:
     """Return an image with the detected boxes, RGB [H, W, 3].
 
     Args:
@@ -51,15 +51,15 @@ def marked(detector: Detector, image: Tensor, intrinsic: Tensor | None = None) -
         intrinsic: Camera matrix [3, 3], for a 3D detector.
     """
     detections = clear_detections(detector, image, intrinsic)
-    picture = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
+    canvas = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
     for box, label, score in zip(
         detections.box.tolist(), detections.label.tolist(), detections.score.tolist(), strict=True
     ):
         top_left, bottom_right = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
-        cv2.rectangle(picture, top_left, bottom_right, FOUND, 2, cv2.LINE_AA)
+        cv2.rectangle(canvas, top_left, bottom_right, FOUND, 2, cv2.LINE_AA)
         text = f"{detector.classes[label]} {score:.2f}"
         text_position = (top_left[0], max(top_left[1] - 4, 12))
         # A dark outline first, so that the text is readable on any background.
-        cv2.putText(picture, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.putText(picture, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)
-    return picture
+        cv2.putText(canvas, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.putText(canvas, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)
+    return canvas

@@ -28,7 +28,7 @@ CAMERAS = 64  # of a sample, at most: the number of an image is that of its samp
 
 
 @dataclass(frozen=True, slots=True)
-class PictureBoxes:
+class ImageBoxes:
     """Detections of a 2D detector in the images of one sample, a row per box.
 
     Attributes:
@@ -48,15 +48,15 @@ class PictureBoxes:
 
 
 @dataclass(frozen=True, slots=True)
-class SamplePictures:
+class SampleImages:
     """Detections in the images of one sample."""
 
     token: str
-    boxes: PictureBoxes
+    boxes: ImageBoxes
 
 
 @dataclass(frozen=True, slots=True)
-class PictureTruth:
+class ImageTruth:
     """The true boxes of all camera images of some samples.
 
     Attributes:
@@ -69,7 +69,7 @@ class PictureTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class PictureScores:
+class ImageScores:
     """AP50 of each of nuScenes's ten classes, in the order of `MMDET3D_CLASSES`; NaN for absent classes."""
 
     ap: F64
@@ -81,7 +81,7 @@ class PictureScores:
 
 
 @dataclass(frozen=True, slots=True)
-class PictureMatches:
+class ImageMatches:
     """Matches of boxes, sufficient for the scores under any weights of the samples.
 
     Attributes:
@@ -99,7 +99,7 @@ class PictureMatches:
         """Number of samples."""
         return int(self.truth_counts.shape[1])
 
-    def scores(self, weights: npt.NDArray[np.integer[Any]] | None = None) -> PictureScores:
+    def scores(self, weights: npt.NDArray[np.integer[Any]] | None = None) -> ImageScores:
         """Return the scores, with each sample counted as often as its weight [S]; None: once."""
         repetitions = np.ones(self.samples, np.int64) if weights is None else np.asarray(weights, np.int64)
         # Repeating rows keeps their order, so the bootstrap needs no further matching.
@@ -108,21 +108,21 @@ class PictureMatches:
         resampled = Matched2D(
             matches.label[rows], matches.hit[rows], matches.ignored[rows], self.truth_counts @ repetitions
         )
-        return PictureScores(resampled.average_precision())
+        return ImageScores(resampled.average_precision())
 
 
-def gather_pictures(
+def gather_images(
     samples: Sequence[Any],
-    by_sample: Mapping[str, Sequence[SensorFrame]],
-    found: Sequence[Detections],
+    frames_by_sample: Mapping[str, Sequence[SensorFrame]],
+    detections: Sequence[Detections],
     classes: Sequence[str],
-) -> list[SamplePictures]:
-    """The boxes of images put together by sample; those of classes that nuScenes does not have are left out.
+) -> list[SampleImages]:
+    """Group the boxes of images by sample, without those of classes that nuScenes does not have.
 
     Args:
-        samples: In order.
-        by_sample: Camera frames of each.
-        found: Of all images, in order.
+        samples: Samples, in order.
+        frames_by_sample: Camera frames of each sample.
+        detections: Detections in all images, in order.
         classes: Names of the labels.
     """
     label_table = np.array(
@@ -130,8 +130,8 @@ def gather_pictures(
     )
     sample_pictures, start = [], 0
     for sample in samples:
-        count = len(by_sample.get(sample.token, []))
-        sample_detections = found[start : start + count]
+        count = len(frames_by_sample.get(sample.token, []))
+        sample_detections = detections[start : start + count]
         start += count
         camera_indices = np.repeat(np.arange(count), [len(single.score) for single in sample_detections]).astype(
             np.int32
@@ -143,8 +143,8 @@ def gather_pictures(
             _joined([single.score for single in sample_detections]),
         )
         sample_pictures.append(
-            SamplePictures(
-                sample.token, PictureBoxes(camera_indices[is_known], box[is_known], score[is_known], labels[is_known])
+            SampleImages(
+                sample.token, ImageBoxes(camera_indices[is_known], box[is_known], score[is_known], labels[is_known])
             )
         )
     return sample_pictures
@@ -156,7 +156,7 @@ def _joined(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
 
 
 @lru_cache(maxsize=2)
-def read_picture_truth(root: Path, version: str, scenes: tuple[str, ...], samples: tuple[str, ...]) -> PictureTruth:
+def read_image_truth(root: Path, version: str, scenes: tuple[str, ...], samples: tuple[str, ...]) -> ImageTruth:
     """Read the true boxes of all camera images.
 
     Args:
@@ -181,26 +181,26 @@ def read_picture_truth(root: Path, version: str, scenes: tuple[str, ...], sample
                 image_numbers += [image_number] * len(truth.label)
                 labels.append(truth.label.numpy())
                 boxes.append(truth.box.double().numpy())
-    return PictureTruth(
+    return ImageTruth(
         samples,
         Boxes2D(np.array(image_numbers, np.int32), np.concatenate(labels).astype(np.int32), np.concatenate(boxes)),
     )
 
 
-def match_pictures(found: Sequence[SamplePictures], truth: PictureTruth, classes: Sequence[str]) -> PictureMatches:
-    """Match boxes whose IoU is 0.5 at least.
+def match_images(detections: Sequence[SampleImages], truth: ImageTruth, classes: Sequence[str]) -> ImageMatches:
+    """Match boxes with an IoU of at least 0.5.
 
     Args:
-        found: Boxes of all samples.
-        truth: Of the same samples.
-        classes: Names of those that the detector knows; objects of others are left out.
+        detections: Boxes of all samples.
+        truth: Truth of the same samples.
+        classes: Names of the classes of the detector; objects of others are left out.
     """
     truth_boxes = truth.boxes
     is_known = np.isin(truth_boxes.label, [index for index, name in enumerate(MMDET3D_CLASSES) if name in classes])
     truth_boxes = Boxes2D(truth_boxes.image[is_known], truth_boxes.label[is_known], truth_boxes.box[is_known])
     sample_index = {token: index for index, token in enumerate(truth.samples)}
     known_samples = sorted(
-        (sample_pictures for sample_pictures in found if sample_pictures.token in sample_index),
+        (sample_pictures for sample_pictures in detections if sample_pictures.token in sample_index),
         key=lambda sample_pictures: sample_index[sample_pictures.token],
     )
     boxes_by_sample = [sample_pictures.boxes for sample_pictures in known_samples]
@@ -225,16 +225,16 @@ def match_pictures(found: Sequence[SamplePictures], truth: PictureTruth, classes
         truth_boxes.label.astype(np.int64) * sample_count + truth_boxes.image // CAMERAS,
         minlength=class_count * sample_count,
     )
-    return PictureMatches(matched, sample_numbers[matched.row], truth_counts.reshape(class_count, sample_count))
+    return ImageMatches(matched, sample_numbers[matched.row], truth_counts.reshape(class_count, sample_count))
 
 
-def picture_figures(scores: PictureScores, *, few: bool = False) -> dict[str, float]:
-    """The figures of scores, by the names that those of 3D detectors have: mAP, and the AP of each class that is there.
+def image_figures(scores: ImageScores, *, is_summary: bool = False) -> dict[str, float]:
+    """Return the figures of scores, named as for 3D detectors: mAP, and the AP of each class present.
 
     Args:
         scores: The scores.
-        few: Whether only mAP and the AP of cars are wanted.
+        is_summary: Return only mAP and the AP of cars.
     """
     class_ap = {f"AP_{name}": float(scores.ap[MMDET3D_CLASSES.index(name)]) for name in CLASSES}
-    figures = {"mAP": scores.mean_ap, "AP_car": class_ap["AP_car"]} | ({} if few else class_ap)
+    figures = {"mAP": scores.mean_ap, "AP_car": class_ap["AP_car"]} | ({} if is_summary else class_ap)
     return {name: round(value, 6) for name, value in figures.items() if np.isfinite(value)}

@@ -43,7 +43,7 @@ class Images:
     notes: tuple[str, ...] = ()
 
 
-def as_images(x: Any, *, where: str = "images") -> Images:
+def as_images(x: Any, *, origin: str = "images") -> Images:
     """Convert one image or a batch from files, arrays or tensors; gradients of float tensors are kept.
 
     Channels are RGB (OpenCV reads BGR: reverse its arrays first). uint8 is divided by 255, uint16 by 65535 (also
@@ -54,7 +54,7 @@ def as_images(x: Any, *, where: str = "images") -> Images:
         x: A file name (PNG, JPEG, TIFF, BMP, WebP; 8 bits, then turned upright by its EXIF, or 16); a numpy array
             [H, W], [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; or a list of
             these, all of one size.
-        where: Name of the argument, for messages.
+        origin: Name of the argument, for messages.
 
     Raises:
         ConfigError: The shape, type or range is invalid, or the images differ in size.
@@ -62,46 +62,46 @@ def as_images(x: Any, *, where: str = "images") -> Images:
     """
     if isinstance(x, Sequence) and not isinstance(x, str | bytes):
         if not x:
-            raise ConfigError(f"{where}: no picture")
-        converted_images = [as_images(image, where=f"{where}[{index}]") for index, image in enumerate(x)]
+            raise ConfigError(f"{origin}: no picture")
+        converted_images = [as_images(image, origin=f"{origin}[{index}]") for index, image in enumerate(x)]
         sizes = sorted({tuple(converted.tensor.shape[2:]) for converted in converted_images})
         if len(sizes) > 1:
             size_list = ", ".join(f"{height} x {width}" for height, width in sizes[:3])
-            raise ConfigError(f"{where}: pictures of different sizes ({size_list}, height x width) make no batch")
+            raise ConfigError(f"{origin}: pictures of different sizes ({size_list}, height x width) make no batch")
         notes = dict.fromkeys(note for converted in converted_images for note in converted.notes)
         return Images(torch.cat([converted.tensor for converted in converted_images]), tuple(notes))
     if isinstance(x, str | os.PathLike):
-        return _scaled(*_read(Path(x).expanduser()), where=str(x))
+        return _to_floats(*_read(Path(x).expanduser()), origin=str(x))
     if isinstance(x, np.ndarray):
-        return _scaled(_from_array(x, where), (), where=where)
+        return _to_floats(_from_array(x, origin), (), origin=origin)
     if isinstance(x, Tensor):
-        return _scaled(_from_tensor(x, where), (), where=where)
-    raise ConfigError(f"{where}: a {type(x).__name__} is no picture; give a file name, an array or a tensor")
+        return _to_floats(_from_tensor(x, origin), (), origin=origin)
+    raise ConfigError(f"{origin}: a {type(x).__name__} is no picture; give a file name, an array or a tensor")
 
 
-def _from_array(x: npt.NDArray[Any], where: str) -> Tensor:
+def _from_array(x: npt.NDArray[Any], origin: str) -> Tensor:
     """Convert [H, W], [H, W, C] or [B, H, W, C] to [B, C, H, W]."""
     if x.ndim == 2:
         x = x[..., None]
     if x.ndim == 3:
         x = x[None]
     if x.ndim != 4 or x.shape[3] not in (1, 3, 4):
-        turned = ", with channels last (turn [3, H, W] by .transpose(1, 2, 0))" if 3 in x.shape[:2] else ""
-        raise ConfigError(f"{where}: an array of shape {list(x.shape)}; pictures are [H, W, 3] or [B, H, W, 3]{turned}")
+        hint = ", with channels last (turn [3, H, W] by .transpose(1, 2, 0))" if 3 in x.shape[:2] else ""
+        raise ConfigError(f"{origin}: an array of shape {list(x.shape)}; pictures are [H, W, 3] or [B, H, W, 3]{hint}")
     if x.dtype.kind not in "uifb" or x.dtype.itemsize > 8:
-        raise ConfigError(f"{where}: an array of {x.dtype}; pictures are uint8, uint16 or floats in [0, 1]")
+        raise ConfigError(f"{origin}: an array of {x.dtype}; pictures are uint8, uint16 or floats in [0, 1]")
     # torch.from_numpy takes native byte order only, and warns of read-only arrays.
     native = np.ascontiguousarray(x.astype(x.dtype.newbyteorder("="), copy=False))
     return torch.from_numpy(native if native.flags.writeable else native.copy()).permute(0, 3, 1, 2)
 
 
-def _from_tensor(x: Tensor, where: str) -> Tensor:
+def _from_tensor(x: Tensor, origin: str) -> Tensor:
     if x.ndim == 3:
         x = x[None]
     if x.ndim != 4 or x.shape[1] not in (1, 3, 4):
-        turned = ", with channels first (turn [H, W, 3] by .permute(2, 0, 1))" if x.shape[-1:] == (3,) else ""
+        hint = ", with channels first (turn [H, W, 3] by .permute(2, 0, 1))" if x.shape[-1:] == (3,) else ""
         shape = list(x.shape)
-        raise ConfigError(f"{where}: a tensor of shape {shape}; pictures are [3, H, W] or [B, 3, H, W]{turned}")
+        raise ConfigError(f"{origin}: a tensor of shape {shape}; pictures are [3, H, W] or [B, 3, H, W]{hint}")
     return x
 
 
@@ -119,7 +119,7 @@ def _read(path: Path) -> tuple[Tensor, tuple[str, ...]]:
             if image_file.width * image_file.height > MAX_PIXELS:
                 raise FormatError(f"{path}: {image_file.width} x {image_file.height} pixels are more than {MAX_PIXELS}")
             image_file.load()  # raises where the file is cut short
-            has_16_bits = _is_deep(image_file, content)
+            has_16_bits = _has_16_bits(image_file, content)
             upright = ImageOps.exif_transpose(image_file)
     except FormatError:
         raise
@@ -127,7 +127,7 @@ def _read(path: Path) -> tuple[Tensor, tuple[str, ...]]:
         reason = "cut short" if "truncated" in str(error) else f"not a picture of {', '.join(FORMATS)}"
         raise FormatError(f"{path}: {reason}, or broken") from None
     if has_16_bits:
-        return _read_deep(content, path)
+        return _read_16_bits(content, path)
     if upright.mode == "P":
         upright = upright.convert("RGBA" if "transparency" in upright.info else "RGB")
     elif upright.mode in ("1", "CMYK", "YCbCr", "LAB", "HSV"):
@@ -137,19 +137,19 @@ def _read(path: Path) -> tuple[Tensor, tuple[str, ...]]:
     return _channels(np.array(upright))
 
 
-def _is_deep(picture: Any, data: bytes) -> bool:
-    """Whether a file has 16 bits a channel, which Pillow keeps for greyscale only."""
-    if picture.format == "PNG":
+def _has_16_bits(image_file: Any, content: bytes) -> bool:
+    """Return True for a file of 16 bits per channel, which Pillow keeps for greyscale only."""
+    if image_file.format == "PNG":
         # Byte 24 of a PNG file is the bit depth in its IHDR chunk.
-        return data[24] == 16
+        return content[24] == 16
     # TIFF tag 258 is BitsPerSample.
-    return picture.format == "TIFF" and bool(picture.tag_v2.get(258, (8,))[0] == 16)
+    return image_file.format == "TIFF" and bool(image_file.tag_v2.get(258, (8,))[0] == 16)
 
 
-def _read_deep(data: bytes, path: Path) -> tuple[Tensor, tuple[str, ...]]:
+def _read_16_bits(content: bytes, path: Path) -> tuple[Tensor, tuple[str, ...]]:
     import cv2
 
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16:
         raise FormatError(f"{path}: 16 bits a channel in a way that is not known")
     # OpenCV returns BGR or BGRA.
@@ -167,10 +167,10 @@ def _channels(pixels: npt.NDArray[Any]) -> tuple[Tensor, tuple[str, ...]]:
     return torch.from_numpy(colour).permute(2, 0, 1)[None], notes
 
 
-def _scaled(x: Tensor, notes: tuple[str, ...], *, where: str) -> Images:
+def _to_floats(x: Tensor, notes: tuple[str, ...], *, origin: str) -> Images:
     """Convert [B, C, H, W] of any type to three channels of floats in [0, 1]."""
     if 0 in x.shape:
-        raise ConfigError(f"{where}: an empty picture, shape {list(x.shape)}")
+        raise ConfigError(f"{origin}: an empty picture, shape {list(x.shape)}")
     dtype_name = str(x.dtype).removeprefix("torch.")
     if x.dtype == torch.uint8:
         image = x.float() / 255
@@ -181,10 +181,10 @@ def _scaled(x: Tensor, notes: tuple[str, ...], *, where: str) -> Images:
         notes = (*notes, "16 bit" if max_value > 4095 else f"16 bit, none above {max_value}: dark, or of fewer bits")
     elif x.is_floating_point():
         image = x if x.dtype in (torch.float32, torch.float64) else x.float()
-        _check_range(image.detach(), where)
+        _check_range(image.detach(), origin)
     else:
         raise ConfigError(
-            f"{where}: {dtype_name} numbers; pictures are uint8, uint16 or floats in [0, 1]{HINTS.get(x.dtype, '')}"
+            f"{origin}: {dtype_name} numbers; pictures are uint8, uint16 or floats in [0, 1]{HINTS.get(x.dtype, '')}"
         )
     if image.shape[1] == 4:
         image = image[:, :3]
@@ -195,10 +195,10 @@ def _scaled(x: Tensor, notes: tuple[str, ...], *, where: str) -> Images:
     return Images(image.contiguous(), notes)
 
 
-def _check_range(image: Tensor, where: str) -> None:
+def _check_range(image: Tensor, origin: str) -> None:
     low, high = (float(value) for value in image.aminmax())
     if not bool(image.isfinite().all()):
-        raise ConfigError(f"{where}: holds NaN or infinite values")
+        raise ConfigError(f"{origin}: holds NaN or infinite values")
     if low < 0 or high > 1:
         unit = "; divide by 255" if low >= 0 and 1 < high <= 255 else ""
-        raise ConfigError(f"{where}: floats from {low:.4g} to {high:.4g}; they must lie in [0, 1]{unit}")
+        raise ConfigError(f"{origin}: floats from {low:.4g} to {high:.4g}; they must lie in [0, 1]{unit}")

@@ -13,7 +13,7 @@ from ssad.core.errors import SSADError
 from ssad.detectors.check import promises
 
 
-class Watched:
+class MonitoredDetector:
     """Detector whose failure is a result: after an error or a broken promise it returns no more detections.
 
     Exhausted memory and a lost device are raised. Detections are on the host.
@@ -67,11 +67,13 @@ class Watched:
         text = " ".join(str(error).split())
         self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
 
-    def _broken(self, found: Sequence[Detections], images: int) -> str:
-        if len(found) != images:
+    def _broken(self, detections: Sequence[Detections], images: int) -> str:
+        if len(detections) != images:
             return "broken promise: predict answers for each image"
-        for single in found:
-            for is_kept, promise in promises(single, classes=len(self.detector.classes), three=self.task != "2d"):
+        for image_detections in detections:
+            for is_kept, promise in promises(
+                image_detections, classes=len(self.detector.classes), is_3d=self.task != "2d"
+            ):
                 if not is_kept:
                     return f"broken promise: {promise}"
         return ""

@@ -20,7 +20,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.results import with_ego
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
-from ssad.detectors.image_scores import gather_pictures
+from ssad.detectors.image_scores import gather_images
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes, merge_cameras
 from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
 from ssad.metrics.detection2d import Boxes2D, average_precision
@@ -30,7 +30,7 @@ Look = Callable[[Sequence[SensorFrame]], Sequence[U8]]
 LABEL = np.array([CLASSES.index(name) for name in MMDET3D_CLASSES])
 _ATTRIBUTE = {"": -1} | {name: k for k, name in enumerate(ATTRIBUTES)}
 AT_ONCE = 6  # samples that a GPU is shown at once
-FLOOR = 0.001  # least score that counts for AP of 2D boxes
+MIN_SCORE = 0.001  # least score that counts for AP of 2D boxes
 ERRORS: Mapping[str, str] = {
     "mATE": "trans_err",
     "mASE": "scale_err",
@@ -51,14 +51,14 @@ class SampleBoxes:
 def detect_scene(
     detector: Detector, root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None
 ) -> list[SampleBoxes]:
-    """Boxes in the world for each sample of a scene.
+    """Return the boxes in the world for each sample of a scene.
 
     Args:
         detector: The detector.
         root: The nuScenes root.
         scene: The scene.
-        device: Where the detector is.
-        look: Gives the pictures of camera frames; None: reads the files.
+        device: Device of the detector.
+        look: Returns the images of camera frames; None: reads the files.
     """
     return detect_with([detector], root, scene, device=device, look=look)[0]
 
@@ -73,14 +73,14 @@ def detect_with(
     ahead: bool = True,
     at_once: int = AT_ONCE,
 ) -> list[list[Any]]:
-    """As `detect_scene`, for several detectors that are shown the same pictures.
+    """Return the results of `detect_scene` for several detectors on the same images.
 
     Args:
         detectors: The detectors.
         root: The nuScenes root.
         scene: The scene.
-        device: Where the detectors are.
-        look: Gives the pictures of camera frames; None: reads the files.
+        device: Device of the detectors.
+        look: Returns the images of camera frames; None: reads the files.
         ahead: Whether the next pictures are made while these are looked at; False where `look` needs a detector for
             itself.
         at_once: Samples that a GPU is shown at once.
@@ -89,10 +89,10 @@ def detect_with(
         Boxes of each sample, one list for each detector; `SamplePictures` of 2D detectors, which have no place in the
         world.
     """
-    by_sample: dict[str, list[SensorFrame]] = {}
+    frames_by_sample: dict[str, list[SensorFrame]] = {}
     for frame in scene.frames:
         if frame.modality == "camera" and frame.key_frame:
-            by_sample.setdefault(frame.sample_token, []).append(frame)
+            frames_by_sample.setdefault(frame.sample_token, []).append(frame)
     results: list[list[Any]] = [[] for _ in detectors]
     samples_per_call = at_once if device != "cpu" else 1
     with ThreadPoolExecutor(4) as pool:
@@ -108,7 +108,7 @@ def detect_with(
                 for start in range(0, len(scene.samples), samples_per_call)
             ]
             block_frames = [
-                [camera_frame for sample in samples for camera_frame in by_sample.get(sample.token, [])]
+                [camera_frame for sample in samples for camera_frame in frames_by_sample.get(sample.token, [])]
                 for samples in sample_blocks
             ]
             # Two blocks in flight: one is detected while the next is read.
@@ -123,49 +123,54 @@ def detect_with(
                 for detector_results, detector, image_boxes in zip(results, detectors, detections, strict=True):
                     is_2d = detector.task == "2d"
                     detector_results.extend(
-                        gather_pictures(samples, by_sample, image_boxes, detector.classes)
+                        gather_images(samples, frames_by_sample, image_boxes, detector.classes)
                         if is_2d
-                        else _merged(samples, by_sample, image_boxes)
+                        else _merge_samples(samples, frames_by_sample, image_boxes)
                     )
     return results
 
 
 def _predict(
-    detectors: Sequence[Detector], frames: Sequence[SensorFrame], pictures: Sequence[U8], device: str
+    detectors: Sequence[Detector], frames: Sequence[SensorFrame], images: Sequence[U8], device: str
 ) -> list[list[Detections]]:
-    """Detections of each picture, in order, by detector; pictures of one size in one call."""
+    """Return the detections in each image, in order, by detector; images of one size in one call."""
     by_detector: list[dict[int, Detections]] = [{} for _ in detectors]
-    for image_size in sorted({image.shape[:2] for image in pictures}):
-        rows = [row for row, image in enumerate(pictures) if image.shape[:2] == image_size]
+    for image_size in sorted({image.shape[:2] for image in images}):
+        rows = [row for row, image in enumerate(images) if image.shape[:2] == image_size]
         intrinsics = torch.from_numpy(np.stack([np.asarray(frames[row].intrinsic, np.float32) for row in rows])).to(
             device
         )
-        tensor = to_images([pictures[row] for row in rows], device)
+        tensor = to_images([images[row] for row in rows], device)
         for detector_results, detector in zip(by_detector, detectors, strict=True):
-            for row, detections in zip(rows, Detections.cpu(_fitting(detector, tensor, intrinsics)), strict=True):
+            for row, detections in zip(
+                rows, Detections.cpu(_predict_in_parts(detector, tensor, intrinsics)), strict=True
+            ):
                 detector_results[row] = detections
     return [[detector_results[row] for row in range(len(frames))] for detector_results in by_detector]
 
 
-def _fitting(detector: Detector, images: torch.Tensor, lens: torch.Tensor) -> list[Detections]:
-    """`predict`, of half as many pictures at a time where memory does not suffice."""
+def _predict_in_parts(detector: Detector, images: torch.Tensor, intrinsics: torch.Tensor) -> list[Detections]:
+    """Call `predict`, on half as many images at a time if memory does not suffice."""
     try:
-        return list(detector.predict(images, lens, threshold=FLOOR if detector.task == "2d" else None))
+        return list(detector.predict(images, intrinsics, threshold=MIN_SCORE if detector.task == "2d" else None))
     except torch.OutOfMemoryError:
         if len(images) == 1:
             raise
     # After the except block: the traceback would keep the tensors of the failed call alive.
     torch.cuda.empty_cache()
     half = len(images) // 2
-    return [*_fitting(detector, images[:half], lens[:half]), *_fitting(detector, images[half:], lens[half:])]
+    return [
+        *_predict_in_parts(detector, images[:half], intrinsics[:half]),
+        *_predict_in_parts(detector, images[half:], intrinsics[half:]),
+    ]
 
 
-def _merged(
-    samples: Sequence[Any], by_sample: Mapping[str, Sequence[SensorFrame]], boxes: Sequence[Detections]
+def _merge_samples(
+    samples: Sequence[Any], frames_by_sample: Mapping[str, Sequence[SensorFrame]], boxes: Sequence[Detections]
 ) -> list[SampleBoxes]:
     sample_boxes, start = [], 0
     for sample in samples:
-        frames = by_sample.get(sample.token, [])
+        frames = frames_by_sample.get(sample.token, [])
         sample_detections = boxes[start : start + len(frames)]
         start += len(frames)
         merged = merge_cameras(
@@ -187,11 +192,11 @@ def detect(
         ]
 
 
-def box_table(found: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable:
-    """Found boxes as rows in the order of the truth's samples."""
+def box_table(detections: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable:
+    """Return detected boxes as rows in the order of the truth's samples."""
     sample_index = {token: index for index, token in enumerate(truth.samples)}
     known_samples = sorted(
-        (sample_boxes for sample_boxes in found if sample_boxes.token in sample_index),
+        (sample_boxes for sample_boxes in detections if sample_boxes.token in sample_index),
         key=lambda sample_boxes: sample_index[sample_boxes.token],
     )
     boxes_by_sample = [sample_boxes.boxes for sample_boxes in known_samples]
@@ -219,11 +224,11 @@ def box_table(found: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable:
     return with_ego(table, truth.ego)
 
 
-def match_boxes(found: Sequence[SampleBoxes], truth: GroundTruth) -> Matches:
-    """Found boxes against the truth, as the official evaluation matches them."""
+def match_boxes(detections: Sequence[SampleBoxes], truth: GroundTruth) -> Matches:
+    """Match detected boxes with the truth as the official evaluation does."""
     return match(
         filter_boxes(truth.boxes, points=truth.points, racks=truth.racks),
-        filter_boxes(box_table(found, truth), racks=truth.racks),
+        filter_boxes(box_table(detections, truth), racks=truth.racks),
         samples=len(truth.samples),
     )
 
@@ -231,26 +236,26 @@ def match_boxes(found: Sequence[SampleBoxes], truth: GroundTruth) -> Matches:
 def score_3d(
     detector: Detector, root: Path, version: str, scenes: Sequence[str], *, device: str = "cpu"
 ) -> dict[str, float]:
-    """`numbers` over some scenes."""
+    """Return `score_figures` over some scenes."""
     truth = read_truth(root, version, scenes=frozenset(scenes))
-    return numbers(match_boxes(detect(detector, root, version, scenes, device=device), truth).scores())
+    return score_figures(match_boxes(detect(detector, root, version, scenes, device=device), truth).scores())
 
 
-def numbers(scores: DetectionScores, *, few: bool = False) -> dict[str, float]:
-    """The figures of scores: mAP, NDS, AP of each class and true-positive errors; those that are NaN are left out.
+def score_figures(scores: DetectionScores, *, summary_only: bool = False) -> dict[str, float]:
+    """Return the figures of scores: mAP, NDS, AP of each class and true-positive errors, without NaN.
 
     Args:
         scores: The scores.
-        few: Whether only mAP, NDS and the AP of cars are wanted.
+        summary_only: Return only mAP, NDS and the AP of cars.
     """
     figures = {"mAP": scores.mean_ap, "NDS": scores.nd_score, "AP_car": scores.mean_dist_aps["car"]}
-    if not few:
+    if not summary_only:
         figures |= {f"AP_{name}": value for name, value in scores.mean_dist_aps.items()}
         figures |= {short_name: scores.tp_errors[name] for short_name, name in ERRORS.items()}
     return {name: round(float(value), 6) for name, value in figures.items() if np.isfinite(value)}
 
 
-class Annotated(Protocol):
+class AnnotatedImages(Protocol):
     """Images, uint8 [N, H, W, 3], by slices, and the truth of each."""
 
     @property
@@ -276,23 +281,28 @@ def detect_2d(detector: Detector, batches: Iterable[torch.Tensor], *, device: st
     detections: list[Detections] = []
     for batch in batches:
         tensor = batch.to(device).permute(0, 3, 1, 2).float() / 255
-        detections += detector.predict(tensor, threshold=FLOOR)
+        detections += detector.predict(tensor, threshold=MIN_SCORE)
     return Boxes2D(
         np.repeat(np.arange(len(detections)), [len(single.score) for single in detections]).astype(np.int32),
-        _rows([single.label for single in detections]).astype(np.int32),
-        _rows([single.box for single in detections], 4),
-        _rows([single.score for single in detections]),
+        _concatenate([single.label for single in detections]).astype(np.int32),
+        _concatenate([single.box for single in detections], 4),
+        _concatenate([single.score for single in detections]),
     )
 
 
-def _rows(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
+def _concatenate(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
     """Concatenate tensors [N] or [N, width] on the CPU."""
     empty = np.zeros((0,) if width is None else (0, width))
     return np.concatenate([empty, *(tensor.detach().cpu().double().numpy() for tensor in values)])
 
 
 def score_2d(
-    detector: Detector, data: Annotated, *, classes: Sequence[str] | None = None, device: str = "cpu", batch: int = 32
+    detector: Detector,
+    data: AnnotatedImages,
+    *,
+    classes: Sequence[str] | None = None,
+    device: str = "cpu",
+    batch: int = 32,
 ) -> dict[str, float]:
     """Return AP50 of each class of the detector that occurs in annotated images, and their mean.
 
@@ -315,13 +325,13 @@ def score_2d(
         torch.zeros(len(truth.label), dtype=torch.bool) if truth.crowd is None else truth.crowd for truth in data.truth
     ]
     image = np.repeat(np.arange(len(data.truth)), [len(truth.label) for truth in data.truth]).astype(np.int32)
-    label = detector_labels[_rows([truth.label for truth in data.truth]).astype(np.int32)]
+    label = detector_labels[_concatenate([truth.label for truth in data.truth]).astype(np.int32)]
     is_known = label >= 0
     truth_boxes = Boxes2D(
         image[is_known],
         label[is_known],
-        _rows([truth.box for truth in data.truth], 4)[is_known],
-        ignore=_rows(crowd_flags).astype(bool)[is_known],
+        _concatenate([truth.box for truth in data.truth], 4)[is_known],
+        ignore=_concatenate(crowd_flags).astype(bool)[is_known],
     )
     ap = average_precision(truth_boxes, detections, labels=len(names))
     class_ap = {f"AP50_{name}": float(value) for name, value in zip(names, ap, strict=True) if np.isfinite(value)}

@@ -98,19 +98,19 @@ def from_yolov5_keys(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return converted
 
 
-def _rename(layer: int, rest: str) -> str | None:
+def _rename(layer: int, suffix: str) -> str | None:
     """Return the name of a tensor in `Yolo`; "" if it is not needed, None if it is unknown."""
     if layer == HEADS:
-        if rest == "anchors":
+        if suffix == "anchors":
             return "anchors"
-        if rest in {"anchor_grid", "stride"}:
+        if suffix in {"anchor_grid", "stride"}:
             return ""
-        head = re.fullmatch(r"m\.([012])\.(weight|bias)", rest)
+        head = re.fullmatch(r"m\.([012])\.(weight|bias)", suffix)
         return f"network.heads.{head[1]}.{head[2]}" if head else None
     if layer not in LAYERS:
         return None
     layer_name = LAYERS[layer]
-    match = re.fullmatch(r"(?:m\.(\d+)\.)?(?:(cv[123])\.)?(conv\.weight|bn\.\w+)", rest)
+    match = re.fullmatch(r"(?:m\.(\d+)\.)?(?:(cv[123])\.)?(conv\.weight|bn\.\w+)", suffix)
     if match is None:
         return None
     block, part, tensor = match[1], match[2], match[3].replace("bn.", "norm.")

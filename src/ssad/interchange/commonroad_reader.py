@@ -27,7 +27,7 @@ from ssad.interchange.commonroad_xml import STEP, VERSION, Texts, own_values
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.knowledge._placing import Place, lane_path
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, lane_path
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.roads import is_town, load_town, route_along, town_names
 from ssad.world.roads.query import nearest_all
@@ -280,10 +280,10 @@ class _Reader:
         return route, route_along(graph, route)
 
 
-def _lane_under(graph: LaneGraph, pose: Pose) -> Place | None:
+def _lane_under(graph: LaneGraph, pose: Pose) -> LanePosition | None:
     """Return the driving lane under a pose with its direction."""
     lanes, distances, lane_distances = nearest_all(graph, (pose.x, pose.y), (LaneType.DRIVING,))
-    places = [Place(lane, distance) for lane, distance in zip(lanes.tolist(), distances.tolist(), strict=True)]
+    places = [LanePosition(lane, distance) for lane, distance in zip(lanes.tolist(), distances.tolist(), strict=True)]
     heading_differences = [abs(float(wrap_angle(graph.at(place.lane, place.s)[2] - pose.yaw))) for place in places]
     candidates = [
         index

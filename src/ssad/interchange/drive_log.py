@@ -22,7 +22,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
 from ssad.interchange.ego_start import start_parameters
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.frozen import Rows, told_rows
+from ssad.scenarios.dynamic.frozen import Rows, rounded_rows
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
 from ssad.world.roads import is_town, load_town, route_along
@@ -300,5 +300,5 @@ def _actor(track: _Track) -> Actor:
     if len(rows) == 1:  # annotated in one key frame: it exists for that moment only
         rows = np.concatenate([rows, rows])
         rows[1, 0] += STEP
-    kept_rows: Rows = told_rows(rows)
+    kept_rows: Rows = rounded_rows(rows)
     return Actor(track.name, track.model, Pose(*kept_rows[0][1:]), trajectory=kept_rows)

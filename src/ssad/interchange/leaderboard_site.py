@@ -15,7 +15,7 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Actor, Condition, LaneType, Limits, Phase, Pose, Route, Scenario, SignalPlan
 from ssad.scenarios.dynamic.knowledge._meeting import time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
-    Place,
+    LanePosition,
     ahead,
     behind,
     beside,
@@ -118,7 +118,7 @@ class Site:
         """Return 1 if the scenario comes from the right of the road, -1 if from the left."""
         return 1.0 if self.word("direction", "right", ("left", "right")) == "right" else -1.0
 
-    def lane_at(self, tag: str) -> Place:
+    def lane_at(self, tag: str) -> LanePosition:
         """The lane under a place of the file. FormatError where it is missing, RouteError off the road."""
         element = self.item.find(tag)
         self.used.add(tag)
@@ -130,7 +130,7 @@ class Site:
         nearest = int(np.argmin(gap))
         if gap[nearest] > _NEAR:
             raise self.fail(f"{tag} is {gap[nearest]:.0f} m off the road")
-        return Place(int(lane[nearest]), float(s[nearest]))
+        return LanePosition(int(lane[nearest]), float(s[nearest]))
 
     def fail(self, message: str) -> RouteError:
         """Return a RouteError that names the scenario."""
@@ -155,7 +155,7 @@ class Site:
         x, y = self.route.xy[index].tolist()
         return shifted(Pose(x, y, float(self.route.yaw[index])), 0.0, -right, turn)
 
-    def place(self, index: int) -> Place:
+    def place(self, index: int) -> LanePosition:
         """Return the lane under a route point."""
         return route_place(self.graph, self.scenario, self.route, index)
 
@@ -177,7 +177,7 @@ class Site:
         outermost_pose = pose_at(self.graph, outermost)
         return math.dist((pose.x, pose.y), (outermost_pose.x, outermost_pose.y)) + 0.5 * width_at(self.graph, outermost)
 
-    def oncoming(self, index: int) -> Place:
+    def oncoming(self, index: int) -> LanePosition:
         """Return the lane to the left with oncoming traffic. RouteError if there is none."""
         neighbour = beside(self.graph, self.place(index), "left")
         if (
@@ -192,7 +192,7 @@ class Site:
         """Return the route points at which the first junction after the trigger begins and ends."""
         return junction_span(self.graph, self.scenario, self.route)
 
-    def approach(self, sides: Sequence[float]) -> tuple[Place, int]:
+    def approach(self, sides: Sequence[float]) -> tuple[LanePosition, int]:
         """Find the lane into the ego's junction from given sides, and the lane straight on from it.
 
         If several lanes qualify, the one whose path comes nearest to the ego's is taken.
@@ -210,7 +210,7 @@ class Site:
         junction = int(self.graph.junction[self.route.lane[entry_point]])
         heading = float(self.route.yaw[max(entry_point - 1, 0)])
         ego_path = self.route.xy[entry_point : exit_point + 15].astype(np.float64)
-        best: tuple[int, float, Place, int] | None = None
+        best: tuple[int, float, LanePosition, int] | None = None
         for junction_lane in np.flatnonzero(
             (self.graph.junction == junction) & (self.graph.kind == LaneType.DRIVING)
         ).tolist():
@@ -220,22 +220,22 @@ class Site:
                     or entry_lane == self.place(max(entry_point - 1, 0)).lane
                 ):
                     continue
-                yaw = pose_at(self.graph, Place(entry_lane, float(self.graph.length[entry_lane]))).yaw
+                yaw = pose_at(self.graph, LanePosition(entry_lane, float(self.graph.length[entry_lane]))).yaw
                 turns = [abs(float(wrap_angle(yaw - heading - side))) for side in sides]
                 rank = next((side_index for side_index, turn in enumerate(turns) if turn < math.radians(45)), None)
                 if rank is None or abs(turn_of(self.graph, junction_lane)) > math.radians(45):
                     continue
                 crossing_path = lane_path(
-                    self.graph, Place(junction_lane, 0.0), float(self.graph.length[junction_lane]) + 15.0
+                    self.graph, LanePosition(junction_lane, 0.0), float(self.graph.length[junction_lane]) + 15.0
                 )
                 gap = float(np.hypot(*(ego_path[:, None] - crossing_path[None]).transpose(2, 0, 1)).min())
                 if best is None or (rank, gap) < best[:2]:
-                    best = rank, gap, Place(entry_lane, float(self.graph.length[entry_lane])), junction_lane
+                    best = rank, gap, LanePosition(entry_lane, float(self.graph.length[entry_lane])), junction_lane
         if best is None:
             raise self.fail(f"no lane comes into junction {junction} from where {self.item.get('type')} wants it")
         return best[2], best[3]
 
-    def before_junction(self, place: Place, distance: float) -> Place:
+    def before_junction(self, place: LanePosition, distance: float) -> LanePosition:
         """Return the place `distance` m back along lanes, or the last one before a junction."""
         farthest = place
         for step_back in np.arange(2.0, distance + 0.1, 2.0).tolist():
@@ -274,7 +274,7 @@ class Site:
         """Draw a model of a car."""
         return str(self.random.choice(CARS))
 
-    def driver(self, name: str, start: Place, distance: float, speed: float) -> None:
+    def driver(self, name: str, start: LanePosition, distance: float, speed: float) -> None:
         """Add a car that the Autopilot drives straight on for a distance; it reacts to the ego."""
         lane_points = lane_path(self.graph, start, distance)
         distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane_points, axis=0).T))])
@@ -302,7 +302,7 @@ class Site:
         lane = self.oncoming(index)
         speed = min(float(self.route.speed_limit[index]), 1.5 * SPEED)
         distance_back = speed * (self.arrival(index) + after) - 0.5 * speed**2 / MODELS["compact"].max_accel
-        previous_start: Place | None = None
+        previous_start: LanePosition | None = None
         for _ in range(6):
             start = behind(self.graph, lane, distance_back)
             if previous_start is not None and self.apart(start, previous_start) < 8.0:
@@ -331,7 +331,7 @@ class Site:
             pose = Pose(*rows[0, 1:].tolist())
             self.actors.append(Actor(actor_name, model, pose, trajectory=tuple(map(tuple, rows.tolist()))))
 
-    def way(self, start: Place, end: Place) -> F64:
+    def way(self, start: LanePosition, end: LanePosition) -> F64:
         """Return the path [N, 2] along lanes from one place to another. RouteError if there is none."""
         start_pose, end_pose = pose_at(self.graph, start), pose_at(self.graph, end)
         try:
@@ -368,11 +368,11 @@ class Site:
             offset_share = 0.5 * (1.0 + np.cos(np.pi * progress))
         return self.offset(path, right * offset_share)
 
-    def beyond(self, start: Place, distance: float) -> Place:
+    def beyond(self, start: LanePosition, distance: float) -> LanePosition:
         """Return the place `distance` m ahead along lanes, straight on."""
         return ahead(self.graph, start, distance)
 
-    def apart(self, one: Place, other: Place) -> float:
+    def apart(self, one: LanePosition, other: LanePosition) -> float:
         """Metres between two places."""
         first_pose, second_pose = pose_at(self.graph, one), pose_at(self.graph, other)
         return math.dist((first_pose.x, first_pose.y), (second_pose.x, second_pose.y))

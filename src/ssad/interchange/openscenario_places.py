@@ -14,7 +14,7 @@ from ssad.core.errors import FormatError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType, Pose
-from ssad.scenarios.dynamic.knowledge._placing import Place, ahead, behind, pose_at, shifted
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, ahead, behind, pose_at, shifted
 from ssad.world.roads.query import nearest_all
 
 if TYPE_CHECKING:
@@ -126,10 +126,10 @@ class Places:
         finally:
             self._open.discard(entity)
 
-    def lane_under(self, pose: Pose, *, aligned: bool = True) -> Place | None:
+    def lane_under(self, pose: Pose, *, aligned: bool = True) -> LanePosition | None:
         """Return the driving lane under a pose; with `aligned`, only one with its direction."""
         lanes, positions, distances = nearest_all(self.graph, (pose.x, pose.y), (LaneType.DRIVING,))
-        best: tuple[float, Place] | None = None
+        best: tuple[float, LanePosition] | None = None
         for candidate, lane_position, distance in zip(
             lanes.tolist(), positions.tolist(), distances.tolist(), strict=True
         ):
@@ -139,7 +139,7 @@ class Places:
                 and (not aligned or heading_difference < math.pi / 3)
                 and (best is None or max(distance, 0) < best[0])
             ):
-                best = max(distance, 0.0), Place(candidate, lane_position)
+                best = max(distance, 0.0), LanePosition(candidate, lane_position)
         return best[1] if best else None
 
     def _world(self, element: Element) -> Pose:
@@ -156,7 +156,7 @@ class Places:
         absolute = self.values.text(orientation, "type", "absolute") == "absolute"
         return Pose(pose.x, pose.y, heading if absolute else float(wrap_angle(pose.yaw + heading)))
 
-    def _on_lane(self, element: Element, lane: int, s: float) -> Place:
+    def _on_lane(self, element: Element, lane: int, s: float) -> LanePosition:
         """Return the place at s of a lane by its OpenDRIVE ids; s is measured along the lane itself."""
         graph = self.graph
         road = int(self.values.number(element, "roadId"))
@@ -172,7 +172,9 @@ class Places:
             length = float(graph.length[section])
             if s <= length or section == sections[-1]:
                 # Lanes with a positive id run against s.
-                return Place(section, min(max(s, 0.0), length) if lane < 0 else min(max(length - s, 0.0), length))
+                return LanePosition(
+                    section, min(max(s, 0.0), length) if lane < 0 else min(max(length - s, 0.0), length)
+                )
             s -= length
         raise AssertionError
 
@@ -226,6 +228,6 @@ class Places:
             nearest = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[lane])),))
             match = int(np.flatnonzero(nearest[0] == lane)[0])
             to_left ^= not self.graph.same_direction(place.lane, lane)  # what is further left is on the right of those
-            place = Place(lane, float(nearest[1][match]))
+            place = LanePosition(lane, float(nearest[1][match]))
             pose = pose_at(self.graph, place)
         return self._turned(element, shifted(pose, 0.0, lateral_offset))

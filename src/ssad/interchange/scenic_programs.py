@@ -30,8 +30,8 @@ from ssad.core.types import F64, Actor, LaneType, Limits, Pose, Scenario
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import scenario_name
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.frozen import agent_pose, stopping, told_rows
-from ssad.scenarios.dynamic.knowledge._placing import Place, lane_path
+from ssad.scenarios.dynamic.frozen import agent_pose, rounded_rows, stopping
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, lane_path
 from ssad.world.roads import load_town, route_along, town_names, town_xodr
 from ssad.world.roads.query import nearest_all
 
@@ -294,7 +294,7 @@ def _actor(drive: Any, rows: F64, k: int, until: float) -> Actor:
     trajectory = np.column_stack([time, rows[:, k, :3]])
     if np.hypot(*np.ptp(trajectory[:, 1:3], axis=0)) < STILL:
         return Actor(drive.names[k], drive.models[k], agent_pose(trajectory[0]))
-    kept_rows = told_rows(stopping(trajectory, until))
+    kept_rows = rounded_rows(stopping(trajectory, until))
     return Actor(drive.names[k], drive.models[k], Pose(*kept_rows[0][1:]), trajectory=kept_rows)
 
 
@@ -318,7 +318,7 @@ def _route(program: Program, ego: F64, lost: list[str]) -> tuple[tuple[Pose, ...
 def _ahead(graph: LaneGraph, start: Pose, way: float = WAY) -> tuple[Pose, ...]:
     """Key points along the lane under a pose, so many metres."""
     lanes, distances, lane_distances = nearest_all(graph, (start.x, start.y), (LaneType.DRIVING,))
-    places = [Place(lane, distance) for lane, distance in zip(lanes.tolist(), distances.tolist(), strict=True)]
+    places = [LanePosition(lane, distance) for lane, distance in zip(lanes.tolist(), distances.tolist(), strict=True)]
     heading_differences = [abs(float(wrap_angle(graph.at(place.lane, place.s)[2] - start.yaw))) for place in places]
     candidates = [
         index

@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.tensor_boxes import solid_corners
 from ssad.detectors.mono3d.config import FCOS3D, Mono3DConfig
 from ssad.detectors.mono3d.decode import (
-    Places,
+    PlaceGrid,
     global_yaw,
     places_of,
     project,
@@ -31,7 +31,7 @@ K = lens(300.0, SIZE)
 ONE = torch.ones(2, dtype=torch.float64)
 
 
-def grid(strides: tuple[int, ...] = (8, 16, 32, 64, 128), size: tuple[int, int] = SIZE) -> Places:
+def grid(strides: tuple[int, ...] = (8, 16, 32, 64, 128), size: tuple[int, int] = SIZE) -> PlaceGrid:
     maps = [torch.zeros(1, 1, -(-size[0] // s), -(-size[1] // s), dtype=torch.float64) for s in strides]
     return places_of(maps, strides)
 

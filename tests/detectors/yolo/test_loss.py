@@ -12,7 +12,7 @@ from torchvision.ops import complete_box_iou_loss
 
 from ssad.core.detections import Assignment, Dense, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.yolo.decode import Grid, decode, make_grid
+from ssad.detectors.yolo.decode import CellGrid, decode, make_grid
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.loss import BALANCE, ciou
 from ssad.detectors.yolov3 import YOLOV3, YOLOV3_TINY
@@ -46,12 +46,12 @@ def truth(label: Sequence[int], box: Sequence[Sequence[float]], crowd: Sequence[
     )
 
 
-def grid_of(detector: Yolo, height: int, width: int) -> Grid:
+def grid_of(detector: Yolo, height: int, width: int) -> CellGrid:
     shapes = [(height // stride, width // stride) for stride in detector.spec.strides]
     return make_grid(shapes, detector.spec.strides, detector.anchors)
 
 
-def answering(detector: Yolo, values: Tensor, grid: Grid) -> Yolo:
+def answering(detector: Yolo, values: Tensor, grid: CellGrid) -> Yolo:
     """The detector with a network whose flattened output is `values` [B, P, 5 + C]."""
     count, batch = grid.anchors.shape[1], len(values)
     ends = [*grid.start[1:], values.shape[1]]
@@ -67,7 +67,7 @@ def answering(detector: Yolo, values: Tensor, grid: Grid) -> Yolo:
     return copy
 
 
-def encode(rule: str, box: Tensor, grid: Grid) -> Tensor:
+def encode(rule: str, box: Tensor, grid: CellGrid) -> Tensor:
     """The raw numbers [..., P, 4] that `decode` turns into the boxes [..., P, 4]; infinite or NaN where none do."""
     cell = (box[..., :2] + box[..., 2:]) / 2 / grid.stride[:, None] - grid.cell
     ratio = (box[..., 2:] - box[..., :2]) / grid.anchor
@@ -141,7 +141,7 @@ def test_a_perfect_map_decodes_to_the_truth_and_has_no_loss(detector: Yolo) -> N
     assert all(value > 0.01 for value in blank.losses(blank.dense(images), assignment).values())
 
 
-def slow_owner(detector: Yolo, grid: Grid, one: Truth) -> list[int]:
+def slow_owner(detector: Yolo, grid: CellGrid, one: Truth) -> list[int]:
     """The rules of the two papers as loops over objects, anchors and cells."""
     crowd = one.crowd if one.crowd is not None else torch.zeros(len(one.label), dtype=torch.bool)
     best: dict[int, tuple[float, int]] = {}

@@ -20,8 +20,8 @@ from ssad.rendering.onboard import DAY
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import Camouflage
-from ssad.scenarios.static.physical.lights import Projector, Target, make_light
-from ssad.scenarios.static.physical.lights.export import Shining, export_light, load_worn
+from ssad.scenarios.static.physical.lights import Projector, TargetSize, make_light
+from ssad.scenarios.static.physical.lights.export import LightSetup, export_light, load_exported_attack
 from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
@@ -79,16 +79,16 @@ def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:
 
 def test_a_light_is_exported_and_shines_in_a_drive(trace: EpisodeTrace, tmp_path: Path) -> None:
     """By night, on the car; a picture that was changed after its export is refused."""
-    shape = Projector().surface(Target(4.9, 2.06, 1.51)).size
-    projector = Shining("projector", {"lumens": 800.0}, "night", "sedan:black:0", {}, torch.full((3, *shape), 1.0))
+    shape = Projector().surface(TargetSize(4.9, 2.06, 1.51)).size
+    projector = LightSetup("projector", {"lumens": 800.0}, "night", "sedan:black:0", {}, torch.full((3, *shape), 1.0))
     export_light(tmp_path / "projector", projector)
     flashlight = make_light("flashlight", {})
     values = {
-        name: low + 0.5 * (high - low) for name, (low, high) in flashlight.ranges(Target(4.9, 2.06, 1.51)).items()
+        name: low + 0.5 * (high - low) for name, (low, high) in flashlight.ranges(TargetSize(4.9, 2.06, 1.51)).items()
     }
-    export_light(tmp_path / "flashlight", Shining("flashlight", {}, "night", "sedan:black:0", values))
+    export_light(tmp_path / "flashlight", LightSetup("flashlight", {}, "night", "sedan:black:0", values))
     for name in ("projector", "flashlight"):
-        made = load_worn(tmp_path / name)
+        made = load_exported_attack(tmp_path / name)
         night = at_hour(DAY, made.hour)
         frames = attacked_frames(trace, load_town("ProvingGround"), made.live(1), width=160, every=9, weather=night)
         left, right = np.split(next(frames)[:90].astype(int), 2, axis=1)
@@ -96,6 +96,6 @@ def test_a_light_is_exported_and_shines_in_a_drive(trace: EpisodeTrace, tmp_path
         assert 20 < brighter.sum() < 0.3 * brighter.size, name
     (tmp_path / "projector" / "picture.npz").write_bytes(b"other")
     with pytest.raises(FormatError, match=r"not what light\.json describes"):
-        load_worn(tmp_path / "projector")
+        load_exported_attack(tmp_path / "projector")
     with pytest.raises(SSADError):
-        load_worn(tmp_path)
+        load_exported_attack(tmp_path)

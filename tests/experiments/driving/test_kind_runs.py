@@ -27,7 +27,7 @@ from ssad.engine.run import run
 from ssad.experiments.driving.attacked_film import attacked_frames
 from ssad.experiments.driving.kind import Driving, DrivingSuite
 from ssad.experiments.runs import replay, summary
-from ssad.scenarios.static.physical.textures.export import Print, export_texture
+from ssad.scenarios.static.physical.textures.export import PrintedTexture, export_texture
 
 SCENARIOS = ["StraightObstacle/00", "LaneChanging/01", "natural/Crossgate_00/00"]
 
@@ -145,7 +145,9 @@ def test_replay_films_a_drive_with_a_texture(done: Path, tmp_path: Path, monkeyp
 
     monkeypatch.setattr("ssad.experiments.driving.attacked_film.attacked_frames", short)
     monkeypatch.setattr("ssad.rendering.episode_scene.PHASES", 1)  # bodies are made faster
-    export_texture(tmp_path / "shirt", Print(torch.zeros((3, 128, 128)), "camouflage", {}, "pedestrian"), dots=20)
+    export_texture(
+        tmp_path / "shirt", PrintedTexture(torch.zeros((3, 128, 128)), "camouflage", {}, "pedestrian"), dots=20
+    )
     words = "replay", done, "blind/StraightObstacle/00", "--detector", "none", "--out", tmp_path / "out", "--wear"
     shown = ssad(*words, tmp_path / "shirt")
     assert shown.returncode == 0, shown.stderr

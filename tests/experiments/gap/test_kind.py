@@ -177,7 +177,7 @@ def test_a_texture_is_worn_where_there_is_a_car(tmp_path: Path) -> None:
     cars = sorted(name for name, model in MODELS.items() if model.kind == AgentKind.CAR)
     for name in (name for name, family in registered_names().items() if family == "texture"):
         for model in cars[::4]:
-            mesh, edit = Texture(name).worn_by(1).body(model)
+            mesh, edit = Texture(name).agent_edit(1).body(model)
             assert len(mesh.faces) > 100
             assert len(edit.textures) == 1
     assert cells[2].spec["target"] == 1

@@ -15,7 +15,7 @@ from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.dynamic.generate import GENERATORS, Trials, generator_factory
 from ssad.scenarios.dynamic.logged.near_miss import moved, near_misses
 from ssad.scenarios.dynamic.policy.l2c import _Distribution
-from ssad.scenarios.dynamic.transition.motion import KNOTS, Way
+from ssad.scenarios.dynamic.transition.motion import KNOTS, TimedPath
 from ssad.world.roads import load_town
 
 
@@ -75,7 +75,7 @@ def test_a_distribution_moves_to_what_was_better_and_follows_a_valley() -> None:
 def test_a_way_is_driven_at_other_speeds_and_beside_it() -> None:
     step = 0.1 * np.arange(31)
     trace = make_trace(31, [(0.0, 500.0, 0.0, 0.0), (5.0 * step, 0.0, 0.0, 5.0)])
-    way = Way.of(trace, 1)
+    way = TimedPath.of(trace, 1)
     assert way.speed == pytest.approx(5.0, abs=1e-4)
     same = way.rows(way.distance)
     assert same[:, 1] == pytest.approx(5.0 * step, abs=1e-5)

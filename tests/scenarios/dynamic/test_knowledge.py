@@ -29,7 +29,7 @@ from ssad.scenarios.dynamic.episode import forced_signals
 from ssad.scenarios.dynamic.knowledge._junction import FROM_LEFT, FROM_RIGHT, ONCOMING
 from ssad.scenarios.dynamic.knowledge._meeting import ego_times, meeting_place, time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
-    Place,
+    LanePosition,
     ahead,
     bending_route,
     beside,
@@ -260,7 +260,7 @@ def turned(route: Route, angle: float, index: slice = slice(None)) -> Route:
     return replace(route, yaw=yaw)
 
 
-def meet(graph: LaneGraph, route: Route, *sides: float) -> Place:
+def meet(graph: LaneGraph, route: Route, *sides: float) -> LanePosition:
     return meeting_place(
         graph, scenario("RedlightRunning"), route, sides=sides, trigger_distance=35.0, speed=10.0, body="coupe"
     )
@@ -326,7 +326,7 @@ def test_of_all_places_the_one_with_the_least_wait_is_taken(
     # the car comes along y = -1.75 or -5.25 and the ego along x = 1.75: they meet at (1.75, y)
     times, xy = ego_times(route), route.xy.astype(float)
 
-    def wait(place: Place) -> float:
+    def wait(place: LanePosition) -> float:
         x, y = crossroads.at(place.lane, place.s)[:2]
         off = np.hypot(xy[:, 0] - x, xy[:, 1] - y)
         start = int(np.argmax(off < trigger))
@@ -336,7 +336,7 @@ def test_of_all_places_the_one_with_the_least_wait_is_taken(
         return abs(time_to_cover(1.75 - x, speed, model("coupe").max_accel) - float(times[conflict] - times[start]))
 
     lanes = [lane_of(crossroads, 12, k) for k in (1, 2)]
-    every = [wait(Place(lane, s)) for lane in lanes for s in np.arange(70.0, 99.5, 0.5)]
+    every = [wait(LanePosition(lane, s)) for lane in lanes for s in np.arange(70.0, 99.5, 0.5)]
     # points of the route are 1 m apart, so the place where they meet is known to half a metre
     assert wait(found) < min(every) + 0.12
 
@@ -361,17 +361,17 @@ def test_signals_of_a_junction_that_the_route_does_not_pass(crossroads: LaneGrap
 def test_lanes_of_the_ego_from_the_south(crossroads: LaneGraph) -> None:
     inner, outer = lane_of(crossroads, 13, 1), lane_of(crossroads, 13, 2)
     assert inner == 0
-    assert beside(crossroads, Place(outer, 30.0), "left") == Place(inner, pytest.approx(30.0))
-    assert beside(crossroads, Place(inner, 30.0), "right") == Place(outer, pytest.approx(30.0))
-    opposite = beside(crossroads, Place(inner, 30.0), "left")
-    assert opposite == Place(lane_of(crossroads, 13, -1), pytest.approx(70.0))
-    assert beside(crossroads, Place(lane_of(crossroads, 13, 3), 30.0), "right") is None
-    assert width_at(crossroads, Place(inner, 30.0)) == 3.5
+    assert beside(crossroads, LanePosition(outer, 30.0), "left") == LanePosition(inner, pytest.approx(30.0))
+    assert beside(crossroads, LanePosition(inner, 30.0), "right") == LanePosition(outer, pytest.approx(30.0))
+    opposite = beside(crossroads, LanePosition(inner, 30.0), "left")
+    assert opposite == LanePosition(lane_of(crossroads, 13, -1), pytest.approx(70.0))
+    assert beside(crossroads, LanePosition(lane_of(crossroads, 13, 3), 30.0), "right") is None
+    assert width_at(crossroads, LanePosition(inner, 30.0)) == 3.5
 
 
 @pytest.mark.parametrize(("at", "s"), [((2.0, -85.25), 29.75), ((9.0, -200.0), 0.0), ((0.0, 40.0), 100.0)])
 def test_a_point_is_projected_onto_its_lane(at: tuple[float, float], s: float, crossroads: LaneGraph) -> None:
-    assert project(crossroads, 0, *at) == Place(0, pytest.approx(s, abs=1e-4))
+    assert project(crossroads, 0, *at) == LanePosition(0, pytest.approx(s, abs=1e-4))
 
 
 def test_a_point_is_projected_onto_a_bend(crossroads: LaneGraph) -> None:
@@ -397,30 +397,30 @@ def test_turns_at_the_crossroads(crossroads: LaneGraph) -> None:
 
 def test_places_ahead(crossroads: LaneGraph) -> None:
     inside, after = lane_of(crossroads, 132, -1), lane_of(crossroads, 11, -1)
-    assert ahead(crossroads, Place(0, 60.0), 40.0) == Place(0, 100.0)
-    assert ahead(crossroads, Place(0, 60.0), 45.0) == Place(inside, 5.0)
-    assert ahead(crossroads, Place(0, 60.0), 75.0) == Place(after, 5.0)
-    assert ahead(crossroads, Place(0, 60.0), 500.0) == Place(after, 100.0)  # the end of the road
-    assert ahead(crossroads, Place(0, 60.0), 75.0, stop_at_junction=True) == Place(0, 100.0)
+    assert ahead(crossroads, LanePosition(0, 60.0), 40.0) == LanePosition(0, 100.0)
+    assert ahead(crossroads, LanePosition(0, 60.0), 45.0) == LanePosition(inside, 5.0)
+    assert ahead(crossroads, LanePosition(0, 60.0), 75.0) == LanePosition(after, 5.0)
+    assert ahead(crossroads, LanePosition(0, 60.0), 500.0) == LanePosition(after, 100.0)  # the end of the road
+    assert ahead(crossroads, LanePosition(0, 60.0), 75.0, stop_at_junction=True) == LanePosition(0, 100.0)
     # one who is in the junction leaves it
-    assert ahead(crossroads, Place(inside, 20.0), 15.0, stop_at_junction=True) == Place(after, 5.0)
+    assert ahead(crossroads, LanePosition(inside, 20.0), 15.0, stop_at_junction=True) == LanePosition(after, 5.0)
 
 
 def test_a_lanes_path_goes_on_over_the_lanes_that_follow(crossroads: LaneGraph) -> None:
     for start, distance in ((60.25, 20.0), (60.25, 60.0), (99.96, 110.0)):
-        path = lane_path(crossroads, Place(0, start), distance)
+        path = lane_path(crossroads, LanePosition(0, start), distance)
         assert np.allclose(path[:, 0], 1.75)
         assert path[0, 1] == pytest.approx(start - 115.0, abs=1e-4)
         steps = np.diff(path[:, 1])
         assert ((steps >= 0.0) & (steps <= 1.05)).all()
         # the last point is the last one of the lane not beyond the distance; where lanes join, one point more or less
         assert start - 115.0 + distance - 1.1 < path[-1, 1] <= start - 115.0 + distance + 1e-3
-    assert lane_path(crossroads, Place(0, 60.0), 500.0)[-1, 1] == pytest.approx(115.0)  # the end of the road
+    assert lane_path(crossroads, LanePosition(0, 60.0), 500.0)[-1, 1] == pytest.approx(115.0)  # the end of the road
 
 
 def test_only_a_path_that_bends_is_followed(crossroads: LaneGraph, routes: Any) -> None:
-    assert bending_route(crossroads, Place(0, 20.0)) is None
-    bend = bending_route(crossroads, Place(lane_of(crossroads, 133, -1), 0.0))
+    assert bending_route(crossroads, LanePosition(0, 20.0)) is None
+    bend = bending_route(crossroads, LanePosition(lane_of(crossroads, 133, -1), 0.0))
     assert bend is not None
     assert np.allclose(bend.xy[0], (1.75, -15.0), atol=1e-3)
     assert np.allclose(bend.xy[-1], (-115.0, 1.75), atol=1.1)
@@ -431,8 +431,8 @@ def test_only_a_path_that_bends_is_followed(crossroads: LaneGraph, routes: Any) 
         return replace(crossroads, xy=xy)
 
     for by, bends in ((0.25, False), (-0.25, False), (0.35, True), (-0.35, True)):
-        assert (bending_route(straying(by), Place(0, 20.0)) is not None) == bends
-    assert bending_route(crossroads, Place(lane_of(crossroads, 11, -1), 99.5)) is None  # no road is left to bend
+        assert (bending_route(straying(by), LanePosition(0, 20.0)) is not None) == bends
+    assert bending_route(crossroads, LanePosition(lane_of(crossroads, 11, -1), 99.5)) is None  # no road is left to bend
 
 
 def test_a_path_off_the_lane_graph() -> None:
@@ -448,19 +448,22 @@ def test_a_path_off_the_lane_graph() -> None:
 
 def test_the_outermost_lane(crossroads: LaneGraph) -> None:
     both, inner, outer = (LaneType.DRIVING, LaneType.SHOULDER), 0, lane_of(crossroads, 13, 2)
-    place, crossed = to_outermost(crossroads, Place(inner, 30.0), kinds=both)
-    assert (place, crossed) == (Place(outer, pytest.approx(30.0)), 1)
-    assert to_outermost(crossroads, Place(inner, 30.0), kinds=(LaneType.SHOULDER,)) == (Place(inner, 30.0), 0)
+    place, crossed = to_outermost(crossroads, LanePosition(inner, 30.0), kinds=both)
+    assert (place, crossed) == (LanePosition(outer, pytest.approx(30.0)), 1)
+    assert to_outermost(crossroads, LanePosition(inner, 30.0), kinds=(LaneType.SHOULDER,)) == (
+        LanePosition(inner, 30.0),
+        0,
+    )
 
     def with_shoulders(width: float) -> LaneGraph:
         wide = np.repeat(crossroads.kind == LaneType.SHOULDER, np.diff(crossroads.offset))
         return replace(crossroads, width=np.where(wide, np.float32(width), crossroads.width))
 
     # a shoulder of up to 2 m is none, a wider one is where cars park
-    assert to_outermost(with_shoulders(2.0), Place(inner, 30.0), kinds=both)[1] == 1
-    place, crossed = to_outermost(with_shoulders(2.1), Place(inner, 30.0), kinds=both)
+    assert to_outermost(with_shoulders(2.0), LanePosition(inner, 30.0), kinds=both)[1] == 1
+    place, crossed = to_outermost(with_shoulders(2.1), LanePosition(inner, 30.0), kinds=both)
     assert (place.lane, crossed) == (lane_of(crossroads, 13, 3), 2)
-    assert to_outermost(with_shoulders(2.1), Place(inner, 30.0), kinds=(LaneType.DRIVING,))[1] == 1
+    assert to_outermost(with_shoulders(2.1), LanePosition(inner, 30.0), kinds=(LaneType.DRIVING,))[1] == 1
 
 
 # ---------------------------------------------------------------- the trigger and the junction
@@ -477,7 +480,7 @@ def test_the_trigger_is_a_point_of_the_route(crossroads: LaneGraph, routes: Any)
     with pytest.raises(RouteError, match=r"the trigger is 5\.1 m off the route; put it on the route"):
         trigger_index(scenario("RightTurn", trigger=Pose(1.75 + 5.1, -80.0)), route)
     place = trigger_place(crossroads, near, route)
-    assert place == Place(0, pytest.approx(35.0, abs=1e-3))
+    assert place == LanePosition(0, pytest.approx(35.0, abs=1e-3))
     lost = replace(route, lane=np.full_like(route.lane, -1))
     with pytest.raises(RouteError, match="no lane under the route at 5 m"):
         trigger_place(crossroads, near, lost)

@@ -18,7 +18,7 @@ from ssad.core.frames import Camera
 from ssad.core.images import read_image
 from ssad.core.types import Controller, Limits
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.detectors.monitored import Watched
+from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.recorders.target_images import record_clips
 from ssad.recorders.target_recording import Clips
@@ -130,7 +130,7 @@ def test_it_acts_on_recorded_scenes(tiny_set: Path, tmp_path: Path) -> None:
     acted = []
     for name in NAMES:
         (perturbation,) = parse_perturbation(name).at([5])
-        victim = Watched(ToyDetector(), "toy")
+        victim = MonitoredDetector(ToyDetector(), "toy")
         if perturbation.needs_target or name == "night":
             with pytest.raises(ConfigError, match="does not act on recorded scenes"):
                 perturbation.on_scene(recorded, victim)

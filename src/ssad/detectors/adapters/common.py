@@ -56,8 +56,8 @@ class Adapter(nn.Module, ABC):
         return self.choose(dense, min_score)
 
     @abstractmethod
-    def choose(self, dense: Dense, least: float) -> list[Detections]:
-        """Detections of each image above a score of `least`."""
+    def choose(self, dense: Dense, min_score: float) -> list[Detections]:
+        """Return the detections of each image above a score."""
 
 
 def label_owned(owner: Tensor, label: Tensor, crowd: Tensor) -> tuple[Tensor, Tensor]:
@@ -77,19 +77,19 @@ def label_owned(owner: Tensor, label: Tensor, crowd: Tensor) -> tuple[Tensor, Te
     return place_label, torch.where(place_label >= 0, owner, -1)
 
 
-def check_images(name: str, images: Tensor, *, least: int = 1) -> tuple[int, int]:
-    """Height and width of images [B, 3, H, W].
+def check_images(name: str, images: Tensor, *, min_count: int = 1) -> tuple[int, int]:
+    """Return height and width of images [B, 3, H, W].
 
     Args:
-        name: Of the detector, for the message.
-        images: What it was given.
-        least: How many images there must be.
+        name: Name of the detector, for the message.
+        images: Images to check.
+        min_count: Minimum number of images.
 
     Raises:
         ConfigError: Another shape or type.
     """
     shape = images.shape
-    if len(shape) != 4 or shape[1] != 3 or not images.is_floating_point() or 0 in shape[2:] or shape[0] < least:
+    if len(shape) != 4 or shape[1] != 3 or not images.is_floating_point() or 0 in shape[2:] or shape[0] < min_count:
         dtype_name = str(images.dtype).removeprefix("torch.")
         raise ConfigError(
             f"{name}: images must be [B, 3, H, W] of floats in [0, 1] (RGB); got {list(images.shape)} of {dtype_name}"
@@ -104,10 +104,10 @@ def size_inside(size: tuple[int, int], input_width: int | None) -> tuple[int, in
     return max(1, round(size[0] * input_width / size[1])), input_width
 
 
-def scale_of(inside: tuple[int, int], size: tuple[int, int], like: Tensor) -> Tensor:
+def scale_of(inside: tuple[int, int], size: tuple[int, int], template: Tensor) -> Tensor:
     """Return the factors [4] from boxes in an image of `size` to boxes in the network's input of size `inside`."""
     x, y = inside[1] / size[1], inside[0] / size[0]
-    return torch.tensor([x, y, x, y], device=like.device, dtype=like.dtype)
+    return torch.tensor([x, y, x, y], device=template.device, dtype=template.dtype)
 
 
 def resize_and_pad(images: Tensor, inside: tuple[int, int], *, multiple: int, grey: float) -> Tensor:
@@ -129,7 +129,7 @@ def check_threshold(name: str, threshold: float) -> float:
 
 
 def check_truth(name: str, truth: Sequence[Truth], images: int, *, scale: Tensor, classes: int) -> Targets:
-    """Truth of all images in one, with boxes in pixels of the network's input.
+    """Return the truth of all images in one, with boxes in pixels of the network's input.
 
     Args:
         name: Name of the detector, for messages.
@@ -169,8 +169,8 @@ def suppress(score: Tensor, label: Tensor, box: Tensor, *, iou: float, limit: in
         size: Height and width of the image.
     """
     height, width = size
-    limit_corner = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
-    clipped = box.clamp(min=0).minimum(limit_corner)
+    image_corner = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
+    clipped = box.clamp(min=0).minimum(image_corner)
     ranking = score.argsort(descending=True, stable=True)
     score, label, clipped = score[ranking], label[ranking], clipped[ranking]
     # float64: suppression by class shifts boxes far apart, and float32 would round them there.
@@ -178,7 +178,7 @@ def suppress(score: Tensor, label: Tensor, box: Tensor, *, iou: float, limit: in
     return Detections(score[survivors], label[survivors], clipped[survivors])
 
 
-def sums(value: Tensor, image: Tensor, images: int) -> Tensor:
-    """Sums [B] of value [N] by image [N]; no atomic additions, hence the same bits in every run."""
-    belongs = torch.arange(images, device=image.device)[:, None] == image
-    return torch.where(belongs, value, torch.zeros_like(value)).sum(1)
+def sum_by_image(value: Tensor, image: Tensor, images: int) -> Tensor:
+    """Return the sums [B] of values [N] by image [N]; no atomic additions, hence the same bits in every run."""
+    is_in_image = torch.arange(images, device=image.device)[:, None] == image
+    return torch.where(is_in_image, value, torch.zeros_like(value)).sum(1)

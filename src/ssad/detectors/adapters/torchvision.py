@@ -17,7 +17,15 @@ from torchvision.ops import box_iou, generalized_box_iou_loss, sigmoid_focal_los
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, scale_of, sums, suppress
+from ssad.detectors.adapters.common import (
+    Adapter,
+    check_images,
+    check_truth,
+    log_odds,
+    scale_of,
+    sum_by_image,
+    suppress,
+)
 from ssad.detectors.yolo.assign import Targets
 
 
@@ -33,7 +41,7 @@ class OneStage(Adapter):
         model: The network.
         classes: Names of the classes, in the order of `columns`.
         columns: Columns of the head that belong to the classes, without background and columns without a name.
-        name: What tables call it.
+        name: Name in tables.
         threshold: Default of `predict`; None: the model's.
 
     Raises:
@@ -91,8 +99,8 @@ class OneStage(Adapter):
             size=size,
         )
 
-    def choose(self, dense: Dense, least: float) -> list[Detections]:
-        """Detections above a score, chosen as in torchvision.
+    def choose(self, dense: Dense, min_score: float) -> list[Detections]:
+        """Return the detections above a score, selected as in torchvision.
 
         FCOS and RetinaNet keep the 1,000 best candidates of each level, SSD the 400 best of each class; then follows
         suppression within each class.
@@ -100,21 +108,23 @@ class OneStage(Adapter):
         score = dense.logit.sigmoid()
         if dense.quality is not None:
             score = (score * dense.quality.sigmoid()[..., None]).sqrt()
-        return [self._choose(image_score, box, dense, least) for image_score, box in zip(score, dense.box, strict=True)]
+        return [
+            self._choose(image_score, box, dense, min_score) for image_score, box in zip(score, dense.box, strict=True)
+        ]
 
-    def _choose(self, score: Tensor, box: Tensor, dense: Dense, least: float) -> Detections:
+    def _choose(self, score: Tensor, box: Tensor, dense: Dense, min_score: float) -> Detections:
         limit = int(self.model.topk_candidates)
         if self.kind == "ssd":
             value, place = score.topk(min(limit, len(score)), 0)
             label = torch.arange(score.shape[1], device=score.device).expand_as(place)
-            passes = value > least
+            passes = value > min_score
             value, place, label = value[passes], place[passes], label[passes]
         else:
             values, places, labels = [], [], []
-            for start, count in _runs(dense.level):
+            for start, count in _level_ranges(dense.level):
                 level_scores = score[start : start + count].flatten()
                 top_scores, top_indices = level_scores.topk(min(limit, len(level_scores)))
-                top_indices = top_indices[top_scores > least]
+                top_indices = top_indices[top_scores > min_score]
                 values.append(level_scores[top_indices])
                 places.append(top_indices // score.shape[1] + start)
                 labels.append(top_indices % score.shape[1])
@@ -156,16 +166,16 @@ class OneStage(Adapter):
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
         target = assignment.extra["box"].to(scale)[image, place] * scale
         regression = dense.maps["bbox_regression"][0][image, place]
-        positives = sums(torch.ones_like(target[:, 0]), image, image_count)
+        positives = sum_by_image(torch.ones_like(target[:, 0]), image, image_count)
         loss_sums = {
             "classification": self._class_loss(dense.maps["cls_logits"][0], assignment.label),
-            "bbox_regression": sums(self._box_loss(regression, target, anchors[place]), image, image_count),
+            "bbox_regression": sum_by_image(self._box_loss(regression, target, anchors[place]), image, image_count),
         }
         if self.kind == "fcos":
             quality = dense.maps["bbox_ctrness"][0][image, place, 0]
             target_quality = _centreness(target, anchors[place])
             quality_loss = functional.binary_cross_entropy_with_logits(quality, target_quality, reduction="none")
-            loss_sums["bbox_ctrness"] = sums(quality_loss, image, image_count)
+            loss_sums["bbox_ctrness"] = sum_by_image(quality_loss, image, image_count)
         if reduction == "image" or self.kind == "retinanet":  # RetinaNet averages the images' normalised losses
             image_losses = {name: loss_sum / positives.clamp(min=1) for name, loss_sum in loss_sums.items()}
             return (
@@ -217,10 +227,10 @@ class OneStage(Adapter):
         box: Tensor = coder.decode_single(regression.reshape(-1, 4), flat_anchors)
         return box.view_as(regression)
 
-    def _match(self, targets: Targets, k: int, dense: Dense) -> Tensor:
-        """Owner [P] of each place of image k, -1 none, -2 in between."""
+    def _match(self, targets: Targets, image_index: int, dense: Dense) -> Tensor:
+        """Return the owner [P] of each place of an image, -1 none, -2 in between."""
         anchors = dense.maps["anchors"][0]
-        box = targets.box[k, targets.real[k]]
+        box = targets.box[image_index, targets.real[image_index]]
         if not len(box):
             return torch.full((len(anchors),), -1, dtype=torch.int64, device=anchors.device)
         if self.kind != "fcos":
@@ -257,7 +267,7 @@ def full(value: Tensor) -> Tensor:
     return value.float() if value.dtype in (torch.float16, torch.bfloat16) else value
 
 
-def _runs(level: Tensor) -> list[tuple[int, int]]:
+def _level_ranges(level: Tensor) -> list[tuple[int, int]]:
     """Return the first place and the number of places of each level."""
     counts = torch.bincount(level).tolist()
     starts = torch.tensor([0, *counts]).cumsum(0).tolist()

@@ -99,13 +99,13 @@ def _check_options(model: str, options: Iterable[str]) -> None:
             raise ConfigError(f"torchvision:{model}: no option '{key}'{hint}")
 
 
-def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], where: str | Path) -> None:
+def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], origin: str | Path) -> None:
     """Copy weights with torchvision's own names into the detector.
 
     Args:
         detector: The detector.
         state: Tensors by name.
-        where: Origin of the weights, for messages.
+        origin: Origin of the weights, for messages.
 
     Raises:
         FormatError: The weights do not fit.
@@ -117,7 +117,7 @@ def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], where:
                 submodule.eps = 0.0
     if not any(key.startswith("model.") for key in state):
         state = {f"model.{key}": value for key, value in state.items()}
-    fit_state(detector, state, where)
+    fit_state(detector, state, origin)
 
 
 def wrap(

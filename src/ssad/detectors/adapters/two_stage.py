@@ -28,8 +28,8 @@ from ssad.detectors.adapters.common import Adapter, check_images, check_truth, l
 from ssad.detectors.adapters.torchvision import full
 from ssad.detectors.yolo.assign import Targets
 
-NONE = -30.0  # logit of a place without proposal; its sigmoid is 0 but for 1e-13
-SMALLEST = 1e-2
+EMPTY_LOGIT = -30.0  # logit of a place without proposal; its sigmoid is 0 but for 1e-13
+MIN_SIDE = 1e-2
 BETA = 1 / 9
 
 
@@ -69,7 +69,9 @@ class TwoStage(Adapter):
         """
         size = check_images(self.name, images)
         # One by one, see the module: batching could change the choice of proposals.
-        image_maps = [self._one(image) for image in torch.split(images.to(next(self.model.parameters()).dtype), 1)]
+        image_maps = [
+            self._run_stages(image) for image in torch.split(images.to(next(self.model.parameters()).dtype), 1)
+        ]
         maps = {
             name: torch.cat([maps_of_image[name] for maps_of_image in image_maps])
             for name in image_maps[0]
@@ -78,7 +80,7 @@ class TwoStage(Adapter):
         anchors, inside = image_maps[0]["anchors"], image_maps[0]["inside"].tolist()
         scale = scale_of((inside[0], inside[1]), size, anchors)
         filled = maps["filled"]
-        logit = log_odds(maps["class_logits"])[..., self.columns].masked_fill(~filled[..., None], NONE)
+        logit = log_odds(maps["class_logits"])[..., self.columns].masked_fill(~filled[..., None], EMPTY_LOGIT)
         column = self.columns[logit.argmax(-1)]
         boxes = self._boxes(maps["box_regression"], maps["proposals"])
         box = boxes.gather(2, column[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
@@ -98,8 +100,8 @@ class TwoStage(Adapter):
             size=size,
         )
 
-    def _one(self, image: Tensor) -> dict[str, Tensor]:
-        """Both stages on one image [1, 3, H, W]: the maps of `dense`, the size inside, the features."""
+    def _run_stages(self, image: Tensor) -> dict[str, Tensor]:
+        """Run both stages on one image [1, 3, H, W]: the maps of `dense`, the size inside, the features."""
         rpn, roi = self.model.rpn, self.model.roi_heads
         batch, _ = self.model.transform(list(image))
         features = self.model.backbone(batch.tensors)
@@ -142,8 +144,8 @@ class TwoStage(Adapter):
         box: Tensor = flat_boxes.view(*regression.shape[:2], -1, 4)
         return box
 
-    def choose(self, dense: Dense, least: float) -> list[Detections]:
-        """Every class of every proposal above the threshold, each with its own box; then suppression within a class."""
+    def choose(self, dense: Dense, min_score: float) -> list[Detections]:
+        """Return all classes of all proposals above a score, each with its own box, suppressed within a class."""
         boxes = self._boxes(dense.maps["box_regression"][0], dense.maps["proposals"][0])[:, :, self.columns]
         boxes = boxes / dense.maps["scale"][0]
         roi = self.model.roi_heads
@@ -151,8 +153,8 @@ class TwoStage(Adapter):
         detections = []
         for score, box, filled in zip(dense.logit.sigmoid(), boxes, dense.maps["filled"][0], strict=True):
             clipped = box.clamp(min=0).minimum(limit)
-            is_large = ((clipped[..., 2:] - clipped[..., :2]) * dense.maps["scale"][0][:2] >= SMALLEST).all(-1)
-            place, label = ((score > least) & filled[:, None] & is_large).nonzero(as_tuple=True)
+            is_large = ((clipped[..., 2:] - clipped[..., :2]) * dense.maps["scale"][0][:2] >= MIN_SIDE).all(-1)
+            place, label = ((score > min_score) & filled[:, None] & is_large).nonzero(as_tuple=True)
             detections.append(
                 suppress(
                     score[place, label],
@@ -174,7 +176,7 @@ class TwoStage(Adapter):
         """
         scale, anchors = dense.maps["scale"][0], dense.maps["anchors"][0]
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
-        label, owner, target = self._second(dense, targets, targets.label)
+        label, owner, target = self._assign_proposals(dense, targets, targets.label)
         rows = []
         for image_index, image_truth in enumerate(truth):
             object_count = len(image_truth.label)
@@ -201,8 +203,8 @@ class TwoStage(Adapter):
         }
         return Assignment(label, owner, tuple(truth), extra)
 
-    def _second(self, dense: Dense, targets: Targets, kinds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Label, owner [B, K] and target [B, K, 4] (in the network's input) of the proposals; kinds [B, Q]: classes."""
+    def _assign_proposals(self, dense: Dense, targets: Targets, object_labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return label, owner [B, K] and target [B, K, 4] (in the network's input) of the proposals."""
         rows = []
         for image_index, object_count in enumerate(targets.real.sum(1).tolist()):
             filled, proposals = dense.maps["filled"][0][image_index], dense.maps["proposals"][0][image_index]
@@ -218,7 +220,9 @@ class TwoStage(Adapter):
             owner[best_proposal[largest_overlap > 0]] = torch.arange(object_count, device=owner.device)[
                 largest_overlap > 0
             ]
-            label, owner = label_owned(owner.masked_fill(~filled, -2), kinds[image_index], targets.crowd[image_index])
+            label, owner = label_owned(
+                owner.masked_fill(~filled, -2), object_labels[image_index], targets.crowd[image_index]
+            )
             rows.append((label, owner, torch.where((owner >= 0)[:, None], box[owner.clamp(min=0)], 0.0)))
         label, owner, target = (torch.stack(column) for column in zip(*rows, strict=True))
         return label, owner, target
@@ -243,20 +247,20 @@ class TwoStage(Adapter):
         label, target = assignment.label, assignment.extra["box"].to(scale) * scale
         # An attack changes the image and thereby the proposals, while its assignment stays fixed.
         if not torch.equal(maps["proposals"][0], assignment.extra["proposals"].to(scale)):
-            label, target = self._again(dense, assignment)
+            label, target = self._reassign(dense, assignment)
         column = torch.where(label >= 0, self.columns[label.clamp(min=0)], 0)
         class_loss = functional.cross_entropy(maps["class_logits"][0].transpose(1, 2), column, reduction="none")
         regression = maps["box_regression"][0].reshape(*label.shape, -1, 4)
         regression = regression.gather(2, column[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
-        box_loss = _smooth(roi.box_coder, regression, target, maps["proposals"][0], label >= 0)
+        box_loss = _box_losses(roi.box_coder, regression, target, maps["proposals"][0], label >= 0)
         anchor_label = assignment.extra["anchor_label"]
         anchors = maps["anchors"][0].expand(len(label), -1, -1)
         anchor_box = assignment.extra["anchor_box"].to(scale) * scale
-        rpn_box_loss = _smooth(rpn.box_coder, maps["rpn_regression"][0], anchor_box, anchors, anchor_label == 1)
+        rpn_box_loss = _box_losses(rpn.box_coder, maps["rpn_regression"][0], anchor_box, anchors, anchor_label == 1)
         logit, is_object = maps["objectness"][0], (anchor_label == 1).to(scale)
         objectness_loss = functional.binary_cross_entropy_with_logits(logit, is_object, reduction="none")
-        proposal_weights = _expected(label >= 0, label == -1, roi.fg_bg_sampler)
-        anchor_weights = _expected(anchor_label == 1, anchor_label == 0, rpn.fg_bg_sampler)
+        proposal_weights = _sampling_weights(label >= 0, label == -1, roi.fg_bg_sampler)
+        anchor_weights = _sampling_weights(anchor_label == 1, anchor_label == 0, rpn.fg_bg_sampler)
         parts = {
             "loss_classifier": (class_loss * proposal_weights[0], proposal_weights[1]),
             "loss_box_reg": (box_loss * proposal_weights[0], proposal_weights[1]),
@@ -274,7 +278,7 @@ class TwoStage(Adapter):
         }
 
     @torch.no_grad()
-    def _again(self, dense: Dense, assignment: Assignment) -> tuple[Tensor, Tensor]:
+    def _reassign(self, dense: Dense, assignment: Assignment) -> tuple[Tensor, Tensor]:
         """Return label and target of proposals other than those of the assignment."""
         scale = dense.maps["scale"][0]
         truth = assignment.truth
@@ -282,26 +286,26 @@ class TwoStage(Adapter):
         object_labels = targets.label.clone()
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
         object_labels[image, assignment.owner[image, place]] = assignment.label[image, place]
-        label, _, target = self._second(dense, targets, object_labels)
+        label, _, target = self._assign_proposals(dense, targets, object_labels)
         return label, target
 
 
-def _smooth(coder: Any, regression: Tensor, target: Tensor, boxes: Tensor, found: Tensor) -> Tensor:
-    """Smooth L1 [B, K] of the encoded boxes where `found`, 0 elsewhere."""
-    image, place = found.nonzero(as_tuple=True)
+def _box_losses(coder: Any, regression: Tensor, target: Tensor, boxes: Tensor, is_object: Tensor) -> Tensor:
+    """Return the smooth L1 loss [B, K] of the encoded boxes where `is_object`, 0 elsewhere."""
+    image, place = is_object.nonzero(as_tuple=True)
     encoded_target = coder.encode_single(target[image, place], boxes[image, place])
     box_loss = functional.smooth_l1_loss(regression[image, place], encoded_target, beta=BETA, reduction="none").sum(-1)
     return torch.zeros_like(regression[..., 0]).index_put((image, place), box_loss)
 
 
-def _expected(found: Tensor, background: Tensor, sampler: Any) -> tuple[Tensor, Tensor]:
-    """Chance [B, K] that a random choice takes a place, and how many it takes [B]."""
+def _sampling_weights(is_object: Tensor, background: Tensor, sampler: Any) -> tuple[Tensor, Tensor]:
+    """Return the probability [B, K] that a place is sampled, and the number of samples [B]."""
     size, max_objects = sampler.batch_size_per_image, int(sampler.batch_size_per_image * sampler.positive_fraction)
-    object_count, background_count = found.sum(1), background.sum(1)
+    object_count, background_count = is_object.sum(1), background.sum(1)
     sampled_objects = object_count.clamp(max=max_objects)
     sampled_background = torch.minimum(background_count, size - sampled_objects)
     probability = (
-        found * (sampled_objects / object_count.clamp(min=1))[:, None]
+        is_object * (sampled_objects / object_count.clamp(min=1))[:, None]
         + background * (sampled_background / background_count.clamp(min=1))[:, None]
     )
     return probability, sampled_objects + sampled_background

@@ -38,7 +38,7 @@ from ssad.detectors.adapters.common import (
     label_owned,
     resize_and_pad,
     size_inside,
-    sums,
+    sum_by_image,
 )
 from ssad.detectors.yolo.assign import Targets
 from ssad.detectors.yolo.classes import COCO
@@ -46,7 +46,7 @@ from ssad.detectors.yolo.decode import select
 from ssad.detectors.yolo.loss import ciou
 
 GREY = 114 / 255
-NMS_IOU, MOST, THRESHOLD = 0.7, 300, 0.25  # its published defaults for predictions
+NMS_IOU, MAX_DETECTIONS, THRESHOLD = 0.7, 300, 0.25  # its published defaults for predictions
 BOX_GAIN, CLASS_GAIN, DFL_GAIN = 7.5, 0.5, 1.5  # and for training
 TOP, ALPHA, BETA = 10, 0.5, 6.0  # of the task-aligned assignment
 INSTALL = f"{install_extra('ultralytics')} (licence AGPL-3.0; not a dependency of SSAD)"
@@ -93,7 +93,7 @@ def ultralytics_detector(
 
 
 def load_package() -> Any:
-    """The package's module of networks, imported offline; what the import changes is restored.
+    """Import the package's module of networks offline, and restore what the import changes.
 
     Raises:
         ConfigError: The package is not installed, or does not import.
@@ -101,7 +101,7 @@ def load_package() -> Any:
     import cv2
 
     # Everything that the import changes, see the module.
-    held = dict(os.environ)
+    environment = dict(os.environ)
     folder = tempfile.mkdtemp(prefix="ssad-ultralytics-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     threads, cv_threads, numpy_print = torch.get_num_threads(), cv2.getNumThreads(), np.get_printoptions()
@@ -113,11 +113,11 @@ def load_package() -> Any:
         return importlib.import_module("ultralytics.nn.tasks")
     except ImportError as error:
         missing = isinstance(error, ModuleNotFoundError) and str(error.name).split(".")[0] == "ultralytics"
-        why = "the package is not installed" if missing else f"the package does not import: {error}"
-        raise ConfigError(f"ultralytics: {why}; {INSTALL}") from None
+        reason = "the package is not installed" if missing else f"the package does not import: {error}"
+        raise ConfigError(f"ultralytics: {reason}; {INSTALL}") from None
     finally:
         os.environ.clear()
-        os.environ.update(held)
+        os.environ.update(environment)
         torch.set_num_threads(threads)
         cv2.setNumThreads(cv_threads)
         np.set_printoptions(**numpy_print)
@@ -184,9 +184,11 @@ class Ultralytics(Adapter):
             size=size,
         )
 
-    def choose(self, dense: Dense, least: float) -> list[Detections]:
-        """Score sigmoid(class), suppressed within a class."""
-        return select(dense.logit.sigmoid(), dense.box, threshold=least, iou=NMS_IOU, limit=MOST, size=dense.size)
+    def choose(self, dense: Dense, min_score: float) -> list[Detections]:
+        """Return the detections by the score sigmoid(class), suppressed within a class."""
+        return select(
+            dense.logit.sigmoid(), dense.box, threshold=min_score, iou=NMS_IOU, limit=MAX_DETECTIONS, size=dense.size
+        )
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
@@ -203,18 +205,18 @@ class Ultralytics(Adapter):
         return Assignment(label, owner, tuple(truth), {"box": box / scale, "weight": weight})
 
     def _assign_one(
-        self, dense: Dense, targets: Targets, k: int, scale: Tensor
+        self, dense: Dense, targets: Targets, image_index: int, scale: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Label, owner, box and weight of the places of image k."""
-        object_count = int(targets.real[k].sum())
-        predicted, place = dense.box[k] * scale, dense.place * scale[:2]
+        """Return label, owner, box and weight of the places of an image."""
+        object_count = int(targets.real[image_index].sum())
+        predicted, place = dense.box[image_index] * scale, dense.place * scale[:2]
         no_owner = torch.full(place.shape[:1], -1, dtype=torch.int64, device=place.device)
         if not object_count:
             return no_owner, no_owner, torch.zeros_like(predicted), torch.zeros_like(predicted[:, 0])
         box, object_labels, crowd = (
-            targets.box[k, :object_count],
-            targets.label[k, :object_count],
-            targets.crowd[k, :object_count],
+            targets.box[image_index, :object_count],
+            targets.label[image_index, :object_count],
+            targets.crowd[image_index, :object_count],
         )
         is_inside = torch.cat((place[:, None] - box[:, :2], box[:, 2:] - place[:, None]), -1).amin(-1) > 1e-9
         pair_shape = (len(place), object_count, 4)
@@ -224,7 +226,7 @@ class Ultralytics(Adapter):
             .view(len(place), object_count)
         )
         overlap = overlap * is_inside
-        alignment = dense.logit[k].sigmoid()[:, object_labels] ** ALPHA * overlap**BETA
+        alignment = dense.logit[image_index].sigmoid()[:, object_labels] ** ALPHA * overlap**BETA
         best_cells = alignment.topk(min(TOP, len(place)), 0).indices
         is_claimed = torch.zeros_like(is_inside).scatter_(0, best_cells, True) & is_inside
         claim_overlap = torch.where(is_claimed, overlap, -1.0)
@@ -272,11 +274,11 @@ class Ultralytics(Adapter):
         centre = dense.place[place] * scale[:2]
         sides = torch.cat((centre - target[:, :2], target[:, 2:] - centre), 1) / stride
         parts = {
-            "box": sums(BOX_GAIN * (1 - ciou(predicted, target)) * weight, image, image_count),
+            "box": sum_by_image(BOX_GAIN * (1 - ciou(predicted, target)) * weight, image, image_count),
             "cls": CLASS_GAIN * torch.where(assignment.label != -2, class_loss, 0.0).sum(1),
-            "dfl": sums(DFL_GAIN * _distribution_loss(bins, sides) * weight, image, image_count),
+            "dfl": sum_by_image(DFL_GAIN * _distribution_loss(bins, sides) * weight, image, image_count),
         }
-        total = sums(weight, image, image_count)
+        total = sum_by_image(weight, image, image_count)
         if reduction == "image":
             return {name: part / total.clamp(min=1) for name, part in parts.items()}
         return {name: part.sum() / total.sum().clamp(min=1) for name, part in parts.items()}

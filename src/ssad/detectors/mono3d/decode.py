@@ -11,7 +11,7 @@ NEAR = 0.1  # m; corners nearer to the camera are moved there before projection
 
 
 @dataclass(frozen=True, slots=True)
-class Flat:
+class FlatMaps:
     """Maps of all levels as rows: level after level, each row by row.
 
     Attributes:
@@ -32,7 +32,7 @@ class Flat:
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
+class PlaceGrid:
     """P places: x, y of each in pixels [P, 2] (stride times index plus half the stride), stride [P], level [P]."""
 
     xy: Tensor
@@ -40,13 +40,13 @@ class Places:
     level: Tensor
 
 
-def flatten(maps: dict[str, list[Tensor]]) -> Flat:
+def flatten(maps: dict[str, list[Tensor]]) -> FlatMaps:
     """Flatten the maps of all levels to rows."""
 
     def rows(name: str) -> Tensor:
         return torch.cat([level_map.flatten(2).transpose(1, 2) for level_map in maps[name]], 1)
 
-    return Flat(
+    return FlatMaps(
         rows("cls_scores"),
         rows("bbox_preds"),
         rows("dir_cls_preds"),
@@ -56,10 +56,10 @@ def flatten(maps: dict[str, list[Tensor]]) -> Flat:
     )
 
 
-def pick(flat: Flat, image: Tensor, rows: Tensor) -> Flat:
+def pick(flat: FlatMaps, image: Tensor, rows: Tensor) -> FlatMaps:
     """Return the rows [N] of images [N]."""
     bins = None if flat.bins is None else flat.bins[image, rows]
-    return Flat(
+    return FlatMaps(
         flat.logit[image, rows],
         flat.reg[image, rows],
         flat.direction[image, rows],
@@ -69,9 +69,9 @@ def pick(flat: Flat, image: Tensor, rows: Tensor) -> Flat:
     )
 
 
-def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:
+def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> PlaceGrid:
     """Return the places of maps [B, C, h, w]."""
-    xy, sizes, level = [], [], []
+    xy, strides_of_places, level = [], [], []
     for level_index, (level_map, stride) in enumerate(zip(maps, strides, strict=True)):
         y, x = torch.meshgrid(
             torch.arange(level_map.shape[2], device=level_map.device),
@@ -80,18 +80,18 @@ def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:
         )
         positions = torch.stack([x, y], -1).reshape(-1, 2).to(level_map.dtype) * stride + stride // 2
         xy.append(positions)
-        sizes.append(torch.full((len(positions),), stride, dtype=level_map.dtype, device=level_map.device))
+        strides_of_places.append(torch.full((len(positions),), stride, dtype=level_map.dtype, device=level_map.device))
         level.append(torch.full((len(positions),), level_index, dtype=torch.int64, device=level_map.device))
-    return Places(torch.cat(xy), torch.cat(sizes), torch.cat(level))
+    return PlaceGrid(torch.cat(xy), torch.cat(strides_of_places), torch.cat(level))
 
 
-def unproject(points: Tensor, lens: Tensor, image: Tensor | None = None) -> Tensor:
-    """Points in the camera frame from pixels and depths.
+def unproject(points: Tensor, intrinsic: Tensor, image: Tensor | None = None) -> Tensor:
+    """Return points in the camera frame from pixels and depths.
 
     Args:
         points: u, v (pixels) and depth (m) [..., 3].
-        lens: Intrinsics [..., 3, 3], broadcast against the points; or one for each image [B, 3, 3].
-        image: Image that each of the points [N, 3] belongs to [N]; None: `lens` is broadcast.
+        intrinsic: Intrinsics [..., 3, 3], broadcast against the points; or one for each image [B, 3, 3].
+        image: Image that each of the points [N, 3] belongs to [N]; None: `intrinsic` is broadcast.
 
     Returns:
         x, y, z [..., 3], m.
@@ -99,15 +99,15 @@ def unproject(points: Tensor, lens: Tensor, image: Tensor | None = None) -> Tens
     u, v, depth = points.unbind(-1)
     homogeneous = torch.stack([u * depth, v * depth, depth], -1)
     # inv_ex, unlike inv, does not wait for the GPU to check that the matrix is invertible.
-    inverse: Tensor = torch.linalg.inv_ex(lens.double())[0].to(points.dtype)
+    inverse: Tensor = torch.linalg.inv_ex(intrinsic.double())[0].to(points.dtype)
     if image is not None:
         inverse = inverse[image]
     return (inverse @ homogeneous[..., None])[..., 0]
 
 
-def project(points: Tensor, lens: Tensor, *, near: float | None = NEAR) -> Tensor:
-    """u, v [..., 2] of points [..., 3] in the camera frame; the depth is held above `near` (None: anything but 0)."""
-    homogeneous = (lens @ points[..., None])[..., 0]
+def project(points: Tensor, intrinsic: Tensor, *, near: float | None = NEAR) -> Tensor:
+    """Return u, v [..., 2] of points [..., 3] in the camera frame, depth clamped to `near` (None: anything but 0)."""
+    homogeneous = (intrinsic @ points[..., None])[..., 0]
     depth = homogeneous[..., 2:]
     if near is None:
         return homogeneous[..., :2] / torch.where(depth.abs() < 1e-4, 1e-4, depth)
@@ -131,22 +131,22 @@ def yaw_of_vectors(vectors: Tensor, dim: int = -1) -> Tensor:
     return axis + torch.pi * points_back.to(axis.dtype)
 
 
-def global_yaw(local: Tensor, direction: Tensor | None, u: Tensor, lens: Tensor, *, offset: float) -> Tensor:
-    """Yaw from the regressed one, the direction bin [...] and the column u of the centre; lens [..., 3, 3].
+def global_yaw(local: Tensor, direction: Tensor | None, u: Tensor, intrinsic: Tensor, *, offset: float) -> Tensor:
+    """Return the yaw from the regressed one, the direction bin [...] and the column u of the centre.
 
     With a bin, the regressed yaw holds up to half a turn; without (None), it is whole. The viewing angle is taken from
     the focal length along x, as in the source.
     """
     if direction is None:
-        return local + ray_angle(u, lens)
+        return local + ray_angle(u, intrinsic)
     wrapped = local - offset
     wrapped = wrapped - (wrapped / torch.pi).floor() * torch.pi
-    return wrapped + offset + torch.pi * direction.to(local.dtype) + ray_angle(u, lens)
+    return wrapped + offset + torch.pi * direction.to(local.dtype) + ray_angle(u, intrinsic)
 
 
-def ray_angle(u: Tensor, lens: Tensor) -> Tensor:
-    """Angle between the ray of column u and the optical axis."""
-    return torch.atan2(u - lens[..., 0, 2], lens[..., 0, 0])
+def ray_angle(u: Tensor, intrinsic: Tensor) -> Tensor:
+    """Return the angle between the ray of column u and the optical axis."""
+    return torch.atan2(u - intrinsic[..., 0, 2], intrinsic[..., 0, 0])
 
 
 def hull(points: Tensor) -> Tensor:

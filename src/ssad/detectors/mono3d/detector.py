@@ -20,7 +20,7 @@ from ssad.detectors.adapters.common import check_images, check_threshold, scale_
 from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (
-    Flat,
+    FlatMaps,
     flatten,
     global_yaw,
     hull,
@@ -85,15 +85,15 @@ class Mono3D(nn.Module):
             ConfigError: Another shape or type, or no intrinsic.
         """
         maps, features, network_intrinsic, size = self._maps(images, intrinsic)
-        scale, rows_above = self._scale(size, network_intrinsic), self._above(size)
+        scale, rows_above = self._scale(size, network_intrinsic), self._rows_above(size)
         flat = flatten(maps)
         places = places_of(maps["cls_scores"], self.config.strides)
-        with _exact(images):
+        with _full_precision(images):
             if self.training:
                 box = flat.reg.new_zeros((len(images), 0, 4))
             else:
                 solids = self._solids(flat, places.xy, network_intrinsic[:, None])
-                box = self._boxes(flat, places.xy, solids, lens=network_intrinsic[:, None], size=size)
+                box = self._boxes(flat, places.xy, solids, intrinsic=network_intrinsic[:, None], size=size)
         return Dense(
             logit=flat.logit,
             quality=flat.centreness,
@@ -111,7 +111,7 @@ class Mono3D(nn.Module):
     ) -> tuple[dict[str, list[Tensor]], Sequence[Tensor], Tensor, tuple[int, int]]:
         """Return the head's maps, its input, the intrinsics [B, 3, 3] in the network's input, and the image size."""
         size, network_intrinsic = self._check(images, intrinsic)
-        network_intrinsic = self._inside(network_intrinsic, size, self._scale(size, network_intrinsic))
+        network_intrinsic = self._scale_intrinsic(network_intrinsic, size, self._scale(size, network_intrinsic))
         features = self.neck(self.backbone(self._prepare(images)))
         return (
             self.bbox_head(features, self._factor(network_intrinsic), self._rays(features, network_intrinsic)),
@@ -131,7 +131,7 @@ class Mono3D(nn.Module):
         min_score = check_threshold(self.name, self.config.threshold if threshold is None else threshold)
         with evaluating(self):
             maps, _, network_intrinsic, size = self._maps(images, intrinsic)  # without the boxes of all places
-        return self._chosen(maps, network_intrinsic, size, threshold=min_score, best_first=True)
+        return self._select_detections(maps, network_intrinsic, size, threshold=min_score, best_first=True)
 
     def select(self, dense: Dense, threshold: float) -> list[Detections]:
         """Return the detections of each image in mmdetection3d's order, without boxes that the source suppresses.
@@ -143,36 +143,42 @@ class Mono3D(nn.Module):
             threshold: Minimum score.
         """
         maps, intrinsic = _head_maps(dense), dense.maps["intrinsic"][0]
-        return self._chosen(maps, intrinsic, dense.size, threshold=threshold, best_first=False)
+        return self._select_detections(maps, intrinsic, dense.size, threshold=threshold, best_first=False)
 
-    def _chosen(
-        self, maps: dict[str, list[Tensor]], lens: Tensor, size: tuple[int, int], *, threshold: float, best_first: bool
+    def _select_detections(
+        self,
+        maps: dict[str, list[Tensor]],
+        intrinsic: Tensor,
+        size: tuple[int, int],
+        *,
+        threshold: float,
+        best_first: bool,
     ) -> list[Detections]:
-        """Suppression is a chain of small steps and runs on the host; the device is asked once, not for each step."""
-        with _exact(lens):
+        """Select and suppress detections; suppression runs on the host, with one transfer from the device."""
+        with _full_precision(intrinsic):
             flat, places = flatten(maps), places_of(maps["cls_scores"], self.config.strides)
-            class_scores = self._shares(flat, lens)
-            top_rows = self._leading(maps, class_scores.amax(-1))
+            class_scores = self._class_scores(flat, intrinsic)
+            top_rows = self._top_places(maps, class_scores.amax(-1))
             class_scores = class_scores.gather(1, top_rows[..., None].expand(-1, -1, class_scores.shape[2]))
             image, place, label = (class_scores > threshold).nonzero(as_tuple=True)
             rows, score = top_rows[image, place], class_scores[image, place, label]
             outputs, xy = pick(flat, image, rows), places.xy[rows]
-            solids = centre, extent, yaw = self._solids(outputs, xy, lens, image)
-            image_boxes = self._boxes(outputs, xy, solids, lens=lens[image], size=size)
+            solids = centre, extent, yaw = self._solids(outputs, xy, intrinsic, image)
+            image_boxes = self._boxes(outputs, xy, solids, intrinsic=intrinsic[image], size=size)
             candidates = torch.cat([centre, extent, outputs.reg[:, 7:9], outputs.direction], 1)
             ground = torch.stack([centre[:, 0], centre[:, 2], extent[:, 0], extent[:, 2], -yaw], -1)
             host_columns = [
                 candidate_column.cpu() for candidate_column in (image, label, score, image_boxes, ground, candidates)
             ]
             image, label, score, image_boxes, ground, candidates = host_columns
-            survivors = self._suppressed(ground, image_boxes, score, label, image, best_first=best_first)
+            survivors = self._suppress(ground, image_boxes, score, label, image, best_first=best_first)
             values = (
-                self._voted(candidates, image_boxes, score, label, image, survivors)
+                self._vote(candidates, image_boxes, score, label, image, survivors)
                 if self.config.vote is not None
                 else candidates[survivors]
             )
             centre, extent, velocity, direction = torch.split(values, [3, 3, 2, outputs.direction.shape[1]], 1)
-            device_rows, device = survivors.to(lens.device), lens.device
+            device_rows, device = survivors.to(intrinsic.device), intrinsic.device
             yaw = yaw[device_rows]
             if self.config.heading == "vectors":
                 # Voting averages vectors, not angles, so the yaw is decoded anew; the viewing angle stays.
@@ -187,56 +193,58 @@ class Mono3D(nn.Module):
                 velocity,
                 outputs.attribute[device_rows].argmax(-1),
             )
-            counts = torch.bincount(image[survivors], minlength=len(lens)).tolist()
+            counts = torch.bincount(image[survivors], minlength=len(intrinsic)).tolist()
             image_columns = zip(*(torch.split(column.to(device), counts) for column in columns), strict=True)
             return [
                 Detections(image_column[0], image_column[1], image_column[2], Solids(*image_column[3:]))
                 for image_column in image_columns
             ]
 
-    def _shares(self, flat: Flat, lens: Tensor) -> Tensor:
-        """Scores [B, P, 10]: class times centreness, for PGD-Det times how sure it is of the depth; see also `fade`."""
+    def _class_scores(self, flat: FlatMaps, intrinsic: Tensor) -> Tensor:
+        """Return scores [B, P, 10]: class times centreness, for PGD-Det times confidence of depth; see `fade`."""
         scores = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
         if flat.bins is not None:
             scores = scores * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
         if self.config.fade:
-            scores = scores * torch.exp(-self.config.fade * self._depth(flat, lens[:, None]).clamp_min(0.0))[..., None]
+            scores = (
+                scores * torch.exp(-self.config.fade * self._depth(flat, intrinsic[:, None]).clamp_min(0.0))[..., None]
+            )
         return scores
 
-    def _depth(self, flat: Flat, lens: Tensor) -> Tensor:
-        """Depth [..., P] of places, m; lens [..., 3, 3], one a place or broadcast."""
+    def _depth(self, flat: FlatMaps, intrinsic: Tensor) -> Tensor:
+        """Return the depth [..., P] of places, m; intrinsic [..., 3, 3], one per place or broadcast."""
         depth = flat.reg[..., 2]
-        return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._factor(lens))
+        return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._factor(intrinsic))
 
-    def _voted(  # noqa: PLR0917
-        self, values: Tensor, shown: Tensor, score: Tensor, label: Tensor, image: Tensor, stay: Tensor
+    def _vote(  # noqa: PLR0917
+        self, values: Tensor, image_boxes: Tensor, score: Tensor, label: Tensor, image: Tensor, survivors: Tensor
     ) -> Tensor:
-        """Means of values of all candidates, by their scores, over those that show what a box that stays shows.
+        """Return the mean of the values of the candidates that support each survivor, weighted by their scores.
 
         Args:
-            values: Of all candidates [N, K], image by image.
-            shown: Their boxes in the image [N, 4].
+            values: Values of all candidates [N, K], image by image.
+            image_boxes: Their boxes in the image [N, 4].
             score: Their scores [N].
             label: Their classes [N].
             image: Their images [N].
-            stay: Rows of those that stay, image by image.
+            survivors: Rows of the survivors, image by image.
 
         Returns:
-            One row for each that stays.
+            One row for each survivor.
         """
         means = [values[:0]]
-        images, counts = _runs(image[stay])
+        images, counts = _run_lengths(image[survivors])
         starts, ends = torch.searchsorted(image, images), torch.searchsorted(image, images, right=True)
-        for rows, start, end in zip(torch.split(stay, counts), starts.tolist(), ends.tolist(), strict=True):
-            supports = box_iou(shown[rows], shown[start:end]) >= self.config.vote
+        for rows, start, end in zip(torch.split(survivors, counts), starts.tolist(), ends.tolist(), strict=True):
+            supports = box_iou(image_boxes[rows], image_boxes[start:end]) >= self.config.vote
             supports &= label[rows][:, None] == label[start:end]
             supports[torch.arange(len(rows)), rows - start] = True  # a box without area as well
             weight = supports * score[start:end]
             means.append(weight @ values[start:end] / weight.sum(1, keepdim=True))
         return torch.cat(means)
 
-    def _leading(self, maps: dict[str, list[Tensor]], best: Tensor) -> Tensor:
-        """Places [B, R] of the best of each level, by their best scores [B, P]."""
+    def _top_places(self, maps: dict[str, list[Tensor]], best: Tensor) -> Tensor:
+        """Return the best places [B, R] of each level, by their best scores [B, P]."""
         rows: list[Tensor] = []
         start = 0
         for level_map in maps["cls_scores"]:
@@ -251,14 +259,14 @@ class Mono3D(nn.Module):
             start += count
         return torch.cat(rows, 1)
 
-    def _suppressed(
-        self, ground: Tensor, shown: Tensor, score: Tensor, label: Tensor, image: Tensor, *, best_first: bool
+    def _suppress(
+        self, ground: Tensor, image_boxes: Tensor, score: Tensor, label: Tensor, image: Tensor, *, best_first: bool
     ) -> Tensor:
-        """Rows of the candidates that survive suppression, image by image; all images at once, on the host.
+        """Return the rows of the candidates that survive suppression, image by image; all at once, on the host.
 
         Args:
             ground: Rectangles of all candidates on the ground.
-            shown: Their boxes in the image.
+            image_boxes: Their boxes in the image.
             score: Their scores.
             label: Their classes.
             image: Their images, ascending.
@@ -267,7 +275,7 @@ class Mono3D(nn.Module):
         # One group for each image and class: a single pass suppresses all images.
         rows = rotated_nms(ground, score, image * len(self.classes) + label, threshold=self.config.nms)
         if self.config.image_nms is not None:
-            rows = self._suppressed_in_images(rows, shown, score, label, image)
+            rows = self._suppress_in_images(rows, image_boxes, score, label, image)
         row_image = image[rows]
         is_full = torch.bincount(row_image)[row_image] > self.config.most
         # Within an image: by score alone if requested or if there are too many, else in the order of the classes.
@@ -278,15 +286,17 @@ class Mono3D(nn.Module):
         is_within_limit = torch.arange(len(rows)) - torch.searchsorted(row_image, row_image) < self.config.most
         return rows[is_within_limit]
 
-    def _suppressed_in_images(self, rows: Tensor, shown: Tensor, score: Tensor, label: Tensor, image: Tensor) -> Tensor:
-        """Rows (image by image) without those whose boxes in the image overlap too much with better ones."""
+    def _suppress_in_images(
+        self, rows: Tensor, image_boxes: Tensor, score: Tensor, label: Tensor, image: Tensor
+    ) -> Tensor:
+        """Drop rows (image by image) whose boxes in the image overlap too much with better ones."""
         assert self.config.image_nms is not None
         kept_rows = [rows[:0]]
-        for image_rows in torch.split(rows, _runs(image[rows])[1]):
+        for image_rows in torch.split(rows, _run_lengths(image[rows])[1]):
             remaining_rows = image_rows
             if len(image_rows) > 1:
                 order = batched_nms(
-                    shown[image_rows], score[image_rows], label[image_rows], self.config.image_nms
+                    image_boxes[image_rows], score[image_rows], label[image_rows], self.config.image_nms
                 ).sort()[0]
                 remaining_rows = image_rows[order]
             kept_rows.append(remaining_rows)
@@ -303,9 +313,14 @@ class Mono3D(nn.Module):
             raise ConfigError(f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.logit)}")
         intrinsic = dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
-        with _exact(intrinsic):
+        with _full_precision(intrinsic):
             return assign(
-                self.config, places, truth, intrinsic, self._scale(dense.size, intrinsic), above=self._above(dense.size)
+                self.config,
+                places,
+                truth,
+                intrinsic,
+                self._scale(dense.size, intrinsic),
+                rows_above=self._rows_above(dense.size),
             )
 
     @torch.no_grad()
@@ -320,7 +335,7 @@ class Mono3D(nn.Module):
             doubt: Error of the depth at which centreness falls to 1/e, m.
         """
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
-        with _exact(dense.logit):
+        with _full_precision(dense.logit):
             depth = self._depth(pick(flatten(_head_maps(dense)), image, place), dense.maps["intrinsic"][0][image])
         depth_error = (depth - assignment.extra["reg"][image, place, 2]).abs()
         centreness = assignment.extra["centreness"].clone()
@@ -339,7 +354,7 @@ class Mono3D(nn.Module):
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         intrinsic = dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
-        with _exact(intrinsic):
+        with _full_precision(intrinsic):
             return losses(
                 self.config,
                 flatten(_head_maps(dense)),
@@ -352,27 +367,33 @@ class Mono3D(nn.Module):
             )
 
     def _solids(
-        self, flat: Flat, xy: Tensor, lens: Tensor, image: Tensor | None = None
+        self, flat: FlatMaps, xy: Tensor, intrinsic: Tensor, image: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Centre, size, yaw [..., P, ...] of places; lens [..., 3, 3] (broadcast), or one an image and image [P]."""
+        """Return centre, size, yaw of places; intrinsic [..., 3, 3] (broadcast), or one per image and image [P]."""
         centre2d = xy - flat.reg[..., :2]
-        place_intrinsic = lens if image is None else lens[image]
+        place_intrinsic = intrinsic if image is None else intrinsic[image]
         depth = self._depth(flat, place_intrinsic)
-        centre = unproject(torch.cat([centre2d, depth[..., None]], -1), lens, image)
+        centre = unproject(torch.cat([centre2d, depth[..., None]], -1), intrinsic, image)
         direction = flat.direction.argmax(-1) if self.config.heading == "bins" else None
         yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], place_intrinsic, offset=self.config.dir_offset)
         return centre, flat.reg[..., 3:6], yaw
 
     def _boxes(
-        self, flat: Flat, xy: Tensor, solids: tuple[Tensor, Tensor, Tensor], *, lens: Tensor, size: tuple[int, int]
+        self,
+        flat: FlatMaps,
+        xy: Tensor,
+        solids: tuple[Tensor, Tensor, Tensor],
+        *,
+        intrinsic: Tensor,
+        size: tuple[int, int],
     ) -> Tensor:
-        """2D boxes [..., P, 4] at the picture's pixel edges: PGD's own, else of the solids' corners."""
+        """Return 2D boxes [..., P, 4] at the image's pixel edges: PGD's own, else of the solids' corners."""
         if self.config.pgd:
             box = torch.cat([xy - flat.reg[..., 9:11], xy + flat.reg[..., 11:13]], -1)
         else:
-            box = hull(project(solid_corners(*solids), lens[..., None, :, :]))
+            box = hull(project(solid_corners(*solids), intrinsic[..., None, :, :]))
         limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
-        box = box - box.new_tensor([0.0, self._above(size)]).repeat(2)
+        box = box - box.new_tensor([0.0, self._rows_above(size)]).repeat(2)
         return (box / self._scale(size, box).repeat(2)).clamp_min(0.0).minimum(limit)
 
     def _check(self, images: Tensor, intrinsic: Tensor | None) -> tuple[tuple[int, int], Tensor]:
@@ -389,10 +410,10 @@ class Mono3D(nn.Module):
     def _dtype(self) -> torch.dtype:
         return next(self.parameters()).dtype
 
-    def _scale(self, size: tuple[int, int], like: Tensor) -> Tensor:
-        return scale_of(size_inside(size, self.config.input_width), size, like)[:2]
+    def _scale(self, size: tuple[int, int], template: Tensor) -> Tensor:
+        return scale_of(size_inside(size, self.config.input_width), size, template)[:2]
 
-    def _above(self, size: tuple[int, int]) -> int:
+    def _rows_above(self, size: tuple[int, int]) -> int:
         """Return the number of rows added above the resized image, see `Mono3DConfig.trained_width`."""
         trained = self.config.trained_width
         if trained is None or self.config.input_width == trained:
@@ -400,30 +421,30 @@ class Mono3D(nn.Module):
         heights = [size_inside(size, width)[0] for width in (trained, self.config.input_width)]
         return round(self.config.horizon * (heights[0] - heights[1])) % MULTIPLE
 
-    def _inside(self, lens: Tensor, size: tuple[int, int], scale: Tensor) -> Tensor:
-        """Intrinsics in the network's input."""
+    def _scale_intrinsic(self, intrinsic: Tensor, size: tuple[int, int], scale: Tensor) -> Tensor:
+        """Return the intrinsics in the network's input."""
         if self.config.input_width is None and self.config.trained_width is None:
-            return lens
-        added = lens.new_tensor([[0.0, 0.0, 0.0], [0.0, 0.0, self._above(size)]])
-        return torch.cat([lens[:, :2] * scale[:, None] + added, lens[:, 2:]], 1)
+            return intrinsic
+        added = intrinsic.new_tensor([[0.0, 0.0, 0.0], [0.0, 0.0, self._rows_above(size)]])
+        return torch.cat([intrinsic[:, :2] * scale[:, None] + added, intrinsic[:, 2:]], 1)
 
-    def _factor(self, lens: Tensor) -> Tensor | None:
+    def _factor(self, intrinsic: Tensor) -> Tensor | None:
         if self.config.virtual_focal is None:
             return None
-        return lens[..., 0, 0] / self.config.virtual_focal
+        return intrinsic[..., 0, 0] / self.config.virtual_focal
 
-    def _rays(self, maps: list[Tensor], lens: Tensor) -> list[Tensor] | None:
-        """Tangents [B, 2, h, w] of each place of each level, to the right and down, times 4 (about 1 at the border)."""
+    def _rays(self, maps: list[Tensor], intrinsic: Tensor) -> list[Tensor] | None:
+        """Return the tangents [B, 2, h, w] of the places of each level, right and down, times 4 (1 at the border)."""
         if not self.config.rays:
             return None
         level_rays = []
         for level_map, stride in zip(maps, self.config.strides, strict=True):
             x, y = (
-                stride * (torch.arange(length, device=level_map.device, dtype=lens.dtype) + 0.5)
+                stride * (torch.arange(length, device=level_map.device, dtype=intrinsic.dtype) + 0.5)
                 for length in (level_map.shape[3], level_map.shape[2])
             )
-            right = (x - lens[:, 0, 2:]) / lens[:, 0, :1]
-            down = (y - lens[:, 1, 2:]) / lens[:, 1, 1:2]
+            right = (x - intrinsic[:, 0, 2:]) / intrinsic[:, 0, :1]
+            down = (y - intrinsic[:, 1, 2:]) / intrinsic[:, 1, 1:2]
             shape = (len(level_map), level_map.shape[2], level_map.shape[3])
             level_rays.append(4.0 * torch.stack([right[:, None].expand(shape), down[:, :, None].expand(shape)], 1))
         return level_rays
@@ -440,11 +461,11 @@ class Mono3D(nn.Module):
             )
         mean, std = self.get_buffer("mean"), self.get_buffer("std")
         images = (images.flip(1) * 255 - mean) / std
-        rows_above = self._above(size)
+        rows_above = self._rows_above(size)
         return functional.pad(images, (0, -resized[1] % MULTIPLE, rows_above, -(resized[0] + rows_above) % MULTIPLE))
 
 
-def _runs(ascending: Tensor) -> tuple[Tensor, list[int]]:
+def _run_lengths(ascending: Tensor) -> tuple[Tensor, list[int]]:
     """Return the distinct values of ascending whole numbers, and the count of each."""
     counts = torch.bincount(ascending)
     values = counts.nonzero()[:, 0]
@@ -455,6 +476,6 @@ def _head_maps(dense: Dense) -> dict[str, list[Tensor]]:
     return {name: value for name, value in dense.maps.items() if name != "intrinsic"}
 
 
-def _exact(like: Tensor) -> torch.autocast:
+def _full_precision(template: Tensor) -> torch.autocast:
     """Disable mixed precision within the block: boxes and losses need all their digits."""
-    return torch.autocast(like.device.type, enabled=False)
+    return torch.autocast(template.device.type, enabled=False)

@@ -72,8 +72,8 @@ def group_norm_relu(x: Tensor, weight: Tensor, bias: Tensor, groups: int, eps: f
     values = x.permute(0, 2, 3, 1).float()
     group_size = x.shape[1] // groups
 
-    def mean_of_groups(each: Tensor) -> Tensor:
-        return each.view(len(x), groups, group_size).mean(2)
+    def mean_of_groups(channel_means: Tensor) -> Tensor:
+        return channel_means.view(len(x), groups, group_size).mean(2)
 
     mean = mean_of_groups(values.mean((1, 2)))
     variance = (mean_of_groups((values * values).mean((1, 2))) - mean * mean).clamp_min(0.0)
@@ -97,12 +97,12 @@ class Scale(nn.Module):
         self.scale = nn.Parameter(torch.tensor(1.0))
 
 
-def _full(x: Tensor) -> Tensor:
+def _to_float32(x: Tensor) -> Tensor:
     """Return values in at least 32 bits, so that mixed precision does not round what is read off the maps."""
     return x.float() if x.dtype in {torch.float16, torch.bfloat16} else x
 
 
-def _last(inside: int, outside: int, *, rare: bool = False) -> nn.Conv2d:
+def _output_layer(inside: int, outside: int, *, rare: bool = False) -> nn.Conv2d:
     conv = nn.Conv2d(inside, outside, 1)
     nn.init.normal_(conv.weight, std=0.01)
     # The sigmoid of -ln 99 is 0.01.
@@ -126,30 +126,30 @@ class Head(nn.Module):
                 nn.ModuleList([Unit(in_channels, channels), Unit(channels, channels, deformable=config.deformable)]),
             )
         self.conv_cls_prev = nn.ModuleList([Unit(channels, channels)])
-        self.conv_cls = _last(channels, len(MMDET3D_CLASSES), rare=True)
+        self.conv_cls = _output_layer(channels, len(MMDET3D_CLASSES), rare=True)
         self.conv_reg_prevs = nn.ModuleList(
             nn.ModuleList([] if part_index == 4 else [Unit(channels, channels)])
             for part_index in range(len(config.groups))
         )
-        self.conv_regs = nn.ModuleList(_last(channels, size) for size in config.groups)
+        self.conv_regs = nn.ModuleList(_output_layer(channels, size) for size in config.groups)
         if config.heading == "bins":
             self.conv_dir_cls_prev = nn.ModuleList([Unit(channels, channels)])
-            self.conv_dir_cls = _last(channels, 2, rare=True)
+            self.conv_dir_cls = _output_layer(channels, 2, rare=True)
         else:
             self.heading_convs = nn.ModuleList(
                 [Unit(channels + 2 if config.rays else channels, channels), Unit(channels, channels)]
             )
         self.conv_attr_prev = nn.ModuleList([Unit(channels, channels)])
-        self.conv_attr = _last(channels, len(MMDET3D_ATTRIBUTES), rare=True)
+        self.conv_attr = _output_layer(channels, len(MMDET3D_ATTRIBUTES), rare=True)
         centreness_channels = max(channels // 4, 32)
         self.conv_centerness_prev = nn.ModuleList([Unit(channels, centreness_channels)])
-        self.conv_centerness = _last(centreness_channels, 1)
+        self.conv_centerness = _output_layer(centreness_channels, 1)
         self.scales = nn.ModuleList(
             nn.ModuleList(Scale() for _ in range(4 if config.pgd else 3)) for _ in config.strides
         )
         if config.pgd:
             self.conv_depth_cls_prev = nn.ModuleList([Unit(channels, channels)])
-            self.conv_depth_cls = _last(channels, BINS, rare=True)
+            self.conv_depth_cls = _output_layer(channels, BINS, rare=True)
             self.fuse_lambda = nn.Parameter(torch.tensor(1e-4))
         if config.start is not None:
             with torch.no_grad():
@@ -159,13 +159,13 @@ class Head(nn.Module):
         self.register_buffer("base_dims", torch.tensor(BASE_DIMS), persistent=False)
 
     def forward(
-        self, maps: list[Tensor], lens: Tensor | None, rays: list[Tensor] | None = None
+        self, maps: list[Tensor], depth_factor: Tensor | None, rays: list[Tensor] | None = None
     ) -> dict[str, list[Tensor]]:
-        """Maps by mmdetection3d's names, one for each level.
+        """Return maps by mmdetection3d's names, one for each level.
 
         Args:
             maps: Maps of the neck, one for each level.
-            lens: Factor of the depth [B]; None: 1.
+            depth_factor: Factor of the depth [B]; None: 1.
             rays: Viewing direction of each place [B, 2, h, w], one map for each level, if the configuration wants them.
 
         Returns:
@@ -176,18 +176,18 @@ class Head(nn.Module):
         """
         maps_by_name: dict[str, list[Tensor]] = {}
         for level, feature in enumerate(maps):
-            for name, value in self._level(level, feature, lens, None if rays is None else rays[level]).items():
+            for name, value in self._level(level, feature, depth_factor, None if rays is None else rays[level]).items():
                 maps_by_name.setdefault(name, []).append(value)
         return maps_by_name
 
-    def _level(self, level: int, x: Tensor, lens: Tensor | None, rays: Tensor | None) -> dict[str, Tensor]:
+    def _level(self, level: int, x: Tensor, depth_factor: Tensor | None, rays: Tensor | None) -> dict[str, Tensor]:
         regression_input = x if rays is None else torch.cat([x, rays.to(x)], 1)
         class_feature, box_feature = x, regression_input
         for unit in self.get_submodule("cls_convs").children():
             class_feature = unit(class_feature)
         for unit in self.get_submodule("reg_convs").children():
             box_feature = unit(box_feature)
-        logit = _full(self.conv_cls(self.conv_cls_prev[0](class_feature)))
+        logit = _to_float32(self.conv_cls(self.conv_cls_prev[0](class_feature)))
         heading_feature = box_feature
         if self.config.heading == "vectors":
             heading_feature = regression_input
@@ -198,24 +198,24 @@ class Head(nn.Module):
             part_feature = heading_feature if part_index == YAW else box_feature
             for unit in tower.children():
                 part_feature = unit(part_feature)
-            parts.append(_full(output_conv(part_feature)))
+            parts.append(_to_float32(output_conv(part_feature)))
         if self.config.heading == "bins":
-            direction = _full(self.conv_dir_cls(self.conv_dir_cls_prev[0](box_feature)))
+            direction = _to_float32(self.conv_dir_cls(self.conv_dir_cls_prev[0](box_feature)))
         else:
             direction, parts[YAW] = parts[YAW], yaw_of_vectors(parts[YAW], 1)[:, None]
         level_maps = {
             "cls_scores": logit,
-            "bbox_preds": self._decode(level, parts, logit, lens),
+            "bbox_preds": self._decode(level, parts, logit, depth_factor),
             "dir_cls_preds": direction,
-            "attr_preds": _full(self.conv_attr(self.conv_attr_prev[0](class_feature))),
-            "centernesses": _full(self.conv_centerness(self.conv_centerness_prev[0](box_feature))),
+            "attr_preds": _to_float32(self.conv_attr(self.conv_attr_prev[0](class_feature))),
+            "centernesses": _to_float32(self.conv_centerness(self.conv_centerness_prev[0](box_feature))),
         }
         if self.config.pgd:
-            level_maps["depth_cls_preds"] = _full(self.conv_depth_cls(self.conv_depth_cls_prev[0](box_feature)))
+            level_maps["depth_cls_preds"] = _to_float32(self.conv_depth_cls(self.conv_depth_cls_prev[0](box_feature)))
         return level_maps
 
-    def _decode(self, level: int, parts: list[Tensor], logit: Tensor, lens: Tensor | None) -> Tensor:
-        """Offsets times stride, depth and size in metres."""
+    def _decode(self, level: int, parts: list[Tensor], logit: Tensor, depth_factor: Tensor | None) -> Tensor:
+        """Return offsets times stride, depth and size in metres."""
         scales = list(self.scales[level].parameters())
         stride = self.config.strides[level]
         offset = parts[0] * scales[0] * stride
@@ -227,16 +227,16 @@ class Head(nn.Module):
             size = self.base_dims.to(size)[best_class].permute(0, 3, 1, 2) * size
         else:
             depth = depth.exp()
-        if lens is not None:
-            depth = depth * lens[:, None, None, None]
+        if depth_factor is not None:
+            depth = depth * depth_factor[:, None, None, None]
         if self.config.pgd:
             parts = [*parts[:5], (parts[5] * scales[3]).relu() * stride]
         return torch.cat([offset, depth, size, *parts[3:]], 1)
 
-    def fuse(self, depth: Tensor, bins: Tensor, lens: Tensor | None = None) -> Tensor:
-        """PGD's depth [...] from the regressed one and the logits of the bins [..., 6]; lens [...] as in `forward`."""
+    def fuse(self, depth: Tensor, bins: Tensor, depth_factor: Tensor | None = None) -> Tensor:
+        """Return PGD's depth [...] from the regressed one and the logits of the bins [..., 6]; see `forward`."""
         bin_depth = bins.softmax(-1) @ (BIN * torch.arange(BINS, dtype=bins.dtype, device=bins.device))
-        if lens is not None:
-            bin_depth = bin_depth * lens
+        if depth_factor is not None:
+            bin_depth = bin_depth * depth_factor
         weight = self.fuse_lambda.sigmoid()
         return weight * depth + (1 - weight) * bin_depth

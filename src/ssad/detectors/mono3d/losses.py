@@ -13,7 +13,7 @@ from ssad.core.detections import Assignment
 from ssad.core.nuscenes_names import ALIKE, MMDET3D_CLASSES
 from ssad.core.tensor_boxes import intersection, solid_corners
 from ssad.detectors.mono3d.config import Mono3DConfig
-from ssad.detectors.mono3d.decode import Flat, Places, global_yaw, hull, project, unproject, vectors_of_yaw
+from ssad.detectors.mono3d.decode import FlatMaps, PlaceGrid, global_yaw, hull, project, unproject, vectors_of_yaw
 
 BETA = 1.0 / 9.0  # of smooth L1
 _ALIKE = tuple(MMDET3D_CLASSES.index(name) for name in ALIKE)
@@ -23,23 +23,23 @@ Fuse = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 def losses(
     config: Mono3DConfig,
-    flat: Flat,
-    places: Places,
+    flat: FlatMaps,
+    places: PlaceGrid,
     assignment: Assignment,
-    lens: Tensor,
+    intrinsic: Tensor,
     *,
     factor: Tensor | None,
     fuse: Fuse,
     reduction: Reduction,
 ) -> dict[str, Tensor]:
-    """Training losses; depth is compared as the head predicts it, before the factor.
+    """Return the training losses; depth is compared as the head predicts it, before the factor.
 
     Args:
         config: The configuration of the detector.
         flat: Outputs of the head.
         places: Places of the pictures.
         assignment: From `ssad.detectors.mono3d.targets`.
-        lens: Intrinsics of the network's input [B, 3, 3].
+        intrinsic: Intrinsics of the network's input [B, 3, 3].
         factor: Factor of the depth [B] (see `Head.forward`).
         fuse: PGD's fusion of depth.
         reduction: "batch": over all images; "image": each image's own.
@@ -50,7 +50,7 @@ def losses(
     """
     label = assignment.label
     image, place = (label >= 0).nonzero(as_tuple=True)
-    total = _Sum(image, len(label), reduction)
+    total = _LossReducer(image, len(label), reduction)
     target = assignment.extra["reg"][image, place].to(flat.reg.dtype)
     centreness = assignment.extra["centreness"][image, place].to(flat.reg.dtype)
     loss_by_name = {"cls": total.classes(flat.logit, label)}
@@ -59,9 +59,9 @@ def losses(
     code_weights = regression.new_tensor(config.code_weights)
     depth_unit = factor[image] if factor is not None else torch.ones_like(stride)
 
-    def smooth(value: Tensor, wanted: Tensor, first: int) -> Tensor:
-        elements = functional.smooth_l1_loss(value, wanted, beta=BETA, reduction="none")
-        return total.mean((elements * code_weights[first : first + value.shape[1]]).sum(1))
+    def smooth(value: Tensor, target_values: Tensor, first_code: int) -> Tensor:
+        elements = functional.smooth_l1_loss(value, target_values, beta=BETA, reduction="none")
+        return total.mean((elements * code_weights[first_code : first_code + value.shape[1]]).sum(1))
 
     depth = regression[:, 2]
     bins = None if flat.bins is None else flat.bins[image, place]
@@ -113,7 +113,7 @@ def losses(
             direction=predicted_bin,
             target=target,
             stride=stride,
-            lens=lens[image],
+            intrinsic=intrinsic[image],
         )
         loss_by_name["consistency"] = total.mean(box_consistency * code_weights[9:].mean())
     return loss_by_name
@@ -128,9 +128,9 @@ def _consistency(
     direction: Tensor | None,
     target: Tensor,
     stride: Tensor,
-    lens: Tensor,
+    intrinsic: Tensor,
 ) -> Tensor:
-    """1 - GIoU [M] of the 2D box with the hull of the projected corners of the 3D box.
+    """Return 1 - GIoU [M] of the 2D box with the hull of the projected corners of the 3D box.
 
     The 3D box is the predicted one, its centre unprojected with the predicted depth and then moved to the true depth
     along z, and its corners are projected even from behind the camera, as the source does.
@@ -138,17 +138,17 @@ def _consistency(
     if not len(reg):
         return reg.sum(1)
     centre2d = xy - reg[:, :2]
-    centre = unproject(torch.cat([centre2d, depth[:, None]], 1), lens)
+    centre = unproject(torch.cat([centre2d, depth[:, None]], 1), intrinsic)
     centre = torch.cat([centre[:, :2], target[:, 2:3]], 1)
     # vectors have a loss that is smooth everywhere; the angle between them is steep where they are short
     local = reg[:, 6] if direction is not None else reg[:, 6].detach()
-    yaw = global_yaw(local, direction, centre2d[:, 0], lens, offset=config.dir_offset)
-    projected_box = hull(project(solid_corners(centre, reg[:, 3:6], yaw), lens[:, None], near=None))
+    yaw = global_yaw(local, direction, centre2d[:, 0], intrinsic, offset=config.dir_offset)
+    projected_box = hull(project(solid_corners(centre, reg[:, 3:6], yaw), intrinsic[:, None], near=None))
     return 1 - _generalised_iou(projected_box, torch.cat([xy - reg[:, 9:11], xy + reg[:, 11:13]], 1))
 
 
 def _generalised_iou(a: Tensor, b: Tensor) -> Tensor:
-    """GIoU [M] (Rezatofighi et al. 2019) of boxes [M, 4] in pairs."""
+    """Return the Return the GIoU [M] (Rezatofighi et al. 2019) of boxes [M, 4] in pairs."""
     common = intersection(a, b)
     enclosing = (torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
     union = (a[:, 2:] - a[:, :2]).prod(1) + (b[:, 2:] - b[:, :2]).prod(1) - common
@@ -156,15 +156,15 @@ def _generalised_iou(a: Tensor, b: Tensor) -> Tensor:
     return common / union - (enclosing - union) / enclosing
 
 
-class _Sum:
+class _LossReducer:
     """Reduces losses of the positives [M] of B images, over the batch or for each image."""
 
     def __init__(self, image: Tensor, images: int, reduction: Reduction) -> None:
-        self.image, self.images, self.whole = image, images, reduction == "batch"
+        self.image, self.images, self.is_batch = image, images, reduction == "batch"
 
     def total(self, values: Tensor) -> Tensor:
         """Sum values [M] over the batch or over each image."""
-        if self.whole:
+        if self.is_batch:
             return values.sum()
         return values.new_zeros(self.images).index_add(0, self.image, values)
 
@@ -182,6 +182,6 @@ class _Sum:
         # Ignored places (-2) were clamped to background above.
         focal_loss = (focal_loss * (label > -2)[..., None]).sum((1, 2))
         positives = torch.bincount(self.image, minlength=self.images)
-        if self.whole:
+        if self.is_batch:
             return focal_loss.sum() / (positives.sum() + self.images)
         return focal_loss / (positives + 1)

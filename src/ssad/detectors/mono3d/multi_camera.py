@@ -18,7 +18,7 @@ from ssad.detectors.mono3d.nms import rotated_nms
 
 # m from the ego within which a class is reported
 REACH = np.array([RANGES[name] for name in MMDET3D_CLASSES])
-OVERLAP, LEAST, MOST = 0.05, 0.01, 500
+MAX_OVERLAP, MIN_SCORE, MAX_BOXES = 0.05, 0.01, 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +38,9 @@ class DetectedBoxes(WorldBoxes):
 
 
 def merge_cameras(
-    found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to_global: Sequence[F64]
+    detections: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to_global: Sequence[F64]
 ) -> DetectedBoxes:
-    """Detections of the cameras of one moment as boxes in the world, by class and descending score.
+    """Return the detections of the cameras of one moment as boxes in the world, by class and descending score.
 
     As mmdetection3d exports to nuScenes: boxes beyond the range of their class from the ego are dropped; all are moved
     to the camera that looks ahead (upright there); of those of a class that overlap by 5 % or more on its ground, the
@@ -48,19 +48,21 @@ def merge_cameras(
     1.4's.
 
     Args:
-        found: Detections of each camera.
+        detections: Detections of each camera.
         cam_to_ego: Camera to ego [4, 4] of each.
         ego_to_global: Ego to world [4, 4], at each camera's own time.
 
     Raises:
         ConfigError: There is not one pose for each camera, or there are no 3D boxes.
     """
-    if not len(found) == len(cam_to_ego) == len(ego_to_global):
-        raise ConfigError(f"merge_cameras: {len(found)} cameras with {len(cam_to_ego)} and {len(ego_to_global)} poses")
-    if not len(found):
+    if not len(detections) == len(cam_to_ego) == len(ego_to_global):
+        raise ConfigError(
+            f"merge_cameras: {len(detections)} cameras with {len(cam_to_ego)} and {len(ego_to_global)} poses"
+        )
+    if not len(detections):
         return _empty()
     columns = []
-    for camera_detections, to_ego, to_world in zip(found, cam_to_ego, ego_to_global, strict=True):
+    for camera_detections, to_ego, to_world in zip(detections, cam_to_ego, ego_to_global, strict=True):
         if camera_detections.solid is None:
             raise ConfigError("merge_cameras: detections without 3D boxes")
         solid = camera_detections.solid
@@ -69,13 +71,13 @@ def merge_cameras(
             for values in (solid.centre, solid.size_lhw, solid.yaw, solid.velocity)
         )
         score, label = camera_detections.score.detach().cpu().double().numpy(), camera_detections.label.cpu().numpy()
-        in_range = (score > LEAST) & (_distance(centre, to_ego) <= REACH[label])
+        in_range = (score > MIN_SCORE) & (_distance(centre, to_ego) <= REACH[label])
         pose = to_world @ to_ego
         rows = (
             centre @ pose[:3, :3].T + pose[:3, 3],
             size,
             pose[:3, :3] @ camera_axes(yaw),
-            _flat(velocity) @ pose[:3, :3].T,
+            _ground_velocity(velocity) @ pose[:3, :3].T,
             score,
             label,
             solid.attribute.cpu().numpy(),
@@ -93,12 +95,12 @@ def merge_cameras(
     in_range = np.flatnonzero(_distance(centre, cam_to_ego[front_camera]) <= REACH[label])
     ground = torch.from_numpy(np.column_stack([centre[:, [0, 2]], size[:, [0, 2]], -yaw])[in_range])
     survivors = rotated_nms(
-        ground, torch.from_numpy(score[in_range]), torch.from_numpy(label[in_range]), threshold=OVERLAP
+        ground, torch.from_numpy(score[in_range]), torch.from_numpy(label[in_range]), threshold=MAX_OVERLAP
     )
     rows = in_range[survivors.numpy()]
-    if len(rows) > MOST:
-        rows = rows[np.argsort(-score[rows], kind="stable")[:MOST]]
-    world_velocity = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
+    if len(rows) > MAX_BOXES:
+        rows = rows[np.argsort(-score[rows], kind="stable")[:MAX_BOXES]]
+    world_velocity = _ground_velocity((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
     names = tuple(
         _attribute(int(class_index), int(attribute_index))
         for class_index, attribute_index in zip(label[rows], attribute[rows], strict=True)
@@ -133,7 +135,7 @@ def _distance(centre: F64, to_ego: F64) -> F64:
     return np.asarray(np.linalg.norm((centre @ to_ego[:3, :3].T + to_ego[:3, 3])[:, :2], axis=1))
 
 
-def _flat(velocity: F64) -> F64:
+def _ground_velocity(velocity: F64) -> F64:
     """Return velocities [N, 3] from x and z [N, 2] in a camera's frame."""
     return np.stack([velocity[:, 0], np.zeros(len(velocity)), velocity[:, 1]], -1)
 

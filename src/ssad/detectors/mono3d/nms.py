@@ -95,7 +95,7 @@ def rotated_nms(boxes: Tensor, score: Tensor, group: Tensor, *, threshold: float
         overlaps = torch.cat([rotated_iou(boxes[i], boxes[j]) >= threshold for i, j in parts])
         better, worse = better[overlaps], worse[overlaps]
         in_block = worse < stop
-        _settle(alive, better[in_block], worse[in_block])
+        _suppress_pairs(alive, better[in_block], worse[in_block])
         alive[worse[alive[better]]] = False
         start = stop
     return ranking[alive]
@@ -115,12 +115,12 @@ def _candidates(  # noqa: PLR0917
     return rows[row_index], columns[column_index]
 
 
-def _settle(alive: Tensor, first: Tensor, second: Tensor) -> None:
+def _suppress_pairs(alive: Tensor, better: Tensor, worse: Tensor) -> None:
     """Suppress within pairs (better, worse): the one set in which each stays unless a better one that stays hits it."""
     start = alive.clone()
-    while len(first):
+    while len(better):
         after = start.clone()
-        after[second[alive[first]]] = False
+        after[worse[alive[better]]] = False
         if torch.equal(after, alive):
             return
         alive.copy_(after)

@@ -13,15 +13,21 @@ from ssad.core.detections import Assignment, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_CLASSES, NO_ATTRIBUTE
 from ssad.detectors.mono3d.config import Mono3DConfig
-from ssad.detectors.mono3d.decode import Places, project
+from ssad.detectors.mono3d.decode import PlaceGrid, project
 
 FAR = 1e8
 
 
 def assign(
-    config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: Tensor, scale: Tensor, *, above: int = 0
+    config: Mono3DConfig,
+    places: PlaceGrid,
+    truth: Sequence[Truth],
+    intrinsic: Tensor,
+    scale: Tensor,
+    *,
+    rows_above: int = 0,
 ) -> Assignment:
-    """Targets of B images.
+    """Return the targets of B images.
 
     extra: reg [B, P, 13]: offset (place minus projected centre, in strides), depth, size, local yaw, velocity (NaN
     where unknown), 2D distances in strides; attribute [B, P]; centreness [B, P].
@@ -30,9 +36,9 @@ def assign(
         config: The configuration of the detector.
         places: Its places.
         truth: Truth of each image.
-        lens: Intrinsics of the pictures [B, 3, 3].
+        intrinsic: Intrinsics of the pictures [B, 3, 3].
         scale: Factors (x, y) from the picture to the network's input [2].
-        above: Rows that the network's input has above the picture.
+        rows_above: Rows that the network's input has above the picture.
 
     Raises:
         ConfigError: The truth has no 3D boxes.
@@ -56,7 +62,9 @@ def assign(
             "centreness": regression[..., 0].clone(),
         }
         return Assignment(no_label, no_label.clone(), tuple(truth), extra)
-    label, owner, extra = _all(config, places, _pad(truth, device, dtype), lens, scale, above=above)
+    label, owner, extra = _assign_places(
+        config, places, _pad(truth, device, dtype), intrinsic, scale, rows_above=rows_above
+    )
     return Assignment(label, owner, tuple(truth), extra)
 
 
@@ -100,12 +108,12 @@ def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _P
     )
 
 
-def _all(
-    config: Mono3DConfig, places: Places, objects: _Padded, lens: Tensor, scale: Tensor, *, above: int
+def _assign_places(
+    config: Mono3DConfig, places: PlaceGrid, objects: _Padded, intrinsic: Tensor, scale: Tensor, *, rows_above: int
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """Label and owner [B, P] of every place, and what it should say."""
-    centre = project(objects.centre, lens[:, None])  # [B, Q, 2] in the network's input
-    box = objects.box * scale.to(objects.box).repeat(2) + objects.box.new_tensor([0.0, above]).repeat(2)
+    """Return label and owner [B, P] of every place, and its target values."""
+    centre = project(objects.centre, intrinsic[:, None])  # [B, Q, 2] in the network's input
+    box = objects.box * scale.to(objects.box).repeat(2) + objects.box.new_tensor([0.0, rows_above]).repeat(2)
     centre_offset = places.xy[:, None] - centre[:, None]  # [B, P, Q, 2]
     xy = places.xy[:, None]
     sides = torch.cat([xy - box[:, None, :, :2], box[:, None, :, 2:] - xy], -1)

@@ -14,7 +14,7 @@ from torch import Tensor
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.tensor_boxes import intersection
-from ssad.detectors.yolo.decode import Grid
+from ssad.detectors.yolo.decode import CellGrid
 
 IGNORE_IOU = 0.5
 MAX_RATIO = 4.0
@@ -76,7 +76,7 @@ def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets
 
 
 def _padded(*columns: list[Tensor]) -> tuple[Tensor, ...]:
-    """Each column, a tensor [Q, ...] an image, as one tensor [B, largest Q, ...] filled with zeros; and what is real.
+    """Pad each column, a tensor [Q, ...] per image, to [B, largest Q, ...]; return these and a mask of the real rows.
 
     Few steps for all images: one for each image is what a GPU would wait for.
     """
@@ -92,7 +92,7 @@ def _padded(*columns: list[Tensor]) -> tuple[Tensor, ...]:
     return (*padded_columns, real.to(place.device, non_blocking=True))
 
 
-def match_best(targets: Targets, grid: Grid, places: int) -> Tensor:
+def match_best(targets: Targets, grid: CellGrid, places: int) -> Tensor:
     """Assign each object to the anchor of its shape, at the cell that contains its centre (YOLOv3).
 
     Of all anchors, the one with the largest IoU at a common centre is taken. Of two objects at one place, the one
@@ -106,7 +106,7 @@ def match_best(targets: Targets, grid: Grid, places: int) -> Tensor:
     Returns:
         Owner [B, P]: index of the object, -1 for none.
     """
-    size, centre = _size_and_middle(targets.box)
+    size, centre = _size_and_centre(targets.box)
     shape_overlap = _shape_iou(size, grid.anchors.flatten(0, 1))
     quality, best_anchor = shape_overlap.max(-1)
     anchor_count = grid.anchors.shape[1]
@@ -116,10 +116,10 @@ def match_best(targets: Targets, grid: Grid, places: int) -> Tensor:
     column = cell[..., 0].clamp(min=0).minimum(columns[level] - 1)
     row = cell[..., 1].clamp(min=0).minimum(rows[level] - 1)
     place = start[level] + (anchor * rows[level] + row) * columns[level] + column
-    return _settle(targets, place[..., None], quality[..., None], targets.real[..., None], places)
+    return _assign_owners(targets, place[..., None], quality[..., None], targets.real[..., None], places)
 
 
-def match_near(targets: Targets, grid: Grid, places: int) -> Tensor:
+def match_near(targets: Targets, grid: CellGrid, places: int) -> Tensor:
     """Assign each object to all fitting anchors, at its own cell and two neighbouring ones (YOLOv5).
 
     An anchor fits if its width and height are within a factor of four of the object's. The cells are the one that
@@ -134,7 +134,7 @@ def match_near(targets: Targets, grid: Grid, places: int) -> Tensor:
     Returns:
         Owner [B, P]: index of the object, -1 for none.
     """
-    size, centre = _size_and_middle(targets.box)
+    size, centre = _size_and_centre(targets.box)
     # [B, Q, L, A, 2]: every object against every anchor of every level.
     ratio = size[:, :, None, None] / grid.anchors
     fits = torch.maximum(ratio, 1 / ratio).amax(-1) < MAX_RATIO  # [B, Q, L, A]
@@ -156,7 +156,7 @@ def match_near(targets: Targets, grid: Grid, places: int) -> Tensor:
         start[:, None, None] + (anchor * map_rows + y[..., None, :]) * map_columns + x[..., None, :]
     )  # [B, Q, L, A, 3]
     is_candidate = fits[..., None] & valid[..., None, :] & targets.real[:, :, None, None, None]
-    return _settle(
+    return _assign_owners(
         targets, place.flatten(2), quality[..., None].expand(place.shape).flatten(2), is_candidate.flatten(2), places
     )
 
@@ -189,7 +189,7 @@ def label_places(
     if ignore_objects or targets.crowded:
         hides = targets.real if ignore_objects else targets.real & targets.crowd
         hiding_index = hides.long().argsort(dim=1, descending=True, stable=True)[:, : int(hides.sum(1).max())]
-        is_hidden = _touches(
+        is_hidden = _overlaps_hiding_object(
             predicted, targets.box.gather(1, hiding_index[..., None].expand(-1, -1, 4)), hides.gather(1, hiding_index)
         )
         label = torch.where((label == BACKGROUND) & is_hidden, IGNORED, label)
@@ -198,7 +198,7 @@ def label_places(
     return label, owner, torch.where((label >= 0)[..., None], box, torch.zeros_like(box))
 
 
-def _levels(grid: Grid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _levels(grid: CellGrid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return rows, columns, first place and stride of each level, [L] each."""
     device = grid.cell.device
     shape = torch.tensor(grid.shapes, device=device)
@@ -206,7 +206,7 @@ def _levels(grid: Grid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return shape[:, 0], shape[:, 1], torch.tensor(grid.start, device=device), stride
 
 
-def _size_and_middle(box: Tensor) -> tuple[Tensor, Tensor]:
+def _size_and_centre(box: Tensor) -> tuple[Tensor, Tensor]:
     return box[..., 2:] - box[..., :2], (box[..., :2] + box[..., 2:]) / 2
 
 
@@ -216,14 +216,14 @@ def _shape_iou(size: Tensor, anchors: Tensor) -> Tensor:
     return intersection / (size.prod(-1, keepdim=True) + anchors.prod(-1) - intersection).clamp(min=1e-9)
 
 
-def _settle(targets: Targets, place: Tensor, quality: Tensor, good: Tensor, places: int) -> Tensor:
-    """Owner [B, P] of each place from candidates [B, Q, K].
+def _assign_owners(targets: Targets, place: Tensor, quality: Tensor, is_candidate: Tensor, places: int) -> Tensor:
+    """Return the owner [B, P] of each place from candidates [B, Q, K].
 
     At each place the best quality wins, then the first object; objects that count win over crowd objects. The result
     does not depend on the order of the batch or on the device.
     """
     batch = len(place)
-    image, row, slot = good.nonzero(as_tuple=True)
+    image, row, slot = is_candidate.nonzero(as_tuple=True)
     place_key = image * places + place[image, row, slot]
     # Quality is an IoU of at most 1, so 2 puts every crowd object below all others.
     priority = quality[image, row, slot] - 2.0 * targets.crowd[image, row]
@@ -239,10 +239,10 @@ def _settle(targets: Targets, place: Tensor, quality: Tensor, good: Tensor, plac
     return owner.view(batch, places)
 
 
-def _touches(predicted: Tensor, box: Tensor, hiding: Tensor) -> Tensor:
-    """Whether a predicted box [B, P, 4] overlaps one of the objects [B, Q, 4] that hide [B, Q] by IoU > 0.5. [B, P]."""
+def _overlaps_hiding_object(predicted: Tensor, box: Tensor, is_hiding: Tensor) -> Tensor:
+    """Return a mask [B, P] of the predicted boxes [B, P, 4] with IoU > 0.5 with a hiding object [B, Q, 4]."""
     common = intersection(predicted[:, :, None], box[:, None])
     area = (predicted[..., 2:] - predicted[..., :2]).prod(-1)
     object_area = (box[..., 2:] - box[..., :2]).prod(-1)
     union = area[:, :, None] + object_area[:, None] - common
-    return ((common > IGNORE_IOU * union) & hiding[:, None]).any(-1)
+    return ((common > IGNORE_IOU * union) & is_hiding[:, None]).any(-1)

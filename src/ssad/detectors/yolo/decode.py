@@ -22,7 +22,7 @@ MAX_CANDIDATES = 30_000
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class CellGrid:
     """The places of an image.
 
     Attributes:
@@ -46,7 +46,7 @@ class Grid:
     strides: tuple[int, ...]
 
 
-def make_grid(shapes: Sequence[tuple[int, int]], strides: Sequence[int], anchors: Tensor) -> Grid:
+def make_grid(shapes: Sequence[tuple[int, int]], strides: Sequence[int], anchors: Tensor) -> CellGrid:
     """Return the places of maps with these rows and columns; anchors [L, A, 2] give device and dtype."""
     count = anchors.shape[1]
     device, dtype = anchors.device, anchors.dtype
@@ -61,7 +61,7 @@ def make_grid(shapes: Sequence[tuple[int, int]], strides: Sequence[int], anchors
     place_counts = torch.tensor([end - begin for begin, end in pairwise(start)], device=device)
     level = torch.arange(len(strides), device=device).repeat_interleave(place_counts, output_size=start[-1])
     stride = torch.tensor(strides, device=device, dtype=dtype)[level]
-    return Grid(
+    return CellGrid(
         torch.cat(cells), torch.cat(sizes), stride, level, tuple(shapes), tuple(start[:-1]), anchors, tuple(strides)
     )
 
@@ -82,7 +82,7 @@ def to_corners(middle: Tensor, size: Tensor) -> Tensor:
     return torch.cat((middle - size / 2, middle + size / 2), -1)
 
 
-def decode(rule: str, raw: Tensor, grid: Grid) -> Tensor:
+def decode(rule: str, raw: Tensor, grid: CellGrid) -> Tensor:
     """Return boxes [..., P, 4] from the first four raw numbers [..., P, 4].
 
     v3 (paper, section 2.1): centre (sigmoid(t) + cell) * stride, size anchor * exp(t), with t at most ln 1000.

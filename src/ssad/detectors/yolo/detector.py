@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.detectors.adapters.common import Adapter, check_images, check_truth, resize_and_pad, scale_of, size_inside
 from ssad.detectors.yolo.assign import label_places, match_best, match_near
 from ssad.detectors.yolo.classes import COCO
-from ssad.detectors.yolo.decode import Grid, decode, flatten, make_grid, select
+from ssad.detectors.yolo.decode import CellGrid, decode, flatten, make_grid, select
 from ssad.detectors.yolo.loss import Answers, Reduction, losses_v3, losses_v5
 from ssad.detectors.yolo.models import YoloSpec, build_network
 
@@ -74,7 +74,7 @@ class Yolo(Adapter):
         Raises:
             ConfigError: The images have another shape or type.
         """
-        size = check_images(self.name, images, least=0)
+        size = check_images(self.name, images, min_count=0)
         input_size = size_inside(size, self.input_width)
         images = images.to(next(self.network.parameters()).dtype)
         raw, neck = self.network(resize_and_pad(images, input_size, multiple=MULTIPLE, grey=self.spec.grey))
@@ -94,11 +94,11 @@ class Yolo(Adapter):
             size=size,
         )
 
-    def choose(self, dense: Dense, least: float) -> list[Detections]:
-        """Score sigmoid(objectness) * sigmoid(class), suppressed by class."""
+    def choose(self, dense: Dense, min_score: float) -> list[Detections]:
+        """Return the detections by the score sigmoid(objectness) * sigmoid(class), suppressed by class."""
         assert dense.quality is not None
         score = dense.logit.sigmoid() * dense.quality.sigmoid()[..., None]
-        return select(score, dense.box, threshold=least, iou=self.nms_iou, limit=self.limit, size=dense.size)
+        return select(score, dense.box, threshold=min_score, iou=self.nms_iou, limit=self.limit, size=dense.size)
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
@@ -152,12 +152,12 @@ class Yolo(Adapter):
     def _scale(self, size: tuple[int, int], like: Tensor) -> Tensor:
         return scale_of(size_inside(size, self.input_width), size, like)
 
-    def _grid(self, shapes: list[tuple[int, int]]) -> Grid:
+    def _grid(self, shapes: list[tuple[int, int]]) -> CellGrid:
         # Half precision would round anchors and cells of large images.
         anchors = self.anchors
         return make_grid(
             shapes, self.spec.strides, anchors.float() if anchors.dtype in {torch.float16, torch.bfloat16} else anchors
         )
 
-    def _grid_of(self, dense: Dense) -> Grid:
+    def _grid_of(self, dense: Dense) -> CellGrid:
         return self._grid([(level_map.shape[2], level_map.shape[3]) for level_map in dense.maps["raw"]])

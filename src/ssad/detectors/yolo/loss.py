@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from ssad.core.tensor_boxes import intersection
-from ssad.detectors.adapters.common import sums
-from ssad.detectors.yolo.decode import Grid
+from ssad.detectors.adapters.common import sum_by_image
+from ssad.detectors.yolo.decode import CellGrid
 
 Reduction = Literal["batch", "image"]
 BALANCE = (4.0, 1.0, 0.4)
@@ -61,7 +61,7 @@ def ciou(box: Tensor, target: Tensor) -> Tensor:
     return overlap - centre_distance / ((enclosing_size**2).sum(-1) + eps) - weight * aspect
 
 
-def losses_v3(answers: Answers, grid: Grid, *, box_loss: str, reduction: Reduction) -> dict[str, Tensor]:
+def losses_v3(answers: Answers, grid: CellGrid, *, box_loss: str, reduction: Reduction) -> dict[str, Tensor]:
     """Sums over the places of an image, mean over images ("image": each image's own).
 
     obj: cross-entropy of objectness at all places that are not ignored; cls: cross-entropy of each class where an
@@ -83,14 +83,14 @@ def losses_v3(answers: Answers, grid: Grid, *, box_loss: str, reduction: Reducti
     is_counted = answers.label != -2
     objectness_loss = cross_entropy(answers.objectness, is_object, reduction="none")
     loss_parts = {
-        "box": sums(box * (2 - image_share), image, len(is_object)),
+        "box": sum_by_image(box * (2 - image_share), image, len(is_object)),
         "obj": torch.where(is_counted, objectness_loss, 0.0).sum(1),
-        "cls": sums(_class_loss(answers, image, place).sum(-1), image, len(is_object)),
+        "cls": sum_by_image(_class_loss(answers, image, place).sum(-1), image, len(is_object)),
     }
     return loss_parts if reduction == "image" else {name: loss_part.mean() for name, loss_part in loss_parts.items()}
 
 
-def losses_v5(answers: Answers, grid: Grid, *, reduction: Reduction) -> dict[str, Tensor]:
+def losses_v5(answers: Answers, grid: CellGrid, *, reduction: Reduction) -> dict[str, Tensor]:
     """Means over places, summed over levels (the source multiplies by the size of the batch as well; this does not).
 
     box: 0.05 * (1 - CIoU) where an object is; obj: cross-entropy of objectness with CIoU as the target (no gradient),
@@ -102,9 +102,9 @@ def losses_v5(answers: Answers, grid: Grid, *, reduction: Reduction) -> dict[str
     # the means at a level run over the batch's objects, or over the image's
     level_group = image * levels + grid.level[place]
     class_loss = _class_loss(answers, image, place).mean(-1)
-    object_count = sums(torch.ones_like(overlap), level_group, batch * levels).view(batch, levels)
-    box = sums(1 - overlap, level_group, batch * levels).view(batch, levels)
-    cls = sums(class_loss, level_group, batch * levels).view(batch, levels)
+    object_count = sum_by_image(torch.ones_like(overlap), level_group, batch * levels).view(batch, levels)
+    box = sum_by_image(1 - overlap, level_group, batch * levels).view(batch, levels)
+    cls = sum_by_image(class_loss, level_group, batch * levels).view(batch, levels)
     target_objectness = torch.zeros_like(answers.objectness)
     target_objectness[image, place] = overlap.detach().clamp(min=0)
     objectness_loss = cross_entropy(answers.objectness, target_objectness, reduction="none")
@@ -129,6 +129,6 @@ def _class_loss(answers: Answers, image: Tensor, place: Tensor) -> Tensor:
     return cross_entropy(logit, target, reduction="none")
 
 
-def _levels(grid: Grid) -> list[slice]:
+def _levels(grid: CellGrid) -> list[slice]:
     """Return the places of each level."""
     return [slice(begin, end) for begin, end in pairwise((*grid.start, len(grid.stride)))]

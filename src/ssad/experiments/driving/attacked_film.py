@@ -12,7 +12,7 @@ from ssad.core.images import captioned
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.protocols import Detector
 from ssad.core.types import U8, AgentKind, EpisodeTrace
-from ssad.detectors.drawing import marked
+from ssad.detectors.drawing import draw_clear_detections
 from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.onboard import DAY, Onboard
@@ -70,6 +70,8 @@ def attacked_frames(
             (rendered,) = onboard_camera.of_trace(trace, graph, steps=[step])
             image = np.ascontiguousarray(np.moveaxis(rendered, 0, -1))
             if detector is not None:
-                image = marked(detector, torch.from_numpy(rendered.copy())[None].float() / 255, intrinsic)
+                image = draw_clear_detections(
+                    detector, torch.from_numpy(rendered.copy())[None].float() / 255, intrinsic
+                )
             tiles.append(captioned(image, f"{title}, {step * trace.dt:.1f} s", width))
         yield np.hstack(tiles)

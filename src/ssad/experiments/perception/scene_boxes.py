@@ -29,16 +29,16 @@ from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors import loaded_detector, make_detector
 from ssad.detectors.image_scores import (
-    PictureBoxes,
-    PictureTruth,
-    SamplePictures,
-    match_pictures,
-    picture_figures,
-    read_picture_truth,
+    ImageBoxes,
+    ImageTruth,
+    SampleImages,
+    image_figures,
+    match_images,
+    read_image_truth,
 )
-from ssad.detectors.monitored import Watched
+from ssad.detectors.monitored import MonitoredDetector
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes
-from ssad.detectors.on_scenes import AT_ONCE, SampleBoxes, detect_with, match_boxes, numbers
+from ssad.detectors.on_scenes import AT_ONCE, SampleBoxes, detect_with, match_boxes, score_figures
 from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.digital.defences import Defence, Defended
 from ssad.scenarios.static.perturbation import Look, Perturbation, PerturbedScene, RecordedScene
@@ -96,7 +96,9 @@ class SceneCondition:
         condition = "clean" if self.perturbation is None else self.perturbation.folder
         return f"{condition}{f'@{file_name(self.source)}' if self.source else ''}/{self.scene}"
 
-    def present(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> PerturbedScene:
+    def present(
+        self, examination: Examination, data: NuScenes, detectors: Sequence[MonitoredDetector]
+    ) -> PerturbedScene:
         """Return the scene as these detectors receive it: all of them the same images.
 
         A failure of the attacked system is recorded, with its reason, as one of all systems that need the images.
@@ -106,7 +108,7 @@ class SceneCondition:
         victim = None
         if self.source:
             victim = next((detector for detector in detectors if detector.name == self.source), None)
-            victim = victim or Watched(system_of(examination, self.source), self.source)
+            victim = victim or MonitoredDetector(system_of(examination, self.source), self.source)
         presentation = self.perturbation.on_scene(recorded_scene(examination, data, self), victim)
         if victim is not None and presentation.look is not None:
             presentation.look = _passing_failures(presentation.look, victim, detectors)
@@ -128,7 +130,7 @@ def recorded_scene(examination: Examination, data: NuScenes, condition: SceneCon
     )
 
 
-def _passing_failures(look: Look, victim: Watched, detectors: Sequence[Watched]) -> Look:
+def _passing_failures(look: Look, victim: MonitoredDetector, detectors: Sequence[MonitoredDetector]) -> Look:
     """Return a function of images after which a failure of the victim is one of all detectors."""
 
     def look_and_pass(frames: Sequence[SensorFrame]) -> Sequence[U8]:
@@ -187,7 +189,7 @@ def find_boxes(examination: Examination, scene: SceneCondition, detectors: Seque
     if not missing_names:
         return
     with NuScenes(examination.root, examination.version) as dataset:
-        monitored = [Watched(system_of(examination, name), name) for name in missing_names]
+        monitored = [MonitoredDetector(system_of(examination, name), name) for name in missing_names]
         presentation = scene.present(examination, dataset, monitored)
         detector_objects: list[Any] = list(monitored)
         boxes_by_detector = detect_with(
@@ -246,7 +248,7 @@ class DetectorFailed(SSADError):
 
 
 def read_boxes(path: Path) -> tuple[list[Any], dict[str, Any]]:
-    """Read boxes by sample (`SampleBoxes`, or `SamplePictures` of a 2D detector), and the notes of the condition.
+    """Read boxes by sample (`SampleBoxes`, or `SampleImages` of a 2D detector), and the notes of the condition.
 
     Raises:
         DetectorFailed: the file holds a reason instead.
@@ -267,7 +269,7 @@ def read_boxes(path: Path) -> tuple[list[Any], dict[str, Any]]:
     for sample_number, token in enumerate(tokens):
         sample_columns = [column_parts[sample_number] for column_parts in sample_parts]
         samples.append(
-            SamplePictures(token, PictureBoxes(*sample_columns))
+            SampleImages(token, ImageBoxes(*sample_columns))
             if is_2d
             else SampleBoxes(token, _from_columns(*sample_columns))
         )
@@ -376,19 +378,19 @@ def score_found(
         truth: of the same samples; it says which scenes are copies.
         replicates: of the bootstrap over scenes.
     """
-    if isinstance(found[0], SamplePictures):
+    if isinstance(found[0], SampleImages):
         classes = system_of(examination, detector).classes
-        pictures = match_pictures(found, picture_truth_of(examination, truth), classes)
-        figures = lambda weights, summary_only: picture_figures(pictures.scores(weights), few=summary_only)  # noqa: E731
+        pictures = match_images(found, picture_truth_of(examination, truth), classes)
+        figures = lambda weights, summary_only: image_figures(pictures.scores(weights), is_summary=summary_only)  # noqa: E731
     else:
         matches = match_boxes(found, truth)
-        figures = lambda weights, summary_only: numbers(matches.scores(weights), few=summary_only)  # noqa: E731
+        figures = lambda weights, summary_only: score_figures(matches.scores(weights), summary_only=summary_only)  # noqa: E731
     return _resampled(examination, figures, truth, replicates)
 
 
-def picture_truth_of(examination: Examination, truth: GroundTruth) -> PictureTruth:
+def picture_truth_of(examination: Examination, truth: GroundTruth) -> ImageTruth:
     """Return the true boxes in the images of the samples of a truth."""
-    return read_picture_truth(examination.root, examination.version, truth.scenes, truth.samples)
+    return read_image_truth(examination.root, examination.version, truth.scenes, truth.samples)
 
 
 Figures = Callable[[Any, bool], dict[str, float]]

@@ -19,7 +19,7 @@ from ssad.datasets.nuscenes.camera_truth import camera_truth, scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.detectors.drawing import FOUND, TRUE, draw_flat, draw_solids
-from ssad.detectors.monitored import Watched
+from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, detector_of, recorded_scene
 from ssad.scenarios.static.perturbation import Perturbation
 from ssad.scenarios.static.shifts import KNOWN
@@ -43,7 +43,7 @@ def detection_sheet(examination: Examination, split: str, perturbations: Sequenc
     """
     quiet_warp()
     name, weights = examination.detectors[0]
-    detector = Watched(detector_of(name, weights, examination.device)), examination.device
+    detector = MonitoredDetector(detector_of(name, weights, examination.device)), examination.device
     with NuScenes(examination.root, examination.version) as dataset:
         scene, frame = richest(dataset, scenes_of(dataset, split))
         tiles = [tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]

@@ -78,7 +78,7 @@ def build_episode(scenario: Scenario, graph: LaneGraph, *, seed: int, spread: fl
 
 
 def _build(scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, everybody_apart: bool = False) -> Episode:
-    """The episode of just this scenario. everybody_apart: agents whose place was drawn must not touch either."""
+    """Return the episode of this very scenario; everybody_apart: agents at drawn positions must not touch either."""
     scenario_kind = scenario_type(scenario.type)
     scenario = _completed(scenario, scenario_kind)
     values = scenario_kind.values(scenario.parameters)
@@ -136,7 +136,7 @@ def _start(route: Route, forward: float, left: float, turn: float) -> Pose:
 
 
 def _completed(scenario: Scenario, kind: ScenarioType) -> Scenario:
-    """The scenario with what it leaves at the defaults taken from its type."""
+    """Return the scenario with the values that it leaves at the defaults taken from its type."""
     limits = scenario.limits
     if limits.max_distance == Limits().max_distance:
         limits = dataclasses.replace(limits, max_distance=kind.max_distance)

@@ -13,7 +13,7 @@ from ssad.scenarios.dynamic.catalog import CUSTOM, parameter_box, scenario_type
 
 CLOSE: Final = 0.002, 0.001
 """How far a row may be off the line between its neighbours to be left out, m and rad."""
-MOVED: Final = 0.05  # m; an agent that moves less counts as standing
+MIN_MOTION: Final = 0.05  # m; an agent that moves less counts as standing
 BRAKING: Final = 4.0  # m/s^2 of agents that still move when the recording ends
 
 Rows = tuple[tuple[float, float, float, float], ...]
@@ -47,11 +47,11 @@ def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) ->
         rows = _rows(trace, agent_index)
         if rows is None:
             continue
-        if np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MOVED and bool(trace.active[:, agent_index].all()):
+        if np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MIN_MOTION and bool(trace.active[:, agent_index].all()):
             # an actor without phases and trajectory stands still
             actors.append(Actor(trace.names[agent_index], trace.models[agent_index], agent_pose(rows[0])))
             continue
-        trajectory = told_rows(stopping(rows, end_time) if trace.active[-1, agent_index] else rows)
+        trajectory = rounded_rows(stopping(rows, end_time) if trace.active[-1, agent_index] else rows)
         actors.append(
             Actor(trace.names[agent_index], trace.models[agent_index], Pose(*trajectory[0][1:]), trajectory=trajectory)
         )
@@ -69,14 +69,14 @@ def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) ->
 
 
 def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:
-    """A frozen scenario in which one actor moves otherwise.
+    """Return a frozen scenario in which one actor has another motion.
 
     Args:
         scenario: As `frozen` makes it.
         name: Of the actor.
         rows: Its time s, x, y m and yaw rad [T, 4]; at their end it brakes to a stop.
     """
-    trajectory = told_rows(stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
+    trajectory = rounded_rows(stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
     pose = Pose(*trajectory[0][1:])
     return replace(
         scenario,
@@ -92,7 +92,7 @@ def agent_pose(row: F64) -> Pose:
     return Pose(round(float(row[1]), 3), round(float(row[2]), 3), round(float(wrap_angle(row[3])), 4))
 
 
-def told_rows(rows: F64, *, thin: bool = True) -> Rows:
+def rounded_rows(rows: F64, *, thin: bool = True) -> Rows:
     """Round rows [T, 4] to the precision of scenario files (mm), optionally without collinear rows."""
     selected_rows = np.array(thinned(rows)) if thin else rows
     rounded = np.concatenate([selected_rows[:, :3].round(3), np.asarray(wrap_angle(selected_rows[:, 3:])).round(4)], 1)
@@ -145,7 +145,7 @@ def braked(speed: F64, time: F64) -> tuple[F64, F64]:
 
 
 def stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
-    """Rows [T, 4] of time, x, y and yaw, and after them a stop straight ahead, until a time s."""
+    """Extend rows [T, 4] of time, x, y and yaw by a stop straight ahead, until a time, s."""
     last_row, previous_row = rows[-1], rows[-2]
     heading = np.array([np.cos(last_row[3]), np.sin(last_row[3])])
     speed = float((last_row[1:3] - previous_row[1:3]) @ heading / (last_row[0] - previous_row[0]))

@@ -164,9 +164,9 @@ class Trials:
         return rollout(world, driver_of, sensors=self.sensors, policies=self.policies), taken_over
 
 
-def _adversaries(proposal: Proposal, episode: Episode, trace: EpisodeTrace, taken: Bool) -> list[int]:
-    """Numbers of the agents that count as adversaries."""
-    adversaries = {agent_index for agent_index in range(1, len(episode.agents)) if taken[agent_index]}
+def _adversaries(proposal: Proposal, episode: Episode, trace: EpisodeTrace, taken_over: Bool) -> list[int]:
+    """Return the indices of the agents that count as adversaries."""
+    adversaries = {agent_index for agent_index in range(1, len(episode.agents)) if taken_over[agent_index]}
     adversaries |= {
         agent_index
         for agent_index, agent in enumerate(episode.agents)
@@ -188,7 +188,7 @@ def search(
     budget: int,
     batch: int = BATCH,
     known: Sequence[Sequence[Outcome]] = (),
-    after: Callable[[int], None] = lambda asked: None,
+    after: Callable[[int], None] = lambda requested: None,
 ) -> list[list[Outcome]]:
     """Run a generator until each base has used its budget or no more proposals come.
 

@@ -85,7 +85,7 @@ class _Event:
 
 
 @dataclass(frozen=True)
-class _Road:
+class _ImportedRoute:
     """One route of an XML file."""
 
     ident: str
@@ -107,7 +107,7 @@ def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[S
     """
     folder = Path(folder)
     if folder.is_file() and folder.parent.name == "scenario_type":
-        return _listed(_routes_of(folder.parent), _read_list(folder, left_out), folder, left_out)
+        return _scenarios_of_list(_routes_of(folder.parent), _read_list(folder, left_out), folder, left_out)
     if not folder.is_dir():
         raise FormatError(f"{folder}: no such folder")
     lists = sorted(path for list_folder in _scenario_types(folder) for path in list_folder.glob("*.json"))
@@ -120,7 +120,7 @@ def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[S
         entries, list_errors = entries_by_list[preferred_list]
         if left_out is not None:
             left_out += list_errors
-        return _listed(_routes_of(preferred_list.parent), entries, preferred_list, left_out)
+        return _scenarios_of_list(_routes_of(preferred_list.parent), entries, preferred_list, left_out)
     return _leaderboard(folder)
 
 
@@ -210,7 +210,9 @@ def _values(entry: Mapping[str, Any], number: int) -> dict[str, float]:
     return values
 
 
-def _listed(routes: Path, entries: Sequence[_Entry], listing: Path, left_out: list[str] | None) -> tuple[Scenario, ...]:
+def _scenarios_of_list(
+    routes: Path, entries: Sequence[_Entry], listing: Path, left_out: list[str] | None
+) -> tuple[Scenario, ...]:
     """Build the scenarios of a list; repetitions of a route get seeds 0, 1, ..."""
     if not entries:
         raise FormatError(f"{listing}: no entry of it can be read{f'; the first: {left_out[0]}' if left_out else ''}")
@@ -257,13 +259,13 @@ def _listed(routes: Path, entries: Sequence[_Entry], listing: Path, left_out: li
 
 
 def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
-    """The scenario of one route file with the first trigger along it."""
+    """Return the scenario of one route file with the first trigger along it."""
     routes = _read_roads(path)
     if len(routes) != 1:
         raise FormatError(f"{path}: expected one route, found {len(routes)}")
     route = routes[0]
     # Key points are sparse: a trigger in a bend can be far from the straight line between two of them.
-    triggers = _triggers(route, events) or _triggers(_through_town(route), events)
+    triggers = _triggers(route, events) or _triggers(_with_lane_points(route), events)
     if not triggers and kind != "NaturalJunction":
         raise FormatError(f"{path}: no trigger of {kind} in {route.town} lies on the route (2 m, 10 degrees)")
     event = events[triggers[0][1]] if triggers else None
@@ -277,17 +279,19 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
     )
     if kind in _PLACED and not scenario.placements:
         raise FormatError(f"{path}: its trigger names no other actor, which {kind} needs")
-    return _checked(scenario, path)
+    return _check_scenario(scenario, path)
 
 
-def _triggers(road: _Road, events: Sequence[_Event]) -> list[tuple[float, int]]:
-    """How far along a route its triggers are, and their numbers, in order."""
-    positions = ((_along(road, event.trigger), index) for index, event in enumerate(events) if event.town == road.town)
+def _triggers(route: _ImportedRoute, events: Sequence[_Event]) -> list[tuple[float, int]]:
+    """Return the position of each trigger along a route, and its number, in order."""
+    positions = (
+        (_position_along(route, event.trigger), index) for index, event in enumerate(events) if event.town == route.town
+    )
     return sorted((position, index) for position, index in positions if position is not None)
 
 
-def _through_town(road: _Road) -> _Road:
-    """The route with a point each metre along the lanes of its town, if that is known and has such a route.
+def _with_lane_points(road: _ImportedRoute) -> _ImportedRoute:
+    """Return the route with a point each metre along the lanes of its town; unchanged without such a town or route.
 
     Source: SafeBench (Xu et al. 2022) interpolates a route to a point each metre and matches triggers to these.
     """
@@ -299,15 +303,15 @@ def _through_town(road: _Road) -> _Road:
     return replace(road, points=points)
 
 
-def _checked(scenario: Scenario, path: Path) -> Scenario:
+def _check_scenario(scenario: Scenario, path: Path) -> Scenario:
     for location, message in problems(scenario):
         raise FormatError(f"{path}: {dotted(location)}: {message}")
     return scenario
 
 
-def _along(road: _Road, trigger: Pose) -> float | None:
-    """How far along the key points the trigger is, counted in key points; None beyond 2 m or 10 degrees from them."""
-    for index, (start, end) in enumerate(pairwise(road.points)):
+def _position_along(route: _ImportedRoute, trigger: Pose) -> float | None:
+    """Return the position of a trigger along the key points, in key points; None beyond 2 m or 10 degrees from them."""
+    for index, (start, end) in enumerate(pairwise(route.points)):
         dx, dy = end.x - start.x, end.y - start.y
         length = math.hypot(dx, dy)
         if length > 1e-6:
@@ -351,7 +355,7 @@ def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
                     source=f"leaderboard route {route.ident} of {path.name}",
                 )
                 count[event.type] += 1
-                scenarios.append(_checked(scenario, path))
+                scenarios.append(_check_scenario(scenario, path))
     if not scenarios:
         raise FormatError(f"{folder}: no trigger lies on any route (2 m, 10 degrees)")
     return tuple(scenarios)
@@ -360,9 +364,9 @@ def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
 # ---------------------------------------------------------------- files
 
 
-def _read_roads(path: Path) -> list[_Road]:
+def _read_roads(path: Path) -> list[_ImportedRoute]:
     root = read_xml(path)
-    imported_routes: list[_Road] = []
+    imported_routes: list[_ImportedRoute] = []
     for element in root.iter("route"):
         route_id, town = element.get("id", ""), element.get("town")
         if not town:
@@ -373,7 +377,7 @@ def _read_roads(path: Path) -> list[_Road]:
         )
         if len(points) < 2:
             raise FormatError(f"{location}: needs at least two waypoints, has {len(points)}")
-        imported_routes.append(_Road(route_id or str(len(imported_routes)), town, points))
+        imported_routes.append(_ImportedRoute(route_id or str(len(imported_routes)), town, points))
     if not imported_routes:
         raise FormatError(f"{path}: no <route> in it")
     return imported_routes
@@ -411,41 +415,41 @@ def _block_events(path: Path, block: Any, strict: bool) -> Iterator[_Event]:
                     _NAMES[scenario_name],
                     town,
                     _pose(event.get("transform"), f"{location}: transform"),
-                    _others(event, location),
+                    _other_actors(event, location),
                 )
 
 
-def _others(event: Mapping[str, Any], where: str) -> tuple[Pose, ...]:
+def _other_actors(event: Mapping[str, Any], location: str) -> tuple[Pose, ...]:
     actors_by_side = event.get("other_actors") or {}
     if not isinstance(actors_by_side, dict):
-        raise FormatError(f"{where}: other_actors should map front, left, right to lists")
+        raise FormatError(f"{location}: other_actors should map front, left, right to lists")
     return tuple(
-        _pose(actor, f"{where}: other_actors: {side} {index}")
+        _pose(actor, f"{location}: other_actors: {side} {index}")
         for side in _SIDES
-        for index, actor in enumerate(_list(actors_by_side.get(side, []), f"{where}: other_actors: {side}"))
+        for index, actor in enumerate(_list(actors_by_side.get(side, []), f"{location}: other_actors: {side}"))
     )
 
 
-def _list(value: Any, where: str) -> list[Any]:
+def _list(value: Any, location: str) -> list[Any]:
     if not isinstance(value, list):
-        raise FormatError(f"{where}: expected a list")
+        raise FormatError(f"{location}: expected a list")
     return value
 
 
-def _pose(data: Any, where: str) -> Pose:
+def _pose(data: Any, location: str) -> Pose:
     """CARLA's x, y, yaw (numbers or text, yaw in degrees) as a pose of ours."""
     if not isinstance(data, Mapping):
-        raise FormatError(f"{where}: expected x, y and yaw")
+        raise FormatError(f"{location}: expected x, y and yaw")
     coordinates = []
     for key in ("x", "y", "yaw"):
         try:
             value = float(data[key])
         except KeyError:
-            raise FormatError(f"{where}: '{key}' is missing") from None
+            raise FormatError(f"{location}: '{key}' is missing") from None
         except (TypeError, ValueError):
-            raise FormatError(f"{where}: {key} is {data[key]!r}, not a number") from None
+            raise FormatError(f"{location}: {key} is {data[key]!r}, not a number") from None
         if not math.isfinite(value):
-            raise FormatError(f"{where}: {key} is {data[key]!r}, not a finite number")
+            raise FormatError(f"{location}: {key} is {data[key]!r}, not a finite number")
         coordinates.append(value)
     x, y, yaw = coordinates
     # 0.0 - y instead of -y avoids negative zeros in saved scenarios.

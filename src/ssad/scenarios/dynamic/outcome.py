@@ -58,7 +58,7 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
         time=contact_time,
         impact_speed=impact_speed,
         ego_speed=ego_speed,
-        gap=0.0 if len(contact_rows) else _least_gap(trace, agent_boxes, agent_indices),
+        gap=0.0 if len(contact_rows) else _min_gap(trace, agent_boxes, agent_indices),
         off_road=any(_leaves_road(trace, graph, agent) for agent in motor_vehicles),
         hit_others=any(_hits_others(trace, agent_boxes, agent) for agent in agent_indices),
         acceleration=acceleration,
@@ -74,11 +74,11 @@ def _closing_speed(trace: EpisodeTrace, row: int, agent: int) -> float:
     return float(np.hypot(*(velocity[0] - velocity[1])))
 
 
-def _least_gap(trace: EpisodeTrace, box: F64, who: Sequence[int]) -> float | None:
-    """Least distance of the ego's body from one of the agents', m."""
+def _min_gap(trace: EpisodeTrace, box: F64, agents: Sequence[int]) -> float | None:
+    """Return the minimum distance between the body of the ego and those of the agents, m."""
     gaps = [
         float(obb_distance(box[common_rows, 0], box[common_rows, agent]).min())
-        for agent in who
+        for agent in agents
         if len(common_rows := np.flatnonzero(trace.active[:, agent] & trace.active[:, 0]))
     ]
     return min(gaps, default=None)
@@ -99,15 +99,15 @@ def _leaves_road(trace: EpisodeTrace, graph: LaneGraph, agent: int) -> bool:
 
 
 def _hits_others(trace: EpisodeTrace, box: F64, agent: int) -> bool:
-    """Whether an agent touches anybody but the ego who was not in touch with it from the start."""
+    """Return True if an agent touches another one, not the ego, that it did not touch from the start."""
     reach = 0.5 * np.hypot(trace.length, trace.width)
-    for other in range(1, len(trace.kind)):
-        both_present = trace.active[:, agent] & trace.active[:, other]
-        centre_distance = np.hypot(*(box[:, agent, :2] - box[:, other, :2]).T)
+    for other_agent in range(1, len(trace.kind)):
+        both_present = trace.active[:, agent] & trace.active[:, other_agent]
+        centre_distance = np.hypot(*(box[:, agent, :2] - box[:, other_agent, :2]).T)
         # The circle test is cheap and excludes nearly all rows before the exact box distance.
-        near_rows = np.flatnonzero(both_present & (centre_distance <= reach[agent] + reach[other]))
-        if other != agent and len(near_rows):
-            touching = obb_distance(box[near_rows, agent], box[near_rows, other]) <= 0.0
+        near_rows = np.flatnonzero(both_present & (centre_distance <= reach[agent] + reach[other_agent]))
+        if other_agent != agent and len(near_rows):
+            touching = obb_distance(box[near_rows, agent], box[near_rows, other_agent]) <= 0.0
             if touching.any() and not (touching[0] and near_rows[0] == np.flatnonzero(both_present)[0]):
                 return True
     return False

@@ -57,7 +57,7 @@ def scenario_from(data: Any, document: Document | None = None, place: Location =
 
     source_document = document or Document("scenario", data)
     if not isinstance(data, Mapping):
-        raise source_document.error(place, f"a scenario is a mapping of keys, not {_shown(data)}")
+        raise source_document.error(place, f"a scenario is a mapping of keys, not {_abbreviated(data)}")
     try:
         # JSON mode is the strict one that still takes lists for tuples and words for literals
         text = json.dumps(data, default=str)
@@ -97,9 +97,9 @@ def _explain(error: ValidationError) -> tuple[tuple[str | int, ...], str]:
     if error_type in ("missing", "missing_argument"):
         return location[:-1], f"key '{location[-1]}' is missing"
     if error_type == "literal_error":
-        return location, f"{_shown(first_error['input'])} is not one of {first_error['ctx']['expected']}"
+        return location, f"{_abbreviated(first_error['input'])} is not one of {first_error['ctx']['expected']}"
     message = first_error["msg"].replace("Input should be", "should be")
-    return location, f"{message}, not {_shown(first_error['input'])}"
+    return location, f"{message}, not {_abbreviated(first_error['input'])}"
 
 
 def _fields_at(location: Location) -> list[str]:
@@ -122,7 +122,7 @@ def _fields_at(location: Location) -> list[str]:
     return [dataclass_field.name for dataclass_field in dataclasses.fields(dataclass_type)]
 
 
-def _shown(value: Any) -> str:
+def _abbreviated(value: Any) -> str:
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:57] + "..."
 

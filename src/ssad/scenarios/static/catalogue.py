@@ -72,7 +72,7 @@ class PerturbationEntry(Schema):
         if self.label:
             return self.label
         name = Path(self.name).stem if self.is_path else self.name
-        settings = "&".join(f"{key}={_word(value)}" for key, value in sorted(self.settings.items()))
+        settings = "&".join(f"{key}={_setting_text(value)}" for key, value in sorted(self.settings.items()))
         return f"{name}?{settings}" if settings else name
 
     @property
@@ -152,9 +152,9 @@ class ShiftEntry(PerturbationEntry):
         from ssad.scenarios.static.shifts.perturbation import OwnShift, Shift
 
         if not is_own(self.name):
-            _refuse(self.name, self.options)
+            _refuse_options(self.name, self.options)
             return Shift(self.name, severity, label=self.label)
-        return OwnShift(self.title, _made("shift", self.name, self.options, severity, ("shift",)), severity)
+        return OwnShift(self.title, _make_object("shift", self.name, self.options, severity, ("shift",)), severity)
 
 
 class DigitalEntry(PerturbationEntry):
@@ -176,9 +176,9 @@ class DigitalEntry(PerturbationEntry):
     @property
     def settings(self) -> dict[str, Any]:
         """Options, and the fields that differ from their defaults."""
-        given = {"radius": self.radius, "norm": self.norm, "loss": self.loss, "classes": self.classes}
+        fields = {"radius": self.radius, "norm": self.norm, "loss": self.loss, "classes": self.classes}
         defaults: dict[str, Any] = {"radius": None, "norm": "linf", "loss": LOSS, "classes": []}
-        return {**self.options, **{key: value for key, value in given.items() if value != defaults[key]}}
+        return {**self.options, **{key: value for key, value in fields.items() if value != defaults[key]}}
 
     @property
     def has_severities(self) -> bool:
@@ -215,7 +215,7 @@ class TextureEntry(PerturbationEntry):
         """Return the texture."""
         from ssad.scenarios.static.physical.textures.perturbation import Texture
 
-        _refuse(self.name, self.options)
+        _refuse_options(self.name, self.options)
         return Texture(self.name, self.label)
 
 
@@ -233,11 +233,11 @@ class LightEntry(PerturbationEntry):
 
     def make(self, severity: int) -> Perturbation:
         """Return the light at a severity."""
-        from ssad.scenarios.static.physical.lights.perturbation import NIGHT, Light
+        from ssad.scenarios.static.physical.lights.perturbation import NIGHT, LightPerturbation
 
         if self.name == NIGHT or self.is_path:
-            _refuse(self.name, self.options)
-        return Light(self.name, severity, self.options, self.label or ("" if self.is_path else self.title))
+            _refuse_options(self.name, self.options)
+        return LightPerturbation(self.name, severity, self.options, self.label or ("" if self.is_path else self.title))
 
 
 class FaultEntry(PerturbationEntry):
@@ -255,9 +255,9 @@ class FaultEntry(PerturbationEntry):
         from ssad.scenarios.static.faults.perturbation import Fault
 
         if not is_own(self.name):
-            _refuse(self.name, self.options)
+            _refuse_options(self.name, self.options)
             return Fault.of_camera(self.name, severity, label=self.label)
-        return Fault(self.title, lambda: _made("fault", self.name, self.options, severity, ()), severity)
+        return Fault(self.title, lambda: _make_object("fault", self.name, self.options, severity, ()), severity)
 
 
 class OwnEntry(PerturbationEntry):
@@ -272,13 +272,13 @@ class OwnEntry(PerturbationEntry):
 
     def make(self, severity: int) -> Perturbation:
         """Return the perturbation at a severity."""
-        made = _made("perturbation", self.name, self.options, severity, ("name", "family"))
-        if not isinstance(made, Perturbation):
+        perturbation = _make_object("perturbation", self.name, self.options, severity, ("name", "family"))
+        if not isinstance(perturbation, Perturbation):
             raise ConfigError(
-                f"perturbation '{self.name}': of type {type(made).__name__}, which does not derive from "
+                f"perturbation '{self.name}': of type {type(perturbation).__name__}, which does not derive from "
                 "ssad.scenarios.static.perturbation.Perturbation"
             )
-        return made
+        return perturbation
 
 
 def _parse(value: Any) -> Any:
@@ -319,24 +319,24 @@ def parse_perturbation(value: Any) -> PerturbationEntry:
         return _Holder(entry=value).entry
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in problem["loc"][2:])
-        text = problem["msg"].removeprefix("Value error, ")
-        if text.startswith("perturbation "):  # it names itself
-            raise ConfigError(text) from None
-        raise ConfigError(f"perturbation {value!r}: {place + ': ' if place else ''}{text}") from None
+        field_path = ".".join(str(part) for part in problem["loc"][2:])
+        message = problem["msg"].removeprefix("Value error, ")
+        if message.startswith("perturbation "):  # it names itself
+            raise ConfigError(message) from None
+        raise ConfigError(f"perturbation {value!r}: {field_path + ': ' if field_path else ''}{message}") from None
 
 
 def _fields_of(value: Any) -> dict[str, Any]:
     """Return the fields of an entry from a text or a mapping."""
     if isinstance(value, str):
-        modern = _modern(value)
-        if modern is not value:
+        current = _current_spelling(value)
+        if current is not value:
             warnings.warn(
-                f"'{value}' is an old spelling of a perturbation and will be refused: write {modern!r}",
+                f"'{value}' is an old spelling of a perturbation and will be refused: write {current!r}",
                 FutureWarning,
                 stacklevel=2,
             )
-            return _fields_of(modern)
+            return _fields_of(current)
         reference = Reference("", {}, "") if is_path(value) else Reference.of(value)
         name = reference.name or value
         return _fields(family_of_name(name), name, dict(reference.options), reference.label)
@@ -347,18 +347,18 @@ def _fields_of(value: Any) -> dict[str, Any]:
         if len(families) > 1:
             raise ConfigError(f"{dict(value)}: {' and '.join(families)} in one perturbation; write two")
         key = families[0]
-        others = {name: setting for name, setting in value.items() if name != key}
-        chosen = value[key]
-        if isinstance(chosen, Mapping):  # {texture: {name: mine.json}}
-            others, chosen = {**chosen, **others}, chosen.get("name")
-            others.pop("name", None)
-        if not isinstance(chosen, str) or not chosen:
-            raise ConfigError(f"{dict(value)}: {key} is a name, a path or module:object, not {chosen!r}")
-        reference = Reference("", {}, "") if is_path(chosen) else Reference.of(chosen)
-        name, family = reference.name or chosen, SPELLINGS.get(key, key)
+        other_settings = {name: setting for name, setting in value.items() if name != key}
+        object_name = value[key]
+        if isinstance(object_name, Mapping):  # {texture: {name: mine.json}}
+            other_settings, object_name = {**object_name, **other_settings}, object_name.get("name")
+            other_settings.pop("name", None)
+        if not isinstance(object_name, str) or not object_name:
+            raise ConfigError(f"{dict(value)}: {key} is a name, a path or module:object, not {object_name!r}")
+        reference = Reference("", {}, "") if is_path(object_name) else Reference.of(object_name)
+        name, family = reference.name or object_name, SPELLINGS.get(key, key)
         if family != "own":
             _check_name(family, name)
-        return _fields(family, name, {**reference.options, **others}, reference.label)
+        return _fields(family, name, {**reference.options, **other_settings}, reference.label)
     if len(value) > 1:
         raise ConfigError(
             f"{dict(value)}: settings stand below the name, as in {{{next(iter(value))}: {{...}}}}, or beside a family "
@@ -393,7 +393,7 @@ def _fields(family: str, name: str, settings: dict[str, Any], label: str) -> dic
     return {**fields, "options": {**options, **settings}}
 
 
-def _modern(text: str) -> str:
+def _current_spelling(text: str) -> str:
     """Return the present spelling of a perturbation that an earlier version wrote; the text itself if it is one."""
     if text.startswith("shine:"):
         return text.removeprefix("shine:")
@@ -427,7 +427,7 @@ def _registered(search_path: tuple[str, ...]) -> Mapping[str, str]:
 
     names: dict[str, str] = {}
     for family, group in GROUPS.items():
-        names |= {point.name: family for point in entry_points(group=f"ssad.{group}s")}
+        names |= {entry_point.name: family for entry_point in entry_points(group=f"ssad.{group}s")}
     names |= dict.fromkeys((*CONTROLS, *shipped_textures()), "texture")
     names |= dict.fromkeys((name for name in ATTACKS if not needs(name)), "digital")
     names |= dict.fromkeys((NIGHT, *LIGHTS), "light")
@@ -460,7 +460,11 @@ def family_of_name(name: str) -> str:
 
 def _check_name(family: str, name: str) -> None:
     """Raise UnknownNameError if a family has no such name."""
-    names = {registered for registered, its_family in registered_names().items() if its_family == family}
+    names = {
+        registered_name
+        for registered_name, registered_family in registered_names().items()
+        if registered_family == family
+    }
     if name in names or ":" in name or (family in ("texture", "light") and is_path(name)):
         return
     raise unknown_name("perturbation", name, names)
@@ -474,8 +478,8 @@ def _family_of_object(name: str) -> str:
     if isinstance(candidate, Perturbation) or (isinstance(candidate, type) and issubclass(candidate, Perturbation)):
         return "own"
     methods = {"digital": ("perturb",), "shift": ("shift",), "light": ("ranges", "edit"), "fault": ("apply",)}
-    for family, needed in methods.items():
-        if all(callable(getattr(candidate, method, None)) for method in needed):
+    for family, required_methods in methods.items():
+        if all(callable(getattr(candidate, method, None)) for method in required_methods):
             return family
     if any(callable(getattr(candidate, method, None)) for method in ("observe", "command")):
         return "fault"
@@ -498,16 +502,18 @@ def is_path(name: str) -> bool:
     folder = Path(name).expanduser()
     if name.endswith((".json", "/")) or name.startswith((".", "/", "~")):
         return True
-    return any((folder / card).is_file() for card in ("light.json", "texture.json"))
+    return any((folder / card_name).is_file() for card_name in ("light.json", "texture.json"))
 
 
-def _made(kind: str, name: str, options: Mapping[str, Any], severity: int, needed: tuple[str, ...]) -> Any:
+def _make_object(
+    kind: str, name: str, options: Mapping[str, Any], severity: int, required_attributes: tuple[str, ...]
+) -> Any:
     """Return an object of the user's own, made with its options, and with the severity if it takes one."""
     factory = resolve(kind, {}, name)
     arguments = dict(options)
     if _takes_severity(kind, name):
         arguments["severity"] = severity
-    return make(kind, name, factory, arguments, needed)
+    return make(kind, name, factory, arguments, required_attributes)
 
 
 def _takes_severity(kind: str, name: str) -> bool:
@@ -521,13 +527,13 @@ def _takes_severity(kind: str, name: str) -> bool:
         return False
 
 
-def _refuse(name: str, options: Mapping[str, Any]) -> None:
+def _refuse_options(name: str, options: Mapping[str, Any]) -> None:
     """Raise ConfigError for options of a perturbation that takes none."""
     if options:
         raise ConfigError(f"perturbation '{name}' has no settings; remove {', '.join(sorted(options))}")
 
 
-def _word(value: Any) -> str:
+def _setting_text(value: Any) -> str:
     """Return a setting as `Reference.of` reads it."""
     if isinstance(value, bool):
         return str(value).lower()
@@ -551,10 +557,10 @@ class PerturbationTable(Schema):
     @classmethod
     def _without_none(cls, data: Any) -> Any:
         """Remove "none": the clean condition runs in any case."""
-        listed = data.get("perturbations") if isinstance(data, Mapping) else None
-        if not isinstance(listed, list):
+        entries = data.get("perturbations") if isinstance(data, Mapping) else None
+        if not isinstance(entries, list):
             return data
-        return {**data, "perturbations": [entry for entry in listed if entry != NONE]}
+        return {**data, "perturbations": [entry for entry in entries if entry != NONE]}
 
     def with_files_beside(self, folder: Path) -> Self:
         """Return the suite with the files of its perturbations in the working folder, else in another folder."""
@@ -567,11 +573,11 @@ class PerturbationTable(Schema):
         Raises:
             SSADError: A perturbation cannot be made, or two have the same name and severity.
         """
-        made = [perturbation for entry in self.perturbations for perturbation in entry.at(self.severities)]
-        names = [(perturbation.name, perturbation.severity) for perturbation in made]
+        perturbations = [perturbation for entry in self.perturbations for perturbation in entry.at(self.severities)]
+        names = [(perturbation.name, perturbation.severity) for perturbation in perturbations]
         repeated = next((name for name in names if names.count(name) > 1), None)
         if repeated is not None:
             raise ConfigError(
                 f"perturbations: {repeated[0]} appears twice at severity {repeated[1]}; tell two apart by a label"
             )
-        return made
+        return perturbations

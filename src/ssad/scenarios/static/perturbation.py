@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # torch and Warp are not needed to name and parse perturbatio
     from ssad.core.protocols import Detector
     from ssad.rendering.camera.scene_edit import SceneEdit
     from ssad.rendering.sensor_suite import SensorSuite
-    from ssad.scenarios.static.physical import Surface, View
+    from ssad.scenarios.static.physical import TextureSurface, TextureView
 
 EGO = 0
 """Number of the ego: the target of a perturbation of its sensors, its own state or its commands."""
@@ -124,7 +124,7 @@ class TargetImages(Protocol):
     def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image [1, 3, H, W] in 0 to 1, and truth, as recorded."""
 
-    def wearing(self, surface: Surface) -> Iterator[tuple[str, View]]:
+    def wearing(self, surface: TextureSurface) -> Iterator[tuple[str, TextureView]]:
         """Yield drive and image with a target that is ready for a texture on a surface."""
 
     def lit(self, hour: str, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:

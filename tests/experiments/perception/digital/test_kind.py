@@ -19,7 +19,7 @@ from rich.console import Console
 from ssad.core.errors import SSADError
 from ssad.core.images import read_image
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.detectors.monitored import Watched
+from ssad.detectors.monitored import MonitoredDetector
 from ssad.engine.command import command_of
 from ssad.engine.kind import Job, Plan, Resources
 from ssad.engine.run import run
@@ -281,7 +281,7 @@ def attacker(root: Path, *, batch: int, device: str = "cpu", seed: int = 0) -> t
         name = data.scenes()[0].name
         examination = Examination(Path(), root, "v1.0-mini", ((LINEAR, ""),), seed, device, 1)
         recorded = recorded_scene(examination, data, SceneCondition(name, batch=batch))
-    found = SceneAttacker(PGD, recorded, Watched(detector_of(LINEAR, "", "cpu")))
+    found = SceneAttacker(PGD, recorded, MonitoredDetector(detector_of(LINEAR, "", "cpu")))
     return found, [f for f in recorded.data.frames if f.modality == "camera" and f.key_frame][:4]
 
 
@@ -305,7 +305,7 @@ def test_several_samples_fill_a_batch_on_a_gpu(root: Path) -> None:
         for batch, samples in ((12, 6), (36, 6), (40, 7), (96, 16)):
             examination = Examination(Path(), root, "v1.0-mini", ((LINEAR, ""),), 0, "cpu", 1)
             condition = SceneCondition(base.recorded.data.record.name, DigitalAttack(PGD), LINEAR, batch)
-            shown = condition.present(examination, data, [Watched(base.watched.detector, LINEAR)])
+            shown = condition.present(examination, data, [MonitoredDetector(base.watched.detector, LINEAR)])
             assert samples_at_once(shown) == samples
 
 

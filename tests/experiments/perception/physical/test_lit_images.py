@@ -18,7 +18,7 @@ from ssad.recorders.target_recording import Clips
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.hours import HOURS
 from ssad.scenarios.static.physical.lights import Flashlight, Projector, Shadow
-from ssad.scenarios.static.physical.lights.light import at_values
+from ssad.scenarios.static.physical.lights.light import value_tensors
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_light_on_a_recorded_target(clips: tuple[Path, dict[str, LitClip]], hour
     values = {name: value for name, value in middle.items() if name in light.ranges(target)}
     before, after = clip.render().astype(int), clip.render(light.edit(values, target)).astype(int)
     picture = clip.lit()
-    quick = picture.show(light.change(at_values(values), picture, target))[0].permute(1, 2, 0).numpy() * 255
+    quick = picture.show(light.change(value_tensors(values), picture, target))[0].permute(1, 2, 0).numpy() * 255
     x, y, w, h = next(one["bbox"] for one in clip.clip.objects if one["target"])
     own = (slice(int(y), int(y + h)), slice(int(x), int(x + w)))
     assert np.abs(quick[own] - after[own]).mean() < 6

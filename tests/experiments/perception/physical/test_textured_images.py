@@ -28,7 +28,7 @@ from ssad.rendering.camera.texture import paint_mask, retexture, texture_taps
 from ssad.rendering.camera.torch_jpeg import jpeg
 from ssad.rendering.camera.torch_sensor import develop
 from ssad.rendering.target import TargetCar
-from ssad.scenarios.static.physical.textures.carrier import Road
+from ssad.scenarios.static.physical.textures.carrier import RoadPatch
 
 LAYERS = (TextureLayer(0), TextureLayer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
 CAR = TargetCar("suv", "red", seed=2)
@@ -216,7 +216,7 @@ def test_a_further_picture_costs_few_operations(folder: Path) -> None:
 
 
 def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path) -> None:
-    surface = Road(width=1.5, length=3.0).on(TargetCar().mesh())
+    surface = RoadPatch(width=1.5, length=3.0).on(TargetCar().mesh())
     (clip,) = textured_clips(folder, (surface.layer,))
     ready = clip.prepare({0: surface.size})
     black, white = (ready.show({0: torch.full((3, *surface.size), value)}) for value in (0.05, 0.9))

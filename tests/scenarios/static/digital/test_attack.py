@@ -18,7 +18,7 @@ from ssad.detectors import make_detector
 from ssad.scenarios.static.digital import ATTACKS, Budget, default_loss, make_attack, needs, px, run_attack
 from ssad.scenarios.static.digital.apgd import checkpoints
 from ssad.scenarios.static.digital.budget import lengths
-from ssad.scenarios.static.digital.check import quality_left, within
+from ssad.scenarios.static.digital.check import is_within_budget, remaining_quality
 from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.objectives import Margin, Vanish, make_objective
 from ssad.scenarios.static.digital.victim import Precision, Victim
@@ -73,7 +73,7 @@ def test_every_attack_keeps_its_budget_and_beats_the_clean_image(name: str, norm
     budget = Budget(px(5 if norm == "linf" else 150), norm)  # type: ignore[arg-type]
     options = {"steps": 6} if name == "cw-min" else {}
     found = run_attack(make_attack(name, **options), detector, images, truth, budget, objective=default_loss(name))
-    assert within(found.images, images, budget)
+    assert is_within_budget(found.images, images, budget)
     if name != "noise":
         assert bool((found.after > found.before).all())
 
@@ -129,9 +129,9 @@ def street() -> tuple[Tensor, list[Truth]]:
 def test_a_budget_without_bounds_leaves_nothing() -> None:
     detector = ToyDetector()
     images, truth = toy_scene()
-    assert quality_left(detector, images, truth, None) == 1.0
+    assert remaining_quality(detector, images, truth, None) == 1.0
     found = run_attack(make_attack("pgd"), detector, images, truth, Budget(px(255)), objective="margin")
-    assert quality_left(detector, found.images, truth, None) == 0.0
+    assert remaining_quality(detector, found.images, truth, None) == 0.0
 
 
 def test_the_smallest_change_is_found() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital import Budget, px
 from ssad.scenarios.static.digital.budget import codes_of, lengths, quantise
-from ssad.scenarios.static.digital.check import within
+from ssad.scenarios.static.digital.check import is_within_budget
 
 SHAPE = (2, 3, 5, 7)
 RADII = st.one_of(st.integers(0, 12).map(float), st.floats(0.0, 300.0, allow_nan=False))
@@ -40,7 +40,7 @@ def test_what_is_stored_keeps_to_the_budget(seed: int, radius: float, norm: str,
         assert int(kept.abs().max()) <= radius + 1e-9
     else:
         assert bool(((kept.double() ** 2).flatten(1).sum(1) <= radius**2 * (1 + 1e-9)).all())
-    assert within((codes_of(clean) + kept) / 255, clean, budget)
+    assert is_within_budget((codes_of(clean) + kept) / 255, clean, budget)
 
 
 @pytest.mark.parametrize("norm", ["linf", "l2"])
@@ -48,7 +48,7 @@ def test_what_breaks_the_budget_is_brought_back(norm: str) -> None:
     clean, images = case(3, 0.5)
     budget = Budget(px(4), norm)  # type: ignore[arg-type]
     kept = quantise(images.clamp(-1, 2), codes_of(clean), budget)
-    assert within(kept.float() / 255, clean, budget)
+    assert is_within_budget(kept.float() / 255, clean, budget)
     assert not torch.equal(kept.int(), codes_of(clean))
 
 

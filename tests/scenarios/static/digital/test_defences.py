@@ -50,7 +50,7 @@ def test_each_image_passes_alone_and_stays_in_range(defence: Defence) -> None:
 def test_a_gradient_flows_through(defence: Defence) -> None:
     """A step of some code values along it raises the loss behind the defence as far as it says, about."""
     detector, (images, truth) = ToyDetector(), toy_scene(2)
-    shown = defence.drawn(0) if isinstance(defence, RandomResize) else defence
+    shown = defence.fixed_draw(0) if isinstance(defence, RandomResize) else defence
     victim = Victim(detector, images, truth, TrueLogits(), through=shown)
     loss, gradient = victim.gradient(images)
     change = px(8) * gradient.sign()
@@ -83,7 +83,7 @@ def test_resizing_moves_nothing_and_draws_by_picture() -> None:
     slope = torch.linspace(0, 1, 64).expand(1, 3, 48, 64).contiguous()
     resize = RandomResize(0.5)
     for number in range(4):
-        kept = resize.drawn(number)(slope)
+        kept = resize.fixed_draw(number)(slope)
         assert float((kept - slope)[..., 4:-4].abs().max()) < 0.01
     chance = torch.Generator().manual_seed(0)
     images = (torch.rand(1, 3, 48, 64, generator=chance) * 255).round() / 255
@@ -92,7 +92,7 @@ def test_resizing_moves_nothing_and_draws_by_picture() -> None:
     far = [(resize(one) - images)[..., 8:, 8:] for one in (images, other)]
     assert float((far[0] - far[1]).abs().max()) > 0.01  # one code more, and all is drawn anew
     assert not torch.equal(RandomResize(0.5, seed=1)(images), resize(images))
-    sizes = {float(resize.drawn(number)(images).std()) for number in range(8)}
+    sizes = {float(resize.fixed_draw(number)(images).std()) for number in range(8)}
     assert len(sizes) >= 5
 
 
@@ -188,7 +188,7 @@ def test_expectation_is_the_mean_over_the_draws() -> None:
         )
         assert (found.cost.queries, found.cost.gradients) == (3, 3)
         assert found.about["attack"] == "ask-over-resize-0.5"
-    parts = [Victim(detector, images, truth, Vanish(), through=resize.drawn(k)).gradient(images) for k in range(3)]
+    parts = [Victim(detector, images, truth, Vanish(), through=resize.fixed_draw(k)).gradient(images) for k in range(3)]
     loss, gradient = torch.stack([one[0] for one in parts]).mean(0), torch.stack([one[1] for one in parts]).mean(0)
     for one in seen:
         assert torch.allclose(one[0], loss)

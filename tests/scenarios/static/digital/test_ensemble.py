@@ -15,7 +15,7 @@ from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.scenarios.static.digital import Aim, Budget, make_attack, px, run_attack
 from ssad.scenarios.static.digital.attack import Access
 from ssad.scenarios.static.digital.ensemble import Ensemble, run_ensemble
-from ssad.scenarios.static.digital.image_quality import Quality, image_quality, of_aim
+from ssad.scenarios.static.digital.image_quality import ImageQuality, image_quality, truth_of_aim
 from ssad.scenarios.static.digital.victim import Victim
 
 from .toy_detector import CELL, LENS, ToyDetector, TrueLogits, toy_scene
@@ -44,7 +44,7 @@ def solids(rows: list[tuple[float, float, float]]) -> Solids:
 def test_quality_of_boxes_by_hand() -> None:
     truth = Truth(torch.tensor([0, 0, 1]), BOX[:3])
     right = [(0.9, 0, 0), (0.8, 0, 1), (0.7, 1, 2)]
-    assert image_quality(found_2d(right), truth) == Quality(1.0, pytest.approx(-2.4))
+    assert image_quality(found_2d(right), truth) == ImageQuality(1.0, pytest.approx(-2.4))
     assert image_quality(found_2d([]), truth).value == 0.0
     assert image_quality(found_2d([(0.9, 1, 0), (0.8, 1, 1), (0.7, 0, 2)]), truth).value == 0.0
     # class 0: all found, but the first is false: precision 2/3 at every recall; class 1: missed
@@ -57,14 +57,14 @@ def test_quality_of_boxes_by_hand() -> None:
 
 def test_crowd_counts_neither_way() -> None:
     truth = Truth(torch.tensor([0, 0, 1]), BOX[:3], crowd=torch.tensor([False, True, True]))
-    assert image_quality(found_2d([(0.9, 0, 0)]), truth) == Quality(1.0, pytest.approx(-0.9))
-    assert image_quality(found_2d([(0.95, 0, 1), (0.9, 0, 0)]), truth) == Quality(1.0, pytest.approx(-0.9))
+    assert image_quality(found_2d([(0.9, 0, 0)]), truth) == ImageQuality(1.0, pytest.approx(-0.9))
+    assert image_quality(found_2d([(0.95, 0, 1), (0.9, 0, 0)]), truth) == ImageQuality(1.0, pytest.approx(-0.9))
 
 
 def test_a_picture_without_objects() -> None:
     empty = Truth(torch.zeros(0, dtype=torch.long), torch.zeros(0, 4))
-    assert image_quality(found_2d([]), empty) == Quality(1.0, 0.0)
-    assert image_quality(found_2d([(0.5, 0, 0)]), empty) == Quality(0.0, 0.5)
+    assert image_quality(found_2d([]), empty) == ImageQuality(1.0, 0.0)
+    assert image_quality(found_2d([(0.5, 0, 0)]), empty) == ImageQuality(0.0, 0.5)
     crowd = Truth(torch.tensor([0]), BOX[:1], crowd=torch.tensor([True]))
     assert image_quality(found_2d([(0.5, 0, 0)]), crowd).value == 1.0
 
@@ -100,7 +100,9 @@ def test_quality_of_solids_by_hand() -> None:
     assert image_quality(both, truth, task="3d").value == 1.0
     assert image_quality(found([(0.0, 0, 10), (3.0, 0, 10)], label=1), truth, task="3d").value == 0.0
     crowd = Truth(truth.label, truth.box, truth.solid, crowd=torch.tensor([False, True]))
-    assert image_quality(found([(3.0, 0, 10), (0.0, 0, 10)]), crowd, task="3d") == Quality(1.0, pytest.approx(-0.5))
+    assert image_quality(found([(3.0, 0, 10), (0.0, 0, 10)]), crowd, task="3d") == ImageQuality(
+        1.0, pytest.approx(-0.5)
+    )
     assert image_quality(found([(8.0, 0, 10), (0.0, 0, 10)]), crowd, task="3d").value == pytest.approx(0.5)
     with pytest.raises(ConfigError, match="needs 3D boxes"):
         image_quality(found([(0.0, 0, 10)]), Truth(truth.label, truth.box), task="3d")
@@ -114,7 +116,7 @@ def test_what_is_not_attacked_is_crowd() -> None:
         (Aim(objects=(0, 2)), [False, True, True]),
         (Aim(becomes={"a": "b"}), [False, True, True]),
     ):
-        assert of_aim(truth, aim, ("a", "b")).crowd.tolist() == wanted  # type: ignore[union-attr]
+        assert truth_of_aim(truth, aim, ("a", "b")).crowd.tolist() == wanted  # type: ignore[union-attr]
 
 
 @dataclass(frozen=True)
@@ -176,15 +178,15 @@ def test_of_equal_members_the_noisier_wins_and_then_the_first() -> None:
     detector, (images, truth) = ToyDetector(), toy_scene(1)
     one, other = Erase(()), Erase((0, 1, 2, 3))
 
-    def run(judge: list[Quality]) -> int:
-        answers = iter([*judge, Quality(1.0, 0.0)])
+    def run(judge: list[ImageQuality]) -> int:
+        answers = iter([*judge, ImageQuality(1.0, 0.0)])
         ensemble = Ensemble([(one, "full"), (other, "full")])
         found = run_ensemble(ensemble, detector, images, truth, Budget(px(10)), judge=lambda *_: next(answers))
         return int(found.about["won"][0])
 
-    assert run([Quality(0.0, 0.0), Quality(0.0, 2.0)]) == 1
-    assert run([Quality(0.0, 2.0), Quality(0.0, 2.0)]) == 0
-    assert run([Quality(0.5, 9.0), Quality(0.2, -9.0)]) == 1
+    assert run([ImageQuality(0.0, 0.0), ImageQuality(0.0, 2.0)]) == 1
+    assert run([ImageQuality(0.0, 2.0), ImageQuality(0.0, 2.0)]) == 0
+    assert run([ImageQuality(0.5, 9.0), ImageQuality(0.2, -9.0)]) == 1
 
 
 def test_a_defence_stands_before_the_judge_too() -> None:

@@ -125,7 +125,7 @@ def test_squares_shrink_by_the_schedule_of_the_source() -> None:
     sides = [attack.side(done / 10_000, 32, 32) for done in (0, 10, 11, 51, 201, 501, 1001, 2001, 4001, 6001, 8001)]
     assert sides == [29, 29, 20, 14, 10, 7, 5, 4, 3, 2, 1]
     assert attack.side(0.0, 16, 400) == 15
-    assert attack.side(1.0, 16, 16, least=3) == 3
+    assert attack.side(1.0, 16, 16, min_side=3) == 3
 
 
 def test_the_bump_is_that_of_the_source() -> None:

@@ -14,7 +14,7 @@ from ssad.core.frames import SceneContext, SweepFrame
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_points, transformed_boxes
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.lidar import fog_response, inside
+from ssad.scenarios.static.shifts.lidar import fog_response, is_inside_box
 from ssad.scenarios.static.shifts.objects import affine, deformed
 from ssad.scenarios.static.shifts.sun import sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
@@ -86,7 +86,7 @@ def test_points_move_with_their_object() -> None:
         assert (out[500:] == cloud[500:]).all()
         assert done.details == {"objects": 1, "points": 500}
         label = transformed_boxes(spec, boxes, scene="s", sample="a")
-        assert inside(out[:500], affine(label)[0][0] * 1.0001, label.centre[0]).all()
+        assert is_inside_box(out[:500], affine(label)[0][0] * 1.0001, label.centre[0]).all()
     moving = replace(boxes, velocity=np.array([[3.0, 4.0, 0.0]]))
     out, _ = shift_points(cloud, replace(frame, boxes=moving), ShiftSpec("motion_blur", 5))
     smear = (out - cloud)[:500, :3]

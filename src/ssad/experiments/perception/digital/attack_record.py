@@ -9,7 +9,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.types import F64
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import GroundTruth
-from ssad.detectors.image_scores import match_pictures
+from ssad.detectors.image_scores import match_images
 from ssad.experiments.perception.digital.attack_scores import Match, by_distance, target_success, worst_of
 from ssad.experiments.perception.scene_boxes import (
     Examination,
@@ -70,7 +70,7 @@ def attack_record(
     metrics = attacked_result["metrics"] | scorer.by_distance(boxes, truth)
     clean_score = clean_result["metrics"]["mAP"]
     metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None
-    if not specs[0].aim.everything and not scorer.flat:
+    if not specs[0].aim.attacks_all and not scorer.flat:
         places = _places(examination, specs[0], clean_scenes)
         metrics |= target_success(clean_boxes, boxes, truth, specs[0].wanted, becomes=dict(specs[0].becomes), at=places)
     return {
@@ -98,7 +98,7 @@ class Eye:
         if not self.flat:
             return None
         picture_truth = picture_truth_of(self._examination, truth)
-        return lambda boxes: match_pictures(boxes, picture_truth, self._detector.classes)
+        return lambda boxes: match_images(boxes, picture_truth, self._detector.classes)
 
     def by_distance(self, boxes: Sequence[Any], truth: GroundTruth) -> dict[str, float]:
         """Return the scores by distance; boxes in images are at no distance."""

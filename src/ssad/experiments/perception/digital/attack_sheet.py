@@ -12,7 +12,7 @@ from ssad.core.types import U8
 from ssad.datasets.drawing import title_on
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.detectors.monitored import Watched
+from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, detector_of, recorded_scene
 from ssad.experiments.perception.sheets import WIDTH, richest, tile
 from ssad.scenarios.static.digital.scene_attacker import SceneAttacker
@@ -40,7 +40,7 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
         scene, frame = richest(dataset, scenes_of(dataset, split))
         clean = read_image(examination.root / frame.filename)
         for spec in [None, *specs]:
-            monitored, image = Watched(detector), clean
+            monitored, image = MonitoredDetector(detector), clean
             if spec is not None:
                 recorded = recorded_scene(examination, dataset, SceneCondition(scene.record.name))
                 (image,) = SceneAttacker(spec, recorded, monitored).look([frame])

@@ -16,7 +16,7 @@ from ssad.scenarios.static.digital import default_loss, make_objective
 from ssad.scenarios.static.digital.budget import Norm
 from ssad.scenarios.static.digital.defences import make_defence
 from ssad.scenarios.static.digital.objectives import UNDIVIDED
-from ssad.scenarios.static.digital.spec import AttackSpec, takes
+from ssad.scenarios.static.digital.spec import AttackSpec, has_option
 from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.scenarios.static.digital.victim import Precision
 
@@ -281,7 +281,7 @@ def rows_of(suite: AttackTable) -> list[Point]:
                 draws=draws,
                 object=entry.object or "",
             )
-            if not spec.aim.everything and spec.loss in UNDIVIDED:
+            if not spec.aim.attacks_all and spec.loss in UNDIVIDED:
                 raise ConfigError(
                     f"suite {suite.name}: attack {entry.name}: loss {spec.loss} is of all objects; to attack some "
                     "choose loss: vanish, margin, hide or mislabel"
@@ -369,7 +369,7 @@ def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int |
         ConfigError: It refuses a setting.
     """
     options = dict(method.options)
-    if steps is not None or takes(method.name, "steps"):
+    if steps is not None or has_option(method.name, "steps"):
         options.setdefault("steps", suite.steps if steps is None else steps)
     loss = method.loss or default_loss(method.name)
     make_objective(loss)

@@ -22,8 +22,8 @@ from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import NO_EDIT, SceneEdit, render_with
 from ssad.rendering.hours import at_hour
-from ssad.scenarios.static.physical.lights.light import Target
-from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitPicture, lit_picture
+from ssad.scenarios.static.physical.lights.light import TargetSize
+from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitImage, render_lit_image
 
 QUALITY: Final = 92  # of JPEG, as it is recorded
 
@@ -43,10 +43,10 @@ class LitClip:
     cards: int
 
     @property
-    def target(self) -> Target:
+    def target(self) -> TargetSize:
         """Size of the target."""
         length, width, height = self.clip.row["target_size"]
-        return Target(length, width, height)
+        return TargetSize(length, width, height)
 
     def render(self, edit: SceneEdit = NO_EDIT) -> U8:
         """Return the image [H, W, 3] with an edit, as the recorder would have written it."""
@@ -79,10 +79,10 @@ class LitClip:
             visible["fragments"],
         )
 
-    def lit(self, device: str | torch.device = "cpu") -> LitPicture:
+    def lit(self, device: str | torch.device = "cpu") -> LitImage:
         """Return the image as a function of the light on its target."""
         rows, columns = _part(self.clip)
-        return lit_picture(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
+        return render_lit_image(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
 
 
 def _part(clip: ClipView) -> tuple[slice, slice]:

@@ -28,12 +28,12 @@ from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.target import TargetCar, parse_target
 from ssad.scenarios.static.perturbation import Perturbation, TargetImages
-from ssad.scenarios.static.physical import Surface, TextureSpec, View, albedo_of, make_carrier
-from ssad.scenarios.static.physical.lights import LitView, Target
+from ssad.scenarios.static.physical import TextureSpec, TextureSurface, TextureView, albedo_of, make_carrier
+from ssad.scenarios.static.physical.lights import LitView, TargetSize
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec
-from ssad.scenarios.static.physical.textures.carrier import covered
+from ssad.scenarios.static.physical.textures.carrier import covered_colour
 from ssad.scenarios.static.physical.textures.folder import TextureFolder
-from ssad.scenarios.static.physical.textures.perturbation import worn
+from ssad.scenarios.static.physical.textures.perturbation import wearing_images
 from ssad.scenarios.static.physical.textures.printing import conspicuousness
 
 
@@ -153,7 +153,7 @@ class TrainedTexture(Perturbation):
     @property
     def is_missing(self) -> bool:
         """True if it is to be trained, and is not yet."""
-        return bool(self.spec.trained) and not self.attacks.textures.kept(self.spec).is_file()
+        return bool(self.spec.trained) and not self.attacks.textures.colour_path(self.spec).is_file()
 
     def make(self) -> Tensor:
         """Return the texture [3, H, W], sRGB; it is trained now if necessary.
@@ -164,7 +164,7 @@ class TrainedTexture(Perturbation):
         attacks, spec = self.attacks, self.spec
         surface = surface_of(attacks.target, spec.surface)
 
-        def views() -> list[View]:
+        def views() -> list[TextureView]:
             image_sets = [attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
             if spec.around:
                 image_sets.append(attacks.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
@@ -177,12 +177,12 @@ class TrainedTexture(Perturbation):
 
     def on_target(self, images: TargetImages) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image and truth of the recorded target that wears the texture."""
-        return worn(images, albedo_of(self.make()), surface_of(self.attacks.target, self.spec.surface))
+        return wearing_images(images, albedo_of(self.make()), surface_of(self.attacks.target, self.spec.surface))
 
     def about(self) -> dict[str, Any]:
         """Return the record of the texture: its file, the distance of its colours from the paint, and its training."""
         textures, spec, target = self.attacks.textures, self.spec, self.attacks.target
-        artefacts = {"texture": str(textures.picture(spec).relative_to(self.attacks.folder))}
+        artefacts = {"texture": str(textures.image_path(spec).relative_to(self.attacks.folder))}
         mask = torch.from_numpy(surface_of(target, spec.surface).mask.copy())
         colour_distance = conspicuousness(albedo_of(self.make().detach()), paint_under(target, spec.surface), mask)
         return {"artefacts": artefacts, "delta_e": round(float(colour_distance), 2), **textures.history(spec)}
@@ -209,7 +209,7 @@ class SearchedLight(Perturbation):
     @property
     def is_missing(self) -> bool:
         """True if it is to be searched, and is not yet."""
-        return bool(self.spec.source) and not self.attacks.lights.kept(self.spec).is_file()
+        return bool(self.spec.source) and not self.attacks.lights.record_path(self.spec).is_file()
 
     def make(self) -> SceneEdit:
         """Return the light as an edit of a scene; it is searched now if necessary.
@@ -224,11 +224,13 @@ class SearchedLight(Perturbation):
         def training_images() -> LightableClips:
             return attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)
 
-        def projected(edit: SceneEdit) -> list[View]:
+        def projected(edit: SceneEdit) -> list[TextureView]:
             texture_size = edit.textures[0].shape[1], edit.textures[0].shape[2]
             images = training_images()
             return [
-                View(clip.projected(edit).prepare({0: texture_size}, device=attacks.device), images.lit_truth(clip))
+                TextureView(
+                    clip.projected(edit).prepare({0: texture_size}, device=attacks.device), images.lit_truth(clip)
+                )
                 for clip in images.clips_at(spec.hour)
             ]
 
@@ -238,9 +240,9 @@ class SearchedLight(Perturbation):
 
         return attacks.lights.edit(
             spec,
-            Target(*car.full_size),
+            TargetSize(*car.full_size),
             views=views,
-            projected=projected,
+            projected_views=projected,
             detector=lambda: attacks.detector(spec.source),
         )
 
@@ -251,8 +253,10 @@ class SearchedLight(Perturbation):
     def about(self) -> dict[str, Any]:
         """Return the record of the light: its file and its search."""
         lights, spec = self.attacks.lights, self.spec
-        path = lights.picture(spec)
-        artefacts = {"light": str((path if path.is_file() else lights.kept(spec)).relative_to(self.attacks.folder))}
+        path = lights.image_path(spec)
+        artefacts = {
+            "light": str((path if path.is_file() else lights.record_path(spec)).relative_to(self.attacks.folder))
+        }
         return {"artefacts": artefacts, **lights.history(spec)}
 
 
@@ -300,7 +304,7 @@ def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[TextureLayer |
 
 
 @lru_cache(maxsize=16)
-def surface_of(target: str, surface: str) -> Surface:
+def surface_of(target: str, surface: str) -> TextureSurface:
     """Return the surface of a texture, from a target and `TextureSpec.surface`."""
     row = safeio.parse_json(surface)
     return make_carrier(row["carrier"], row["options"]).on(parse_target(target).mesh())
@@ -310,7 +314,7 @@ def surface_of(target: str, surface: str) -> Surface:
 def paint_under(target: str, surface: str) -> Tensor:
     """Return the colour that a texture covers, linear RGB [3], from a target and `TextureSpec.surface`."""
     parsed_target = parse_target(target)
-    return covered(surface_of(target, surface), parsed_target.mesh(), parsed_target.colour)
+    return covered_colour(surface_of(target, surface), parsed_target.mesh(), parsed_target.colour)
 
 
 def _from(rows: Sequence[Mapping[str, Any]], side: float | None) -> list[int]:

@@ -9,9 +9,9 @@ from typing import Any
 from ssad.core.errors import ConfigError, StoreError
 from ssad.experiments.perception.physical.target_attacks import TargetAttacks, surface_of
 from ssad.scenarios.static.physical import TextureSpec
-from ssad.scenarios.static.physical.lights.export import Shining, export_light
+from ssad.scenarios.static.physical.lights.export import LightSetup, export_light
 from ssad.scenarios.static.physical.lights.folder import LightSpec
-from ssad.scenarios.static.physical.textures.export import Print, export_texture
+from ssad.scenarios.static.physical.textures.export import PrintedTexture, export_texture
 
 
 def export_shown_texture(
@@ -38,7 +38,7 @@ def export_shown_texture(
             raise ConfigError(f"{name} shows a light: ssad export light writes it")
         raise ConfigError(f"{name} shows no texture; choose one of an attack or control")
     spec = TextureSpec.of_row(row)
-    if spec.trained and not attacks.textures.kept(spec).is_file():
+    if spec.trained and not attacks.textures.colour_path(spec).is_file():
         raise StoreError(f"{attacks.folder}: the texture of {name} is not trained yet; run the suite")
 
     def fail_if_missing() -> list[object]:
@@ -46,7 +46,7 @@ def export_shown_texture(
 
     surface = surface_of(attacks.target, spec.surface)
     colour = attacks.textures.texture(spec, surface, views=fail_if_missing, detector=fail_if_missing)  # type: ignore[arg-type]
-    return export_texture(out, Print(colour, spec.carrier, spec.options, attacks.target), dots=dots, name=name)
+    return export_texture(out, PrintedTexture(colour, spec.carrier, spec.options, attacks.target), dots=dots, name=name)
 
 
 def export_shown_light(attacks: TargetAttacks, row: Mapping[str, Any], out: Path, *, name: str) -> list[Path]:
@@ -69,7 +69,9 @@ def export_shown_light(attacks: TargetAttacks, row: Mapping[str, Any], out: Path
     if light_row is None or light_row["attack"] is None:
         raise ConfigError(f"{name} shows no light; choose one of a light attack")
     spec = LightSpec.of_row(light_row)
-    if not attacks.lights.kept(spec).is_file():
+    if not attacks.lights.record_path(spec).is_file():
         raise StoreError(f"{attacks.folder}: the light of {name} is not searched yet; run the suite")
-    values, colour = attacks.lights.found(spec)
-    return export_light(out, Shining(spec.device, spec.options, spec.hour, attacks.target, values, colour), name=name)
+    values, colour = attacks.lights.load_values(spec)
+    return export_light(
+        out, LightSetup(spec.device, spec.options, spec.hour, attacks.target, values, colour), name=name
+    )

@@ -69,7 +69,7 @@ def _textures_shown(cells: Cells, attacks: TargetAttacks, pair: Pair, detector: 
             continue
         if fields["detector"] == detector and spec["source"] in ("", detector):
             texture = TextureSpec.of_row(spec)
-            if not texture.trained or attacks.textures.kept(texture).is_file():
+            if not texture.trained or attacks.textures.colour_path(texture).is_file():
                 textures.setdefault(f"{fields['attack']} ({fields['carrier']})", texture)
     return textures
 
@@ -84,7 +84,7 @@ def _lights_shown(cells: Cells, table: TargetTable, attacks: TargetAttacks) -> d
         if fields["detector"] != table.detectors[0]:
             continue
         spec = None if light["attack"] is None else LightSpec.of_row(light)
-        if spec is None or attacks.lights.kept(spec).is_file():
+        if spec is None or attacks.lights.record_path(spec).is_file():
             title = f"{fields['attack']}, {light['hour']} {options_title(light)}"
             lights.setdefault(title, (light["hour"], spec))
     return lights

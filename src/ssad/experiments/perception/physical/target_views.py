@@ -19,7 +19,7 @@ from ssad.core.images import read_image
 from ssad.core.nuscenes_names import NO_ATTRIBUTE
 from ssad.experiments.perception.physical.textured_images import textured_clips
 from ssad.recorders.target_images import CLASSES, clip_rows
-from ssad.scenarios.static.physical import Surface, View
+from ssad.scenarios.static.physical import TextureSurface, TextureView
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class TargetClips:
                 target_truth(row, objects, self.classes, whole=self.whole),
             )
 
-    def wearing(self, surface: Surface, *, solid: bool = False) -> Iterator[tuple[str, View]]:
+    def wearing(self, surface: TextureSurface, *, solid: bool = False) -> Iterator[tuple[str, TextureView]]:
         """Yield drive and image with a target that is ready for a texture, one after another.
 
         Args:
@@ -79,7 +79,7 @@ class TargetClips:
             prepared = textured.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
             is_visible |= bool(len(prepared.taps[0].pixel))
             truth = target_truth(textured.row, textured.objects, self.classes, whole=self.whole)
-            yield drive_of(textured.row), View(prepared, solid_target(textured.row, truth) if solid else truth)
+            yield drive_of(textured.row), TextureView(prepared, solid_target(textured.row, truth) if solid else truth)
         if not is_visible:
             raise ConfigError(
                 f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "

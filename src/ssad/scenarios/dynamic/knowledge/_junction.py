@@ -70,7 +70,7 @@ def meeting_car(
     sides: Sequence[float],
     phases: Sequence[Phase],
 ) -> list[EpisodeAgent]:
-    """The car where the author put it, going straight; else on a lane, where it meets the ego.
+    """Return the car at its placement, going straight; else on a lane from which it meets the ego.
 
     That place is found with the class's default speed and trigger distance: other values change the outcome.
 

@@ -131,11 +131,11 @@ class ScenarioType:
         """Parameters by name: those of the class, then those of the ego start."""
         return {parameter.name: parameter for parameter in (*self.parameters, *EGO_START)}
 
-    def values(self, given: Mapping[str, float]) -> dict[str, float]:
-        """The value of every parameter.
+    def values(self, overrides: Mapping[str, float]) -> dict[str, float]:
+        """Return the value of every parameter.
 
         Args:
-            given: Parameter name -> value, in the parameter's unit; the others have their defaults.
+            overrides: Parameter name -> value, in the parameter's unit; the others have their defaults.
 
         Returns:
             Parameter name -> value for all of `box`.
@@ -144,7 +144,7 @@ class ScenarioType:
             ConfigError: A name is unknown, or a value out of range.
         """
         parameters = self.box
-        for name, value in given.items():
+        for name, value in overrides.items():
             problem = (
                 parameters[name].problem(value)
                 if name in parameters
@@ -152,4 +152,4 @@ class ScenarioType:
             )
             if problem:
                 raise ConfigError(f"{self.name}: parameter {name}: {problem}")
-        return {name: float(given.get(name, parameter.default)) for name, parameter in parameters.items()}
+        return {name: float(overrides.get(name, parameter.default)) for name, parameter in parameters.items()}

@@ -12,7 +12,7 @@ from ssad.core.errors import RouteError
 from ssad.core.rotations import wrap
 from ssad.core.types import F64, LaneType, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._placing import (
-    Place,
+    LanePosition,
     junction_span,
     lane_path,
     pose_at,
@@ -69,7 +69,7 @@ def meeting_place(
     trigger_distance: float,
     speed: float,
     body: str,
-) -> Place:
+) -> LanePosition:
     """Return the start of an actor on an approach of the ego's junction such that it meets the ego.
 
     The actor stands before the junction; both reach the conflict point at the same time, as closely as the road
@@ -109,19 +109,19 @@ def _search(  # noqa: PLR0917  a remembered function takes its arguments by posi
     trigger_distance: float,
     speed: float,
     body: str,
-) -> Place | None:
+) -> LanePosition | None:
     """Return the start on the best approach to the junction at route points `span`, None without one."""
     entry_index = span[0]
     junction = int(graph.junction[route.lane[entry_index]])
     ego_lanes = {int(lane) for lane in np.unique(route.lane)}
     heading = float(route.yaw[max(entry_index - 1, 0)])
     acceleration = model(body).max_accel
-    best: tuple[float, Place] | None = None
+    best: tuple[float, LanePosition] | None = None
     for side in sides:
         for approach_lane, inside_lane in _approaches(graph, junction):
             if approach_lane in ego_lanes or abs(turn_of(graph, inside_lane)) > math.radians(35):
                 continue
-            approach = pose_at(graph, Place(approach_lane, float(graph.length[approach_lane])))
+            approach = pose_at(graph, LanePosition(approach_lane, float(graph.length[approach_lane])))
             if abs(wrap(approach.yaw - heading - side)) > math.radians(40):
                 continue
             candidate = _meet(
@@ -149,10 +149,10 @@ def _meet(
     trigger_distance: float,
     speed: float,
     acceleration: float,
-) -> tuple[float, Place] | None:
+) -> tuple[float, LanePosition] | None:
     """Return (difference of arrival s, position) of the best start on an approach, None without a conflict."""
     (entry_index, exit_index), (approach_lane, inside_lane) = span, lanes
-    path = lane_path(graph, Place(inside_lane, 0.0), float(graph.length[inside_lane]) + 15.0)
+    path = lane_path(graph, LanePosition(inside_lane, 0.0), float(graph.length[inside_lane]) + 15.0)
     ego = route.xy[entry_index : min(exit_index + 15, len(route.xy))].astype(np.float64)
     distances = np.hypot(ego[:, None, 0] - path[None, :, 0], ego[:, None, 1] - path[None, :, 1])
     close_points = np.flatnonzero(distances.min(axis=1) < 1.5)
@@ -166,9 +166,9 @@ def _meet(
     along = float(np.hypot(*np.diff(path[: path_index + 1], axis=0).T).sum())
     conflict = entry_index + ego_index
     times = ego_times(route)
-    best: tuple[float, Place] | None = None
+    best: tuple[float, LanePosition] | None = None
     for setback in np.arange(1.0, float(graph.length[approach_lane]), 0.5):
-        start_position = Place(approach_lane, float(graph.length[approach_lane]) - float(setback))
+        start_position = LanePosition(approach_lane, float(graph.length[approach_lane]) - float(setback))
         pose = pose_at(graph, start_position)
         ego_distance = np.hypot(route.xy[: conflict + 1, 0] - pose.x, route.xy[: conflict + 1, 1] - pose.y)
         triggered = np.flatnonzero(ego_distance < trigger_distance)

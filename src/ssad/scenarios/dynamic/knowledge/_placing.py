@@ -25,7 +25,7 @@ _PATH = 150.0  # length of the path that an actor gets on a bending road, m
 
 
 @dataclass(frozen=True)
-class Place:
+class LanePosition:
     """Point on a lane's centre line: arc length s m from the lane's start."""
 
     lane: int
@@ -41,18 +41,18 @@ def shifted(pose: Pose, forward: float, left: float, turn: float = 0.0) -> Pose:
 # ---------------------------------------------------------------- lanes
 
 
-def pose_at(graph: LaneGraph, place: Place) -> Pose:
+def pose_at(graph: LaneGraph, place: LanePosition) -> Pose:
     """Return the pose on the centre line, heading along traffic; clamped to the lane's ends."""
     x, y, yaw, _ = graph.at(place.lane, place.s)
     return Pose(x, y, wrap(yaw))
 
 
-def width_at(graph: LaneGraph, place: Place) -> float:
+def width_at(graph: LaneGraph, place: LanePosition) -> float:
     """Return the width of the lane at a position, m."""
     return graph.at(place.lane, place.s)[3]
 
 
-def project(graph: LaneGraph, lane: int, x: float, y: float) -> Place:
+def project(graph: LaneGraph, lane: int, x: float, y: float) -> LanePosition:
     """Return the point of a lane's centre line nearest to (x, y)."""
     span = graph.points(lane)
     xy, arc_length = graph.xy[span].astype(np.float64), graph.s[span].astype(np.float64)
@@ -65,12 +65,12 @@ def project(graph: LaneGraph, lane: int, x: float, y: float) -> Place:
     )
     offsets = starts + fractions[:, None] * segments - (x, y)
     nearest = int(np.argmin((offsets**2).sum(1)))
-    return Place(
+    return LanePosition(
         lane, float(arc_length[nearest] + fractions[nearest] * (arc_length[nearest + 1] - arc_length[nearest]))
     )
 
 
-def beside(graph: LaneGraph, place: Place, side: str) -> Place | None:
+def beside(graph: LaneGraph, place: LanePosition, side: str) -> LanePosition | None:
     """Return the same position on the lane to the left or right in driving direction, None without one."""
     neighbour = int((graph.left if side == "left" else graph.right)[place.lane])
     if neighbour < 0:
@@ -95,19 +95,19 @@ def straightest(graph: LaneGraph, lane: int) -> int | None:
     return min(successors, key=lambda successor: (abs(turn_of(graph, successor)), successor), default=None)
 
 
-def ahead(graph: LaneGraph, place: Place, distance: float, *, stop_at_junction: bool = False) -> Place:
+def ahead(graph: LaneGraph, place: LanePosition, distance: float, *, stop_at_junction: bool = False) -> LanePosition:
     """Return the position `distance` m further on, straight on at forks; clamped to the end of the road."""
     lane, arc_length = place.lane, place.s + distance
     while arc_length > float(graph.length[lane]):
         successor = straightest(graph, lane)
         if successor is None or (stop_at_junction and graph.junction[lane] < 0 <= graph.junction[successor]):
-            return Place(lane, float(graph.length[lane]))
+            return LanePosition(lane, float(graph.length[lane]))
         arc_length -= float(graph.length[lane])
         lane = successor
-    return Place(lane, arc_length)
+    return LanePosition(lane, arc_length)
 
 
-def behind(graph: LaneGraph, place: Place, distance: float) -> Place:
+def behind(graph: LaneGraph, place: LanePosition, distance: float) -> LanePosition:
     """Return the position `distance` m further back, straight on at forks; clamped to the start of the road."""
     lane, arc_length = place.lane, place.s - distance
     while arc_length < 0.0:
@@ -115,13 +115,13 @@ def behind(graph: LaneGraph, place: Place, distance: float) -> Place:
             predecessor for predecessor in graph.predecessors(lane).tolist() if straightest(graph, predecessor) == lane
         ]
         if not predecessors:
-            return Place(lane, 0.0)
+            return LanePosition(lane, 0.0)
         lane = min(predecessors, key=lambda predecessor: abs(turn_of(graph, predecessor)))
         arc_length += float(graph.length[lane])
-    return Place(lane, arc_length)
+    return LanePosition(lane, arc_length)
 
 
-def lane_path(graph: LaneGraph, place: Place, distance: float) -> F64:
+def lane_path(graph: LaneGraph, place: LanePosition, distance: float) -> F64:
     """Return points [N, 2] from a position on, straight on at forks, at most `distance` m."""
     pose = pose_at(graph, place)
     parts, lane, start, remaining = [np.array([[pose.x, pose.y]])], place.lane, place.s, distance
@@ -162,7 +162,7 @@ def polyline_route(xy: F64, *, spacing: float = 1.0) -> Route:
     )
 
 
-def bending_route(graph: LaneGraph, place: Place) -> Route | None:
+def bending_route(graph: LaneGraph, place: LanePosition) -> Route | None:
     """Return the lane's path if it bends, None if a straight line keeps the lane (as SafeBench's actors do)."""
     xy = lane_path(graph, place, _PATH)
     pose = pose_at(graph, place)
@@ -195,7 +195,7 @@ def _nearest_point(route: Route, pose: Pose) -> tuple[int, float]:
     return nearest, float(distances[nearest])
 
 
-def route_place(graph: LaneGraph, scenario: Scenario, route: Route, index: int) -> Place:
+def route_place(graph: LaneGraph, scenario: Scenario, route: Route, index: int) -> LanePosition:
     """Return the lane position under a route point. RouteError if the point is off the lane graph."""
     if route.lane[index] < 0:
         raise RouteError(f"scenario {scenario.name}: no lane under the route at {index * route.spacing:.0f} m")
@@ -203,19 +203,19 @@ def route_place(graph: LaneGraph, scenario: Scenario, route: Route, index: int) 
 
 
 @remembered()
-def _lane_under(graph: LaneGraph, route: Route, index: int) -> Place:
+def _lane_under(graph: LaneGraph, route: Route, index: int) -> LanePosition:
     """Return the lane position under a route point on the lane graph."""
     return project(graph, int(route.lane[index]), float(route.xy[index, 0]), float(route.xy[index, 1]))
 
 
-def trigger_place(graph: LaneGraph, scenario: Scenario, route: Route) -> Place:
+def trigger_place(graph: LaneGraph, scenario: Scenario, route: Route) -> LanePosition:
     """Return the lane position under the trigger."""
     return route_place(graph, scenario, route, trigger_index(scenario, route))
 
 
 def ahead_and_left(
     graph: LaneGraph, scenario: Scenario, route: Route, *, distance: float, gap: float
-) -> tuple[Place, Place]:
+) -> tuple[LanePosition, LanePosition]:
     """Return positions ahead of the trigger: in the ego's lane, and further on in the lane to its left.
 
     Args:
@@ -259,7 +259,7 @@ def _first_junction(graph: LaneGraph, route: Route, first: int) -> tuple[int, in
     return enter, enter + int(exits[0]) if len(exits) else len(route.xy) - 1
 
 
-def to_outermost(graph: LaneGraph, place: Place, *, kinds: Sequence[LaneType]) -> tuple[Place, int]:
+def to_outermost(graph: LaneGraph, place: LanePosition, *, kinds: Sequence[LaneType]) -> tuple[LanePosition, int]:
     """Return the rightmost lane of the given kinds beside a position, and the number of lanes crossed.
 
     A shoulder counts if it is wider than 2 m (CARLA's maps draw parking strips so), and ends the walk.

@@ -13,7 +13,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-class _Same:
+class _IdentityKey:
     """Cache key of an unhashable object: equal to itself only, and kept alive by the cache."""
 
     __slots__ = ("value",)
@@ -25,27 +25,27 @@ class _Same:
         return id(self.value)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.value is other.value
+        return isinstance(other, _IdentityKey) and self.value is other.value
 
 
-def remembered(most: int = 1024) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
-    """Makes a function keep its answers, also for lane graphs and routes, which count as equal if they are one object.
+def remembered(max_size: int = 1024) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Cache the results of a function; lane graphs and routes count as equal if they are one object.
 
     Args:
-        most: How many answers are kept; the one not asked for longest goes first.
+        max_size: Maximum number of cached results; the least recently used goes first.
 
     Returns:
-        A decorator. The function's other arguments must be hashable, and nobody may change an answer. What it raises
-        is not kept.
+        A decorator. The function's other arguments must be hashable, and its results must not be changed.
+        Exceptions are not cached.
     """
 
     def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
         wrapped: Callable[..., _T] = function
 
         # LaneGraph and Route hold arrays and are unhashable; lru_cache needs hashable arguments.
-        @lru_cache(maxsize=most)
+        @lru_cache(maxsize=max_size)
         def cached(*arguments: Any) -> _T:
-            unwrapped = (argument.value if isinstance(argument, _Same) else argument for argument in arguments)
+            unwrapped = (argument.value if isinstance(argument, _IdentityKey) else argument for argument in arguments)
             return wrapped(*unwrapped)
 
         @wraps(function)
@@ -53,7 +53,10 @@ def remembered(most: int = 1024) -> Callable[[Callable[_P, _T]], Callable[_P, _T
             if options:
                 raise TypeError(f"{function.__name__}: give its arguments by position")
             return cached(
-                *(_Same(argument) if isinstance(argument, LaneGraph | Route) else argument for argument in arguments)
+                *(
+                    _IdentityKey(argument) if isinstance(argument, LaneGraph | Route) else argument
+                    for argument in arguments
+                )
             )
 
         return wrapper

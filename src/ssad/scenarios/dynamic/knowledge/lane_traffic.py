@@ -14,7 +14,7 @@ import numpy as np
 from ssad.core.errors import RouteError
 from ssad.core.types import Controller, EpisodeAgent, LaneType, Route, Scenario, TrafficPlan
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import Place, pose_at, project
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, pose_at, project
 from ssad.scenarios.dynamic.knowledge.natural_junction import mixed_body
 from ssad.world.models import model
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
 
 _BEHIND, _AHEAD = 25.0, 80.0  # m around the ego covered by columns
-_LEAST_HEADWAY = 0.7  # s
+_MIN_HEADWAY = 0.7  # s
 
 
 def lanes_beside(graph: LaneGraph, lane: int) -> list[int]:
     """Return a lane and the driving lanes of its direction beside it, from left to right."""
     sides: list[list[int]] = [[], []]
     for adjacent, side_lanes in zip((graph.left, graph.right), sides, strict=True):
-        other = int(adjacent[lane])
-        while other >= 0 and graph.kind[other] == LaneType.DRIVING and graph.same_direction(lane, other):
-            side_lanes.append(other)
-            other = int(adjacent[other])
+        neighbour = int(adjacent[lane])
+        while neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour):
+            side_lanes.append(neighbour)
+            neighbour = int(adjacent[neighbour])
     return [*reversed(sides[0]), lane, *sides[1]]
 
 
@@ -56,10 +56,10 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         while arc_length < min(ego_position + _AHEAD, float(graph.length[lane]) - 10.0):
             speed = values["speed"] + values["speed_spread"] * float(rng.uniform(-1.0, 1.0))
             model_name = mixed_body(rng)
-            headway = _LEAST_HEADWAY + float(rng.exponential(values["headway"] - _LEAST_HEADWAY))
+            headway = _MIN_HEADWAY + float(rng.exponential(values["headway"] - _MIN_HEADWAY))
             arc_length += headway * values["speed"] + 0.5 * model(model_name).length
             if arc_length < float(graph.length[lane]) - 10.0:
-                place = Place(lane, arc_length)
+                place = LanePosition(lane, arc_length)
                 agent = EpisodeAgent(
                     name=model_name,
                     model=model_name,

@@ -27,7 +27,7 @@ from ssad.core.types import (
     TrafficPlan,
 )
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import Place, pose_at
+from ssad.scenarios.dynamic.knowledge._placing import LanePosition, pose_at
 from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 
@@ -56,7 +56,7 @@ _MIX: dict[str, float] = {
 }
 
 
-def spawn_places(graph: LaneGraph) -> list[Place]:
+def spawn_places(graph: LaneGraph) -> list[LanePosition]:
     """Return places every 25 m on driving lanes outside junctions, the same for every episode of a town."""
     positions = []
     for lane in np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)):
@@ -65,12 +65,12 @@ def spawn_places(graph: LaneGraph) -> list[Place]:
             continue
         count = int(usable_length / _SPACING) + 1
         first_position = _FROM_END + (usable_length - (count - 1) * _SPACING) / 2.0
-        positions += [Place(int(lane), first_position + index * _SPACING) for index in range(count)]
+        positions += [LanePosition(int(lane), first_position + index * _SPACING) for index in range(count)]
     return positions
 
 
 @remembered(64)
-def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[Place, Pose], ...]:
+def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[LanePosition, Pose], ...]:
     """Return the spawn places that FREA's rules allow for a route.
 
     Args:
@@ -110,13 +110,13 @@ def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[Place, Pose], ...]
     return tuple(accepted)
 
 
-def fits(body: str, route: Route) -> bool:
-    """Whether a vehicle can drive a route's tightest bend without its nose swinging into the oncoming lane.
+def fits(model_name: str, route: Route) -> bool:
+    """Return True if a vehicle takes a route's tightest bend without its nose swinging into the oncoming lane.
 
     At curvature k of its centre's path the body lags by the slip asin(k wheelbase / 2), so that its front
     corner reaches length / 2 sin(slip) + width / 2 outwards; at most `_NOSE` m are allowed.
     """
-    vehicle = model(body)
+    vehicle = model(model_name)
     curvature = np.abs(np.diff(np.unwrap(route.yaw.astype(np.float64)))) / route.spacing
     # average over 3 m: a single kink between two lanes is no bend
     smoothed = np.convolve(curvature, np.ones(3) / 3.0, mode="valid")

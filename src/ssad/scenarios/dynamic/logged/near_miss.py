@@ -21,7 +21,7 @@ from ssad.core.types import F64, AgentKind, EpisodeTrace
 from ssad.metrics.criticality import boxes
 from ssad.scenarios.dynamic.frozen import frozen, with_motion
 from ssad.scenarios.dynamic.transition.kinematics import King
-from ssad.scenarios.dynamic.transition.motion import MOVES, Way
+from ssad.scenarios.dynamic.transition.motion import MOVES, TimedPath
 
 LATEST: Final = 6.0  # s by which they missed each other at most
 EARLY: Final = 0.5  # s after the start in which nobody meets
@@ -132,7 +132,7 @@ def moved(trace: EpisodeTrace, miss: NearMiss, *, shift: float, aside: float) ->
         shift: s by which it then comes later than the ego.
         aside: m to the left of where it drove.
     """
-    recorded_path = Way.of(trace, miss.agent)
+    recorded_path = TimedPath.of(trace, miss.agent)
     start_time = float(recorded_path.time[0])
     factor = float(np.clip((miss.time + miss.late - start_time) / max(miss.time + shift - start_time, 0.1), *FACTOR))
     warped_time = start_time + (recorded_path.time - start_time) * factor

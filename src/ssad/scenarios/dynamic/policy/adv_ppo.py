@@ -50,15 +50,15 @@ class AdvPPO:
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
         """Check that every base has agents to take over; `seeds` and a `budget` beyond 1 have no effect."""
         for base in bases:
-            if not any(_can_be(agent.controller) for agent in base.episode.agents[1:]):
+            if not any(_is_controllable(agent.controller) for agent in base.episode.agents[1:]):
                 raise ConfigError(f"scenario {base.scenario.name}: {self.name} needs other agents than the ego")
         self._bases = tuple(bases)
         self._drivers: dict[Selector, Driver] = {FreaSelection(count=1, kinds=VEHICLES): Adversary(name=self.name)}
-        self._asked = False
+        self._has_proposed = False
 
     def ask(self, count: int) -> Sequence[Sequence[Proposal]]:
         """Propose each base itself, driven by the policy, once."""
-        first_round, self._asked = not self._asked, True
+        first_round, self._has_proposed = not self._has_proposed, True
         return [
             [Proposal(base.scenario, drivers=self._drivers)] if first_round and count else [] for base in self._bases
         ]
@@ -79,5 +79,5 @@ class AdvDDPG(AdvPPO):
     name = "adv-ddpg"
 
 
-def _can_be(controller: Controller) -> bool:
+def _is_controllable(controller: Controller) -> bool:
     return controller in (Controller.AUTOPILOT, Controller.FOLLOW, Controller.SCRIPT, Controller.EXTERNAL)

@@ -84,7 +84,7 @@ class BoxSearch(ABC):
         self.boxes = [Box.of(base.scenario) for base in bases]
         self.budget = budget
         self.seeds = list(seeds)
-        self._asked: list[F64] = []
+        self._last_points: list[F64] = []
 
     @staticmethod
     def check(episode: Episode) -> None:
@@ -104,12 +104,13 @@ class BoxSearch(ABC):
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Return the scenarios at the next points of each base."""
-        self._asked = [self.points(base_index, count) for base_index in range(len(self.boxes))]
+        self._last_points = [self.points(base_index, count) for base_index in range(len(self.boxes))]
         return [
-            [Proposal(box.at(point)) for point in points] for box, points in zip(self.boxes, self._asked, strict=True)
+            [Proposal(box.at(point)) for point in points]
+            for box, points in zip(self.boxes, self._last_points, strict=True)
         ]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
         """Pass the danger of the proposed points to `learn`."""
-        for base_index, (points, base_outcomes) in enumerate(zip(self._asked, outcomes, strict=True)):
+        for base_index, (points, base_outcomes) in enumerate(zip(self._last_points, outcomes, strict=True)):
             self.learn(base_index, points, np.array([outcome.danger for outcome in base_outcomes]))

@@ -38,18 +38,18 @@ class CmaEs(BoxSearch):
             )
             for box, seed in zip(self.boxes, seeds, strict=True)
         ]
-        self._known: list[list[tuple[F64, float]]] = [[] for _ in self.boxes]
+        self._generations: list[list[tuple[F64, float]]] = [[] for _ in self.boxes]
 
     def points(self, index: int, count: int) -> F64:
         """Draw from the current distribution, at most what its generation still needs."""
         # Points of an older distribution would count as the next one's, and mislead its update.
-        missing = POPULATION - len(self._known[index])
+        missing = POPULATION - len(self._generations[index])
         return np.array([self._search[index].ask() for _ in range(min(count, missing))])
 
     def learn(self, index: int, points: F64, danger: F64) -> None:
         """Update the distribution once its 8 outcomes are there; the search minimises negative danger."""
-        pending = self._known[index]
+        pending = self._generations[index]
         pending += zip(points, (-danger).tolist(), strict=True)
         if len(pending) == POPULATION:
             self._search[index].tell(pending)
-            self._known[index] = []
+            self._generations[index] = []

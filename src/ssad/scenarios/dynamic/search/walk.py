@@ -24,7 +24,7 @@ FIRST_STEP, LAST_STEP = 0.25, 0.03  # forward and backward, in the unit cube
 
 
 @dataclass
-class _Place:
+class _SearchState:
     """State of the search of one base.
 
     Attributes:
@@ -48,7 +48,7 @@ class _LocalSearch(BoxSearch):
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
         super().__init__(bases, seeds=seeds, budget=budget)
         self._random = [generator(self.name, seed) for seed in seeds]
-        self._place = [self._begin(base_index, box.nominal()) for base_index, box in enumerate(self.boxes)]
+        self._states = [self._begin(base_index, box.nominal()) for base_index, box in enumerate(self.boxes)]
 
     @abstractmethod
     def neighbours(self, index: int, count: int) -> F64:
@@ -60,26 +60,28 @@ class _LocalSearch(BoxSearch):
 
     def points(self, index: int, count: int) -> F64:
         """Return the starting point first, then neighbours of the current point."""
-        state = self._place[index]
+        state = self._states[index]
         if state.danger == -np.inf:
             return np.asarray(np.vstack([state.point, self.neighbours(index, count - 1)]))
         return self.neighbours(index, count)
 
     def learn(self, index: int, points: F64, danger: F64) -> None:
         """Move to the most dangerous point; restart after a collision or without progress."""
-        state = self._place[index]
+        state = self._states[index]
         worst_index = int(np.argmax(danger))
         if danger[worst_index] > state.danger:
             state.point, state.danger, state.idle = points[worst_index], float(danger[worst_index]), 0
         else:
             state.idle += 1
         if state.danger >= 0.0 or (state.idle and self.stuck(index)):
-            self._place[index] = self._begin(index, np.asarray(self._random[index].random(points.shape[1])))
+            self._states[index] = self._begin(index, np.asarray(self._random[index].random(points.shape[1])))
 
-    def _begin(self, index: int, point: F64) -> _Place:
+    def _begin(self, index: int, point: F64) -> _SearchState:
         """Start a search at a point; the first parameter and the step length are random."""
         random = self._random[index]
-        return _Place(point, step=FIRST_STEP * random.uniform(0.8, 1.2), axis=2 * int(random.integers(len(point))))
+        return _SearchState(
+            point, step=FIRST_STEP * random.uniform(0.8, 1.2), axis=2 * int(random.integers(len(point)))
+        )
 
 
 class RandomWalk(_LocalSearch):
@@ -89,12 +91,12 @@ class RandomWalk(_LocalSearch):
 
     def neighbours(self, index: int, count: int) -> F64:
         """Return points a normally distributed step away."""
-        point = self._place[index].point
+        point = self._states[index].point
         return np.asarray(np.clip(point + NEAR * self._random[index].standard_normal((count, len(point))), 0.0, 1.0))
 
     def stuck(self, index: int) -> bool:
         """Return True after three rounds without progress."""
-        return self._place[index].idle >= PATIENCE
+        return self._states[index].idle >= PATIENCE
 
 
 class ForwardBackward(_LocalSearch):
@@ -104,7 +106,7 @@ class ForwardBackward(_LocalSearch):
 
     def neighbours(self, index: int, count: int) -> F64:
         """Return the next parameters in turn, each forward and backward."""
-        state = self._place[index]
+        state = self._states[index]
         direction_count = 2 * len(state.point)
         candidates = np.repeat(state.point[None], min(count, direction_count), 0)
         for candidate in candidates:
@@ -115,7 +117,7 @@ class ForwardBackward(_LocalSearch):
 
     def stuck(self, index: int) -> bool:
         """Return True once steps are short; until then halve them after each round through all parameters."""
-        state = self._place[index]
+        state = self._states[index]
         # A round tries up to 8 points, and a full turn has two per parameter.
         if state.idle * 8 >= 2 * len(state.point):
             state.step, state.idle = 0.5 * state.step, 0

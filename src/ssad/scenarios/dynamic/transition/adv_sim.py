@@ -12,7 +12,7 @@ import numpy as np
 
 from ssad.core.generators import Base
 from ssad.core.types import F64
-from ssad.scenarios.dynamic.transition.motion import KNOTS, MotionSearch, Way
+from ssad.scenarios.dynamic.transition.motion import KNOTS, MotionSearch, TimedPath
 from ssad.world.models import model
 
 STANDING = 5.0  # m/s, nominal speed of a vehicle that stands in the base
@@ -23,7 +23,7 @@ class AdvSim(MotionSearch):
 
     name = "adv-sim"
 
-    def motion(self, base: Base, way: Way, agent: int, point: F64) -> F64:
+    def motion(self, base: Base, way: TimedPath, agent: int, point: F64) -> F64:
         """Follow the speeds at evenly spaced moments as closely as the body allows."""
         body = model(base.trace.models[agent])
         nominal_speed = float(way.speed.max())

@@ -15,7 +15,7 @@ import numpy as np
 
 from ssad.core.generators import Base
 from ssad.core.types import F64
-from ssad.scenarios.dynamic.transition.motion import KNOTS, MotionSearch, Way
+from ssad.scenarios.dynamic.transition.motion import KNOTS, MotionSearch, TimedPath
 
 REACH: Final[Mapping[str, float]] = {
     "StraightObstacle": 1.0,
@@ -32,7 +32,7 @@ class AdvTraj(MotionSearch):
 
     name = "adv-traj"
 
-    def motion(self, base: Base, way: Way, agent: int, point: F64) -> F64:
+    def motion(self, base: Base, way: TimedPath, agent: int, point: F64) -> F64:
         """Interpolate offsets linearly between evenly spaced points of the path, starting from 0."""
         reach = REACH.get(base.scenario.type, ELSEWHERE)
         knot_distances = np.linspace(0.0, max(float(way.distance[-1]), 1.0), KNOTS + 1)

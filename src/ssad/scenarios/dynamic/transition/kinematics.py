@@ -89,8 +89,8 @@ class King:
                 for motion, motion_base in zip(self._motion, bases, strict=True)
             ],
         )
-        self._started = [0] * len(self.bases)
-        self._away: list[set[int]] = [set() for _ in self.bases]
+        self._start_counts = [0] * len(self.bases)
+        self._abandoned: list[set[int]] = [set() for _ in self.bases]
         self._chains: list[list[_Chain]] = [[] for _ in self.bases]
 
     @staticmethod
@@ -101,7 +101,7 @@ class King:
             ConfigError: It has none.
         """
         if not any(model(agent.model).kind <= AgentKind.BICYCLE for agent in episode.agents[1:]):
-            raise _nobody(episode.scenario)
+            raise _no_adversary_error(episode.scenario)
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Optimise each chain further and propose its scenario."""
@@ -127,7 +127,7 @@ class King:
                 chain.tried += 1
                 is_hopeless = outcome.gap is None or outcome.gap > HOPELESS
                 if is_hopeless and chain.tried >= 2:
-                    self._away[base_index].add(chain.agent)
+                    self._abandoned[base_index].add(chain.agent)
                 if outcome.trace is None or outcome.valid or chain.tried >= (2 if is_hopeless else PATIENCE):
                     self._chains[base_index][chain_index] = self._new_chain(base_index)
                     continue
@@ -137,13 +137,13 @@ class King:
 
     def _new_chain(self, base: int) -> _Chain:
         """Start a chain with the next adversary in turn; from the second turn on with random controls."""
-        agents = [candidate for candidate in self._agents[base] if candidate not in self._away[base]] or self._agents[
-            base
-        ]
-        turn, agent_position = divmod(self._started[base], len(agents))
+        agents = [
+            candidate for candidate in self._agents[base] if candidate not in self._abandoned[base]
+        ] or self._agents[base]
+        turn, agent_position = divmod(self._start_counts[base], len(agents))
         agent = agents[agent_position]
-        random = generator("king", self._seeds[base], self._started[base])
-        self._started[base] += 1
+        random = generator("king", self._seeds[base], self._start_counts[base])
+        self._start_counts[base] += 1
         change = JITTER * min(turn, 1) * random.standard_normal((STEPS // KNOT + 1, 2))
         if np.abs(self.bases[base].trace.speed[:, agent]).max() < 0.5:
             change[:, 0] += 0.1  # a standing vehicle without throttle has no gradient
@@ -178,7 +178,7 @@ class King:
             [self.bases[member.base].trace.models[member.agent] for member in chains], dtype=torch.float64
         )
         ego = torch.from_numpy(np.stack([member.ego for member in chains]))
-        others = torch.from_numpy(self._others(chains))
+        other_boxes = torch.from_numpy(self._recorded_boxes(chains))
         weight = torch.tensor([member.weight for member in chains], dtype=torch.float64)
         base_index = torch.tensor([member.base for member in chains])
         change = torch.from_numpy(np.stack([member.change for member in chains])).requires_grad_()
@@ -195,7 +195,9 @@ class King:
 
         first_moment, second_moment = torch.zeros_like(change), torch.zeros_like(change)
         for step in range(1, ITERATIONS + 1):
-            cost = self._cost(unroll_changed(), bodies, ego=ego, others=others, weight=weight, place=base_index)
+            cost = self._cost(
+                unroll_changed(), bodies, ego=ego, other_boxes=other_boxes, weight=weight, base_index=base_index
+            )
             cost = cost + EFFORT * change.square().mean((1, 2))
             (gradient,) = torch.autograd.grad(cost.sum(), change)
             # Adam; that of torch.optim imports torch's compiler first, which takes 4 s
@@ -210,7 +212,7 @@ class King:
             chain.change = values.copy()
         return states.pose.transpose(0, 1).numpy()
 
-    def _others(self, chains: Sequence[_Chain]) -> F64:
+    def _recorded_boxes(self, chains: Sequence[_Chain]) -> F64:
         """Return recorded boxes and presence [N, O, T + 1, 6] of all agents but the ego and the adversary."""
         agent_count = max(len(self._motion[member.base]) for member in chains)
         boxes = np.zeros((len(chains), agent_count, STEPS + 1, 6))
@@ -221,7 +223,14 @@ class King:
         return boxes
 
     def _cost(
-        self, states: MotionState, bodies: Bodies, *, ego: Tensor, others: Tensor, weight: Tensor, place: Tensor
+        self,
+        states: MotionState,
+        bodies: Bodies,
+        *,
+        ego: Tensor,
+        other_boxes: Tensor,
+        weight: Tensor,
+        base_index: Tensor,
     ) -> Tensor:
         """Return costs [N]: low near the ego, high near other agents or off the road."""
         pose = states.pose.transpose(0, 1)
@@ -237,12 +246,12 @@ class King:
         time = torch.arange(STEPS + 1)
         time_weight = torch.where(time <= gap.detach().argmin(1)[:, None] + 2, 1.0, AFTER)
         # Only the nearest agent of each step gets an exact gap; the choice itself needs no gradient.
-        squared_distance = (pose.detach()[:, None, :, :2] - others[..., :2]).square().sum(-1)
-        nearest_index = torch.where(others[..., 5] > 0.5, squared_distance, 1.0e9).argmin(1)
-        nearest = torch.take_along_dim(others, nearest_index[:, None, :, None], 1)[:, 0]
+        squared_distance = (pose.detach()[:, None, :, :2] - other_boxes[..., :2]).square().sum(-1)
+        nearest_index = torch.where(other_boxes[..., 5] > 0.5, squared_distance, 1.0e9).argmin(1)
+        nearest = torch.take_along_dim(other_boxes, nearest_index[:, None, :, None], 1)[:, 0]
         intrusion = torch.where(nearest[..., 5] > 0.5, (CLEAR - _gap(box, nearest[..., :5])).clamp_min(0.0), 0.0)
-        corner_cost = self._road(_corners(box), place).clamp(0.0, 5.0).sum(-1)
-        centre_cost = self._road(pose[..., :2], place).add(0.5).clamp(0.0, 5.0)
+        corner_cost = self._road(_corners(box), base_index).clamp(0.0, 5.0).sum(-1)
+        centre_cost = self._road(pose[..., :2], base_index).add(0.5).clamp(0.0, 5.0)
         road_cost = ((corner_cost + 4.0 * centre_cost) * time_weight).mean(1)
         return ego_cost + weight * (OTHERS * (intrusion * time_weight).amax(1) + ROAD * road_cost)
 
@@ -262,11 +271,11 @@ def adversaries(base: Base) -> list[int]:
             route_distance = np.hypot(*np.moveaxis(path[:, None] - trace.route[None], -1, 0))
             candidates.append((float(route_distance.min()), agent))
     if not candidates:
-        raise _nobody(base.scenario)
+        raise _no_adversary_error(base.scenario)
     return [agent for _, agent in sorted(candidates)[:NEAREST]]
 
 
-def _nobody(scenario: Scenario) -> ConfigError:
+def _no_adversary_error(scenario: Scenario) -> ConfigError:
     return ConfigError(
         f"scenario {scenario.name}: there is no vehicle in it that could be an adversary; "
         "add one, or take another scenario"
@@ -300,19 +309,21 @@ def tracked(start: MotionState, poses: Tensor, bodies: Bodies) -> Tensor:
     return torch.stack(controls)
 
 
-def _controls(told: Tensor, change: Tensor) -> Tensor:
-    """Controls [T, N, 4]: those told, and what is added to effort and steering, linear between knots [N, K, 2]."""
+def _controls(recorded: Tensor, change: Tensor) -> Tensor:
+    """Return the recorded controls [T, N, 4] plus a change of effort and steering, linear between knots [N, K, 2]."""
     step_times, knots = torch.arange(STEPS)[:, None] / KNOT, torch.arange(change.shape[1])
     # Hat functions: each step blends the two adjacent knots.
     share = (1.0 - (step_times - knots).abs()).clamp_min(0.0).to(change.dtype)
     added = torch.einsum("tk,nkc->tnc", share, change)
-    effort = told[..., 0] - told[..., 1] + added[..., 0]
-    steer = told[..., 2] + added[..., 1]
-    return torch.stack([effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0), steer.clamp(-1.0, 1.0), told[..., 3]], -1)
+    effort = recorded[..., 0] - recorded[..., 1] + added[..., 0]
+    steer = recorded[..., 2] + added[..., 1]
+    return torch.stack(
+        [effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0), steer.clamp(-1.0, 1.0), recorded[..., 3]], -1
+    )
 
 
 def _gap(first: Tensor, second: Tensor) -> Tensor:
-    """How far boxes [..., 5] are apart: exact up to `FAR`; beyond it, where most pairs are, from their centres."""
+    """Return the gap between boxes [..., 5]: exact up to `FAR`; beyond it, where most pairs are, from their centres."""
     reach = 0.5 * (torch.hypot(first[..., 3], first[..., 4]) + torch.hypot(second[..., 3], second[..., 4]))
     # The exact distance of boxes is expensive, and most pairs are far apart.
     approximate = torch.hypot(first[..., 0] - second[..., 0], first[..., 1] - second[..., 1]) - 0.7 * reach

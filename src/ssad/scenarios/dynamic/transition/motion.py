@@ -28,7 +28,7 @@ MOVES: Final = 1.0  # m; a vehicle that moves less has no path of its own and dr
 
 
 @dataclass(frozen=True)
-class Way:
+class TimedPath:
     """Recorded path of a vehicle with the distance along it over time.
 
     Attributes:
@@ -42,7 +42,7 @@ class Way:
     distance: F64
 
     @classmethod
-    def of(cls, trace: EpisodeTrace, agent: int) -> Way:
+    def of(cls, trace: EpisodeTrace, agent: int) -> TimedPath:
         """Return the timed path of an agent while it is present."""
         present_rows = np.flatnonzero(trace.active[:, agent])
         columns = [getattr(trace, name)[present_rows, agent].astype(np.float64) for name in ("x", "y", "yaw")]
@@ -104,7 +104,7 @@ class MotionSearch(ABC):
         self._frozen = [frozen(base.episode, base.trace) for base in bases]
         self._agents = [movers(base) for base in bases]
         self._ways = [
-            {candidate: Way.of(base.trace, candidate) for candidate in candidates}
+            {candidate: TimedPath.of(base.trace, candidate) for candidate in candidates}
             for base, candidates in zip(bases, self._agents, strict=True)
         ]
         self._search: list[dict[int, Any]] = [
@@ -121,43 +121,43 @@ class MotionSearch(ABC):
             for candidates, seed in zip(self._agents, seeds, strict=True)
         ]
         self._worst: list[dict[int, float]] = [{} for _ in self.bases]
-        self._told: list[dict[int, list[tuple[F64, float]]]] = [
+        self._generations: list[dict[int, list[tuple[F64, float]]]] = [
             {candidate: [] for candidate in candidates} for candidates in self._agents
         ]
-        self._asked: list[tuple[int, F64]] = []
+        self._last_points: list[tuple[int, F64]] = []
 
     @abstractmethod
-    def motion(self, base: Base, way: Way, agent: int, point: F64) -> F64:
+    def motion(self, base: Base, way: TimedPath, agent: int, point: F64) -> F64:
         """Return time, x, y and yaw [T, 4] of the adversary at a point [KNOTS] of the unit cube."""
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Draw from one vehicle's search in each base."""
-        self._asked = [self._next(base_index, count) for base_index in range(len(self.bases))]
+        self._last_points = [self._next(base_index, count) for base_index in range(len(self.bases))]
         return [
             [self._proposal(base_index, agent, point) for point in points]
-            for base_index, (agent, points) in enumerate(self._asked)
+            for base_index, (agent, points) in enumerate(self._last_points)
         ]
 
     def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
         """Update each search that has a complete generation."""
-        for base_index, ((agent, points), base_outcomes) in enumerate(zip(self._asked, outcomes, strict=True)):
+        for base_index, ((agent, points), base_outcomes) in enumerate(zip(self._last_points, outcomes, strict=True)):
             dangers = [max(outcome.danger, -20.0) for outcome in base_outcomes]
             self._worst[base_index][agent] = max([self._worst[base_index].get(agent, -np.inf), *dangers])
-            pending = self._told[base_index][agent]
+            pending = self._generations[base_index][agent]
             pending += zip(points, (-value for value in dangers), strict=True)
             if len(pending) == POPULATION:
                 self._search[base_index][agent].tell(pending)
-                self._told[base_index][agent] = []
+                self._generations[base_index][agent] = []
 
     def _next(self, base: int, count: int) -> tuple[int, F64]:
         untried = [agent for agent in self._agents[base] if agent not in self._worst[base]]
         agent = untried[0] if untried else max(self._worst[base], key=lambda candidate: self._worst[base][candidate])
         # At most what the generation still needs: points of an older distribution would mislead the next update.
-        missing = POPULATION - len(self._told[base][agent])
+        missing = POPULATION - len(self._generations[base][agent])
         return agent, np.array([self._search[base][agent].ask() for _ in range(min(count, missing))])
 
-    def _proposal(self, k: int, agent: int, point: F64) -> Proposal:
-        base = self.bases[k]
-        rows = self.motion(base, self._ways[k][agent], agent, point)
+    def _proposal(self, base_index: int, agent: int, point: F64) -> Proposal:
+        base = self.bases[base_index]
+        rows = self.motion(base, self._ways[base_index][agent], agent, point)
         name = base.trace.names[agent]
-        return Proposal(with_motion(self._frozen[k], name, rows), adversaries=(name,))
+        return Proposal(with_motion(self._frozen[base_index], name, rows), adversaries=(name,))

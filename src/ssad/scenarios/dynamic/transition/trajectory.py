@@ -69,7 +69,7 @@ class Cat:
         self.bases = list(bases)
         self._frozen = [frozen(base.episode, base.trace) for base in bases]
         self._motion = [sampled(base.trace) for base in bases]
-        self._left = [self._candidates(base_index, seed) for base_index, seed in enumerate(seeds)]
+        self._untried = [self._candidates(base_index, seed) for base_index, seed in enumerate(seeds)]
         self._egos: list[deque[F64]] = [deque([motion[0]], maxlen=ANSWERS) for motion in self._motion]
 
     def ask(self, count: int) -> list[list[Proposal]]:
@@ -82,10 +82,10 @@ class Cat:
             egos.extend(sampled(outcome.trace)[0] for outcome in base_outcomes if outcome.trace is not None)
 
     def _best(self, base: int, count: int) -> list[Proposal]:
-        untried = self._left[base]
+        untried = self._untried[base]
         scores = [self._score(base, candidate) for candidate in untried]
         best_indices = sorted(range(len(untried)), key=lambda index: scores[index], reverse=True)[:count]
-        self._left[base] = [remaining for index, remaining in enumerate(untried) if index not in set(best_indices)]
+        self._untried[base] = [remaining for index, remaining in enumerate(untried) if index not in set(best_indices)]
         return [self._proposal(base, untried[index]) for index in best_indices]
 
     def _score(self, base: int, candidate: _Candidate) -> tuple[float, float]:
@@ -154,10 +154,10 @@ class Cat:
         edge = road(torch.from_numpy(np.ascontiguousarray(path[..., :2])), torch.zeros(len(path), dtype=torch.long))
         plausible: Bool = np.asarray((edge.numpy() < 0.0).all(1))
         size = motion[agent, 0, 3:5]
-        for other in range(1, len(motion)):
-            if other == agent:
+        for other_agent in range(1, len(motion)):
+            if other_agent == agent:
                 continue
-            other_boxes, other_present = motion[other, steps, :5], motion[other, steps, 5] > 0.5
+            other_boxes, other_present = motion[other_agent, steps, :5], motion[other_agent, steps, 5] > 0.5
             near_mask = other_present & (np.hypot(*np.moveaxis(path[..., :2] - other_boxes[:, :2], -1, 0)) < 9.0)
             row, column = np.nonzero(near_mask)
             if len(row):
@@ -168,7 +168,7 @@ class Cat:
 
 @lru_cache(maxsize=1)
 def traffic() -> tuple[F64, F64]:
-    """What the prior is learned from: motions of vehicles in natural scenarios that the Autopilot drives.
+    """Return the motions that the prior is learned from: vehicles of the Autopilot in natural scenarios.
 
     Returns:
         Motions [K, LENGTH + 1, 3], x, y, yaw in the frame of their first pose, and their first speeds [K], m/s.
@@ -187,7 +187,7 @@ def traffic() -> tuple[F64, F64]:
 
 
 def windows(trace: EpisodeTrace) -> tuple[F64, F64]:
-    """All motions of 8 s in a trace, one of each vehicle every second: as `traffic` returns them."""
+    """Return all motions of 8 s in a trace, one of each vehicle every second, as `traffic` does."""
     motion = sampled(trace)
     motions, speeds = [np.zeros((0, LENGTH + 1, 3))], [0.0][:0]
     for agent in np.flatnonzero(trace.kind <= AgentKind.BICYCLE).tolist():

@@ -11,7 +11,7 @@ from typing import Any
 
 from ssad.core.errors import ConfigError
 from ssad.core.registry import make, names, resolve
-from ssad.scenarios.static.digital.attack import Attack, Attacked, run_attack
+from ssad.scenarios.static.digital.attack import Attack, AttackResult, run_attack
 from ssad.scenarios.static.digital.budget import Budget, px
 from ssad.scenarios.static.digital.objectives import OBJECTIVES, Aim, Objective, make_objective
 
@@ -102,7 +102,7 @@ __all__ = [
     "OBJECTIVES",
     "Aim",
     "Attack",
-    "Attacked",
+    "AttackResult",
     "Budget",
     "Objective",
     "attack_names",

@@ -65,7 +65,7 @@ class APGD:
         previous_step, previous_best = step_length.clone(), loss.clone()
         previous_images = images
         for iteration in range(1, self.steps + 1):
-            gradient_step = budget.project(images + _each(step_length) * budget.steepest(gradient), victim.clean)
+            gradient_step = budget.project(images + _per_image(step_length) * budget.steepest(gradient), victim.clean)
             step_share = INERTIA if iteration > 1 else 1.0
             proposed = images + step_share * (gradient_step - images) + (1 - step_share) * (images - previous_images)
             previous_images, images = images, budget.project(proposed, victim.clean)
@@ -76,8 +76,8 @@ class APGD:
             rise_count += new_loss > loss
             loss = new_loss
             improved = new_loss > best_loss
-            best_images = torch.where(_each(improved), images, best_images)
-            best_gradient = torch.where(_each(improved), gradient, best_gradient)
+            best_images = torch.where(_per_image(improved), images, best_images)
+            best_gradient = torch.where(_per_image(improved), gradient, best_gradient)
             best_loss = torch.where(improved, new_loss, best_loss)
             if iteration in checkpoint_steps:
                 # Conditions 1 and 2 of the source.
@@ -86,9 +86,9 @@ class APGD:
                 restart = stalled | unchanged
                 previous_step, previous_best = step_length.clone(), best_loss.clone()
                 step_length = torch.where(restart, step_length / 2, step_length)
-                images = torch.where(_each(restart), best_images, images)
-                previous_images = torch.where(_each(restart), best_images, previous_images)
-                gradient = torch.where(_each(restart), best_gradient, gradient)
+                images = torch.where(_per_image(restart), best_images, images)
+                previous_images = torch.where(_per_image(restart), best_images, previous_images)
+                gradient = torch.where(_per_image(restart), best_gradient, gradient)
                 loss = torch.where(restart, best_loss, loss)
                 rise_count = torch.zeros_like(rise_count)
                 last_checkpoint = iteration
@@ -96,7 +96,7 @@ class APGD:
 
 
 def checkpoints(steps: int) -> frozenset[int]:
-    """Steps after which progress is looked at: at 0.22 of all, then after periods that shrink by 0.03 to 0.06.
+    """Return the steps after which progress is checked: at 0.22 of all, then after periods that shrink by 0.03 to 0.06.
 
     Args:
         steps: All steps.
@@ -107,6 +107,6 @@ def checkpoints(steps: int) -> frozenset[int]:
     return frozenset(math.ceil(fraction * steps - 1e-9) for fraction in fractions[1:] if fraction < 1.0)
 
 
-def _each(values: Tensor) -> Tensor:
+def _per_image(values: Tensor) -> Tensor:
     """Reshape values [B] to [B, 1, 1, 1]."""
     return values[:, None, None, None]

@@ -49,7 +49,7 @@ class Attack(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Attacked:
+class AttackResult:
     """Result of an attack on a batch.
 
     Attributes:
@@ -85,7 +85,7 @@ def run_attack(
     through: Through | None = None,
     precision: Precision = "float32",
     check: bool = True,
-) -> Attacked:
+) -> AttackResult:
     """Attack a batch of images.
 
     Args:
@@ -142,7 +142,7 @@ def run_attack(
         "gradients": cost.gradients,
         "queries": cost.queries,
     }
-    return Attacked(stored, loss_before, loss_after, victim.idle, cost, gradient_error, metadata)
+    return AttackResult(stored, loss_before, loss_after, victim.idle, cost, gradient_error, metadata)
 
 
 def keep_best(best: tuple[Tensor, Tensor], images: Tensor, loss: Tensor) -> tuple[Tensor, Tensor]:

@@ -62,7 +62,7 @@ class Budget:
         return self.around(clean, images - clean)
 
     def around(self, clean: Tensor, change: Tensor) -> Tensor:
-        """As `project`, of images that are told by their change.
+        """Return the images of `project`, given their change.
 
         Args:
             clean: [B, 3, H, W], in [0, 1].
@@ -179,7 +179,7 @@ def quantise(images: Tensor, clean: Tensor, budget: Budget) -> Tensor:
 
 
 def _shrink(change: Tensor, room: float) -> None:
-    """Takes whole steps back, largest first, from a change that is too long by its float's last digits."""
+    """Take whole steps back, largest first, from a change that is too long by its float's last digits."""
     while float((change**2).sum()) > room:
         values = change.view(-1)
         largest = values.abs().argmax()
@@ -187,7 +187,7 @@ def _shrink(change: Tensor, room: float) -> None:
 
 
 def _round_up(change: Tensor, full: Tensor, room: float) -> None:
-    """Moves values of an integer change one step towards `full`, those first that lack most, while there is room."""
+    """Move values of an integer change one step towards `full`, those first that lack most, while there is room."""
     remainder = (full - change).view(-1)
     order = remainder.abs().argsort(descending=True, stable=True)
     order = order[remainder[order].abs() > 0.5]

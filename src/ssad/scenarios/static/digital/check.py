@@ -23,8 +23,8 @@ from ssad.scenarios.static.digital.objectives import Margin, Objective, make_obj
 from ssad.scenarios.static.digital.pgd import PGD
 from ssad.scenarios.static.digital.victim import Victim, steady
 
-SLACK = 0.02  # share of the rise of the loss that an attack may lack beside another
-BESIDE = 0.1  # average precision that it may leave beyond what the reference leaves
+LOSS_SLACK = 0.02  # share of the rise of the loss that an attack may lack beside another
+PRECISION_SLACK = 0.1  # average precision that it may leave beyond what the reference leaves
 
 
 def find_weaknesses(
@@ -70,7 +70,9 @@ def find_weaknesses(
             baseline, detector, images, truth, budget, objective=loss_function, intrinsic=intrinsic, check=False
         )
         baseline_increase = baseline_result.after - baseline_result.before
-        if float(loss_increase.mean()) < float(baseline_increase.mean()) - SLACK * abs(float(baseline_increase.mean())):
+        if float(loss_increase.mean()) < float(baseline_increase.mean()) - LOSS_SLACK * abs(
+            float(baseline_increase.mean())
+        ):
             faults.append(
                 f"it raises the loss by {float(loss_increase.mean()):.3g}, {baseline.name} of the same budget by "
                 f"{float(baseline_increase.mean()):.3g}"
@@ -88,9 +90,9 @@ def find_weaknesses(
             check=False,
         )
         attack_quality, reference_quality = (
-            quality_left(detector, attack_result.images, truth, intrinsic) for attack_result in (result, reference)
+            remaining_quality(detector, attack_result.images, truth, intrinsic) for attack_result in (result, reference)
         )
-        if attack_quality > reference_quality + BESIDE:
+        if attack_quality > reference_quality + PRECISION_SLACK:
             faults.append(
                 f"it leaves an average precision of {attack_quality:.0%}, PGD on the loss margin "
                 "with as many steps leaves "
@@ -138,7 +140,7 @@ def _batch_faults(  # noqa: PLR0917
     return faults
 
 
-def quality_left(detector: Detector, images: Tensor, truth: Sequence[Truth], intrinsic: Tensor | None) -> float:
+def remaining_quality(detector: Detector, images: Tensor, truth: Sequence[Truth], intrinsic: Tensor | None) -> float:
     """Return the mean `image_quality` of a detector over images, 0 to 1."""
     detections = detector.predict(images, intrinsic)
     matches = zip(detections, truth, strict=True)
@@ -146,7 +148,7 @@ def quality_left(detector: Detector, images: Tensor, truth: Sequence[Truth], int
     return sum(values) / len(values)
 
 
-def within(images: Tensor, clean: Tensor, budget: Budget) -> bool:
+def is_within_budget(images: Tensor, clean: Tensor, budget: Budget) -> bool:
     """Check that stored images keep to a budget around clean ones, in whole code values."""
     change = codes_of(images).double() - codes_of(clean).double()
     limit = budget.radius * LEVELS

@@ -45,7 +45,11 @@ def chosen_object(scene: SceneData, sample: str, choice: str, classes: Sequence[
     distances = np.linalg.norm(sample_annotations.centre[rows, :2] - frames[0].ego_to_world[:2, 3], axis=1)
     nearest_first = (rows[matching_row] for matching_row in np.argsort(distances, kind="stable"))
     return next(
-        (row for row in nearest_first if any(_seen(camera_frame, sample_annotations, row) for camera_frame in frames)),
+        (
+            row
+            for row in nearest_first
+            if any(_is_visible(camera_frame, sample_annotations, row) for camera_frame in frames)
+        ),
         None,
     )
 
@@ -61,7 +65,7 @@ def chosen_first(scene: SceneData, frame: SensorFrame, choice: str, classes: Seq
     """
     sample_annotations = scene.annotations(frame.sample_token)
     row = chosen_object(scene, frame.sample_token, choice, classes)
-    if row is None or not _seen(frame, sample_annotations, row):
+    if row is None or not _is_visible(frame, sample_annotations, row):
         return sample_annotations.take(np.arange(0))
     return sample_annotations.take(
         np.array([row, *(other_row for other_row in range(len(sample_annotations)) if other_row != row)])
@@ -80,6 +84,6 @@ def chosen_places(scene: SceneData, choice: str, classes: Sequence[str] = ()) ->
     return {token: scene.annotations(token).centre[row] for token, row in rows.items() if row is not None}
 
 
-def _seen(frame: SensorFrame, found: Annotations, row: int) -> bool:
-    """Whether a camera should find an object."""
-    return len(camera_truth(frame, found.take(np.array([row]))).label) > 0
+def _is_visible(frame: SensorFrame, annotations: Annotations, row: int) -> bool:
+    """Return True if a camera should find an object."""
+    return len(camera_truth(frame, annotations.take(np.array([row]))).label) > 0

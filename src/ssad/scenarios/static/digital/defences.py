@@ -194,23 +194,25 @@ class RandomResize:
     def __call__(self, images: Tensor) -> Tensor:
         """Resize each image by the share that its own codes determine."""
         codes = (images.detach() * LEVELS).round().clamp(0, LEVELS).to(torch.uint8).cpu()
-        shares = [self._share(tuple(image.shape), image.numpy().tobytes()) for image in codes]
-        return torch.cat([self._through(image[None], share) for image, share in zip(images, shares, strict=True)])
+        shares = [self._draw_share(tuple(image.shape), image.numpy().tobytes()) for image in codes]
+        return torch.cat(
+            [self._resize_and_restore(image[None], share) for image, share in zip(images, shares, strict=True)]
+        )
 
-    def drawn(self, number: int) -> Callable[[Tensor], Tensor]:
-        """What it does to every picture in one draw, whatever is in it.
+    def fixed_draw(self, number: int) -> Callable[[Tensor], Tensor]:
+        """Return the transformation of one draw, the same for all images.
 
         Args:
-            number: Of the draw.
+            number: Number of the draw.
         """
-        share = self._share("draw", number)
-        return lambda images: torch.cat([self._through(image[None], share) for image in images])
+        share = self._draw_share("draw", number)
+        return lambda images: torch.cat([self._resize_and_restore(image[None], share) for image in images])
 
-    def _share(self, *key: object) -> float:
+    def _draw_share(self, *key: object) -> float:
         return float(generator("random resize", self.seed, *key).uniform(self.smallest, 1.0))
 
     @staticmethod
-    def _through(image: Tensor, share: float) -> Tensor:
+    def _resize_and_restore(image: Tensor, share: float) -> Tensor:
         full_size = (int(image.shape[2]), int(image.shape[3]))
         reduced_size = tuple(max(round(share * side), min(side, SMALLEST)) for side in full_size)
         reduced = functional.interpolate(image, size=reduced_size, mode="bilinear", antialias=True)
@@ -269,14 +271,14 @@ class Defended:
     ) -> list[Detections]:
         """Detect objects in the defended images."""
         with torch.no_grad():
-            defended = self._shown(images)
+            defended = self._defend(images)
         return self.detector.predict(defended, intrinsic, threshold=threshold)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """Return the dense outputs for the defended images."""
-        return self.detector.dense(self._shown(images), intrinsic)
+        return self.detector.dense(self._defend(images), intrinsic)
 
-    def _shown(self, images: Tensor) -> Tensor:
+    def _defend(self, images: Tensor) -> Tensor:
         """Validate images and pass them through the defence, which might hide a wrong shape or type."""
         if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
             raise ConfigError(f"images are [B, 3, H, W] of floats, not {list(images.shape)} {images.dtype}")

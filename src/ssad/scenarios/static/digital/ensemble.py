@@ -12,13 +12,13 @@ from torch import Tensor
 from ssad.core.detections import Detections, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
-from ssad.scenarios.static.digital.attack import Access, Attack, Attacked, run_attack
+from ssad.scenarios.static.digital.attack import Access, Attack, AttackResult, run_attack
 from ssad.scenarios.static.digital.budget import LEVELS, Budget
-from ssad.scenarios.static.digital.image_quality import Quality, image_quality, of_aim
+from ssad.scenarios.static.digital.image_quality import ImageQuality, image_quality, truth_of_aim
 from ssad.scenarios.static.digital.objectives import EVERYTHING, Aim, Objective
 from ssad.scenarios.static.digital.victim import Cost, Through, steady
 
-Judge = Callable[[Detections, Truth], Quality]
+Judge = Callable[[Detections, Truth], ImageQuality]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def run_ensemble(
     check: bool = True,
     threshold: float | None = None,
     judge: Judge | None = None,
-) -> Attacked:
+) -> AttackResult:
     """Attack a batch with every member and keep the worst result of each image after the 8-bit round trip.
 
     The detections in an image determine its quality (`image_quality`). Of members with equal quality, the one whose
@@ -93,12 +93,12 @@ def run_ensemble(
         ConfigError: See `run_attack`.
     """
 
-    def judged(pictures: Tensor) -> list[Quality]:
+    def judge_images(judged_images: Tensor) -> list[ImageQuality]:
         with steady(detector), torch.no_grad():
-            defended = pictures if through is None else through(pictures)
+            defended = judged_images if through is None else through(judged_images)
             detections = detector.predict(defended, intrinsic, threshold=threshold)
         judged_pairs = zip(
-            detections, (of_aim(image_truth, aim, detector.classes) for image_truth in truth), strict=True
+            detections, (truth_of_aim(image_truth, aim, detector.classes) for image_truth in truth), strict=True
         )
         if judge is not None:
             return [judge(*judged_pair) for judged_pair in judged_pairs]
@@ -121,8 +121,8 @@ def run_ensemble(
         )
         for attack, objective in ensemble.members
     ]
-    qualities_by_member = [judged(run.images) for run in runs]
-    clean_qualities = judged(images)
+    qualities_by_member = [judge_images(run.images) for run in runs]
+    clean_qualities = judge_images(images)
     winners = [
         min(range(len(runs)), key=lambda member_index: qualities_by_member[member_index][image_index].order)
         for image_index in range(len(images))
@@ -146,7 +146,7 @@ def run_ensemble(
         ],
         "clean_quality": [clean_quality.value for clean_quality in clean_qualities],
     }
-    return Attacked(
+    return AttackResult(
         torch.stack([runs[member_index].images[image_index] for image_index, member_index in enumerate(winners)]),
         images.new_tensor([1 - clean_quality.value for clean_quality in clean_qualities]),
         images.new_tensor(

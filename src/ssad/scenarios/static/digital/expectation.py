@@ -16,7 +16,7 @@ from ssad.scenarios.static.digital.defences import Defended, RandomResize
 from ssad.scenarios.static.digital.victim import Through, Victim
 
 
-class _OverDraws(Victim):
+class _ExpectedVictim(Victim):
     """Victim whose loss is the mean over draws of a random defence."""
 
     def __init__(self, victim: Victim, defence: RandomResize, draws: Sequence[Through]) -> None:
@@ -81,5 +81,5 @@ class Expected:
         """Run the inner attack on the mean loss over the draws."""
         if victim.through is not None and victim.through != self.defence:
             raise ConfigError(f"{self.name}: the pictures pass another defence on their way to the detector")
-        draws = [self.defence.drawn(draw_index) for draw_index in range(self.draws)]
-        return self.inner.perturb(_OverDraws(victim, self.defence, draws), budget)
+        draws = [self.defence.fixed_draw(draw_index) for draw_index in range(self.draws)]
+        return self.inner.perturb(_ExpectedVictim(victim, self.defence, draws), budget)

@@ -36,7 +36,7 @@ def check_gradient(victim: Victim) -> float:
         ConfigError: There is no gradient, or its error exceeds half its length: it has the wrong sign, is cut off
             from a part of the detector, or masked.
     """
-    error = _error(victim)
+    error = _gradient_error(victim)
     if error > WRONG:
         raise ConfigError(
             f"the gradient of loss '{victim.objective.name}' of {victim.detector.name} is wrong: it differs from "
@@ -45,10 +45,10 @@ def check_gradient(victim: Victim) -> float:
     return error
 
 
-def _error(victim: Victim) -> float:
-    victim = _without_stairs(victim)
-    double_detector = _doubled(victim.detector)
-    checked_victim = victim if double_detector is None else _in_double(victim, double_detector)
+def _gradient_error(victim: Victim) -> float:
+    victim = _without_rounding(victim)
+    double_detector = _to_float64(victim.detector)
+    checked_victim = victim if double_detector is None else _victim_in_float64(victim, double_detector)
     step = COARSE if double_detector is None else STEP
     _, gradient = checked_victim.gradient(checked_victim.clean)
     slope = gradient.flatten(1).norm(dim=1)
@@ -66,7 +66,7 @@ def _error(victim: Victim) -> float:
     return float(relative_error[is_checked].max())
 
 
-def _without_stairs(victim: Victim) -> Victim:
+def _without_rounding(victim: Victim) -> Victim:
     """Remove a defence that is not smooth: finite differences do not measure its slope."""
     smooth_victim = copy.copy(victim)
     smooth_victim.cost, smooth_victim.precision = copy.copy(victim.cost), "float32"
@@ -79,15 +79,15 @@ def _without_stairs(victim: Victim) -> Victim:
     return smooth_victim
 
 
-def _doubled(detector: Any) -> Any:
+def _to_float64(detector: Any) -> Any:
     """Copy a detector to float64, behind its defence if it has one; None if it is no module."""
     if isinstance(detector, Defended):
-        inner = _doubled(detector.detector)
+        inner = _to_float64(detector.detector)
         return None if inner is None else Defended(inner, detector.defence)
     return copy.deepcopy(detector).double() if isinstance(detector, nn.Module) else None
 
 
-def _in_double(victim: Victim, detector: Any) -> Victim:
+def _victim_in_float64(victim: Victim, detector: Any) -> Victim:
     """Return the victim with a float64 copy of the detector and float64 inputs."""
     double_victim = copy.copy(victim)
     double_victim.detector = detector
@@ -98,22 +98,22 @@ def _in_double(victim: Victim, detector: Any) -> Victim:
     assignment = Assignment(
         original.label,
         original.owner,
-        tuple(_double(image_truth) for image_truth in original.truth),
-        {name: _wide(value) for name, value in original.extra.items()},
+        tuple(_truth_to_float64(image_truth) for image_truth in original.truth),
+        {name: _widen(value) for name, value in original.extra.items()},
     )
     double_victim.situation = type(victim.situation)(detector, assignment, victim.situation.aim)
     return double_victim
 
 
-def _wide(value: Tensor) -> Tensor:
+def _widen(value: Tensor) -> Tensor:
     return value.double() if value.is_floating_point() else value
 
 
-def _double(truth: Truth) -> Truth:
+def _truth_to_float64(truth: Truth) -> Truth:
     solid = truth.solid
     if solid is not None:
         solid = Solids(
-            _wide(solid.centre), _wide(solid.size_lhw), _wide(solid.yaw), _wide(solid.velocity), solid.attribute
+            _widen(solid.centre), _widen(solid.size_lhw), _widen(solid.yaw), _widen(solid.velocity), solid.attribute
         )
-    intrinsic = None if truth.intrinsic is None else _wide(truth.intrinsic)
-    return Truth(truth.label, _wide(truth.box), solid, intrinsic, truth.crowd)
+    intrinsic = None if truth.intrinsic is None else _widen(truth.intrinsic)
+    return Truth(truth.label, _widen(truth.box), solid, intrinsic, truth.crowd)

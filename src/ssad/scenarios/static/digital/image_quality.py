@@ -21,11 +21,11 @@ from ssad.scenarios.static.digital.objectives import Aim
 
 IOU = 0.5
 METRES = 2.0
-MOST = 100  # best detections of a class that are looked at in 2D, as COCO does
+MAX_DETECTIONS = 100  # best detections of a class that are looked at in 2D, as COCO does
 
 
 @dataclass(frozen=True, slots=True)
-class Quality:
+class ImageQuality:
     """Detection quality of one image.
 
     Attributes:
@@ -45,19 +45,19 @@ class Quality:
 
 
 def image_quality(
-    found: Detections, truth: Truth, *, task: Literal["2d", "3d"] = "2d", classes: int | None = None
-) -> Quality:
-    """Score the detections of one picture.
+    detections: Detections, truth: Truth, *, task: Literal["2d", "3d"] = "2d", classes: int | None = None
+) -> ImageQuality:
+    """Score the detections in one image.
 
     From the best score down, each takes the nearest object of its class that is still free: by overlap, an IoU of 0.5
     at least, for 2D; by distance in the ground plane, less than 2 m, for 3D. Objects marked as crowd count neither as
     found nor as missed, and detections on them neither as right nor as wrong.
 
     Args:
-        found: What was detected.
-        truth: What is there.
+        detections: Detections in the image.
+        truth: Ground truth of the image.
         task: "2d" or "3d".
-        classes: How many classes there are; None: those that occur.
+        classes: Number of classes; None: those that occur.
 
     Returns:
         The quality.
@@ -65,28 +65,31 @@ def image_quality(
     Raises:
         ConfigError: Truth or detections have no 3D boxes, for 3D.
     """
-    rank = found.score.argsort(descending=True, stable=True)
-    score, label = _array(found.score[rank]), _whole(found.label[rank])
-    truth_label = _whole(truth.label)
+    rank = detections.score.argsort(descending=True, stable=True)
+    score, label = _float_array(detections.score[rank]), _int_array(detections.label[rank])
+    truth_label = _int_array(truth.label)
     crowd = np.zeros(len(truth_label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
     class_count = max([classes or 0, *(label + 1), *(truth_label + 1)])
     if task == "2d":
         matches = match_2d(
             Boxes2D(
-                np.zeros(len(truth_label), np.int32), truth_label.astype(np.int32), _array(truth.box), ignore=crowd
+                np.zeros(len(truth_label), np.int32),
+                truth_label.astype(np.int32),
+                _float_array(truth.box),
+                ignore=crowd,
             ),
-            Boxes2D(np.zeros(len(label), np.int32), label.astype(np.int32), _array(found.box[rank]), score),
+            Boxes2D(np.zeros(len(label), np.int32), label.astype(np.int32), _float_array(detections.box[rank]), score),
             labels=class_count,
             threshold=IOU,
-            max_detections=MOST,
+            max_detections=MAX_DETECTIONS,
         )
         # `match_2d` orders equal scores by class, which sums do not depend on
-        score = np.sort(_best(score, label))[::-1]
+        score = np.sort(_top_scores(score, label))[::-1]
     else:
         matches = _match_3d(
-            _plane(found.solid)[rank.cpu().numpy()],
+            _ground_places(detections.solid)[rank.cpu().numpy()],
             label,
-            _plane(truth.solid),
+            _ground_places(truth.solid),
             truth_label,
             crowd=crowd,
             classes=class_count,
@@ -95,10 +98,10 @@ def image_quality(
     correct, wrong = matches.hit, ~matches.hit & ~matches.ignored
     # rounded, so that pictures of equal quality are equal to the last digit
     value = round(float(np.nanmean(precision)), 9) if matches.truth.any() else float(not wrong.any())
-    return Quality(value, float(score[wrong].sum() - score[correct].sum()))
+    return ImageQuality(value, float(score[wrong].sum() - score[correct].sum()))
 
 
-def of_aim(truth: Truth, aim: Aim, classes: Sequence[str]) -> Truth:
+def truth_of_aim(truth: Truth, aim: Aim, classes: Sequence[str]) -> Truth:
     """Return the truth with every object that is not under attack marked as crowd.
 
     Args:
@@ -106,7 +109,7 @@ def of_aim(truth: Truth, aim: Aim, classes: Sequence[str]) -> Truth:
         aim: Objects under attack.
         classes: Names of the labels.
     """
-    if aim.everything:
+    if aim.attacks_all:
         return truth
     names = list(aim.becomes) if aim.becomes else aim.classes
     crowd = torch.zeros(len(truth.label), dtype=torch.bool) if truth.crowd is None else truth.crowd.clone().cpu()
@@ -116,17 +119,19 @@ def of_aim(truth: Truth, aim: Aim, classes: Sequence[str]) -> Truth:
     return replace(truth, crowd=crowd.to(truth.label.device))
 
 
-def _best(score: F64, label: I64) -> F64:
-    """Scores of the best detections of each class, as many as are looked at."""
-    return np.concatenate([score[:0], *(score[label == class_label][:MOST] for class_label in np.unique(label))])
+def _top_scores(score: F64, label: I64) -> F64:
+    """Return the scores of the best `MAX_DETECTIONS` detections of each class."""
+    return np.concatenate(
+        [score[:0], *(score[label == label_index][:MAX_DETECTIONS] for label_index in np.unique(label))]
+    )
 
 
 def _match_3d(
-    found: F64, label: I64, centre: F64, real: I64, *, crowd: npt.NDArray[np.bool_], classes: int
+    places: F64, label: I64, object_places: F64, object_labels: I64, *, crowd: npt.NDArray[np.bool_], classes: int
 ) -> Matched2D:
-    """Matches of detections at places [N, 2], best first, with objects at places [Q, 2]."""
-    distance = np.sqrt(((found[:, None] - centre[None]) ** 2).sum(-1))
-    is_close = (distance < METRES) & (label[:, None] == real[None])
+    """Match detections at places [N, 2], best first, with objects at places [Q, 2]."""
+    distance = np.sqrt(((places[:, None] - object_places[None]) ** 2).sum(-1))
+    is_close = (distance < METRES) & (label[:, None] == object_labels[None])
     detection_index, object_index = np.nonzero(is_close & ~crowd[None])
     # Detections come best first, so the primary key is the detection, then the distance.
     order = np.lexsort((object_index, distance[detection_index, object_index], detection_index))
@@ -134,26 +139,28 @@ def _match_3d(
         detection_index[order],
         object_index[order],
         distance[detection_index, object_index][order],
-        boxes=len(real),
+        boxes=len(object_labels),
         thresholds=(np.inf,),
     )
-    correct = np.zeros(len(found), np.bool_)
+    correct = np.zeros(len(places), np.bool_)
     correct[matched] = True
     ignored = (is_close & crowd[None]).any(1)
-    return Matched2D(label.astype(np.int32), correct, ignored & ~correct, np.bincount(real[~crowd], minlength=classes))
+    return Matched2D(
+        label.astype(np.int32), correct, ignored & ~correct, np.bincount(object_labels[~crowd], minlength=classes)
+    )
 
 
-def _plane(solid: Solids | None) -> F64:
+def _ground_places(solid: Solids | None) -> F64:
     if solid is None:
         raise ConfigError("the quality of 3D detections needs 3D boxes in the truth and in the detections")
-    return _array(solid.centre)[:, [0, 2]]
+    return _float_array(solid.centre)[:, [0, 2]]
 
 
-def _array(values: Tensor) -> F64:
+def _float_array(values: Tensor) -> F64:
     array: F64 = values.detach().double().cpu().numpy()
     return array
 
 
-def _whole(values: Tensor) -> I64:
+def _int_array(values: Tensor) -> I64:
     array: I64 = values.detach().long().cpu().numpy()
     return array

@@ -22,13 +22,13 @@ from ssad.scenarios.static.digital.budget import LEVELS, Budget, codes_of, quant
 from ssad.scenarios.static.digital.noise import RandomNoise
 from ssad.scenarios.static.digital.objectives import EVERYTHING, Aim, Objective, make_objective
 from ssad.scenarios.static.digital.universal import Universal
-from ssad.scenarios.static.digital.victim import NothingToAttackError, Pictures, steady
+from ssad.scenarios.static.digital.victim import CleanImages, NothingToAttackError, steady
 
-SURE = 0.3  # least score of what is taken for an object
+MIN_SCORE = 0.3  # least score of what is taken for an object
 
 
 @dataclass(slots=True)
-class Spent:
+class TotalCost:
     """Cumulative cost of an attack.
 
     Attributes:
@@ -76,7 +76,7 @@ class LiveAttack:
     detector: Detector | None = None
     intrinsic: Any = None
     batch: int = 8
-    spent: Spent = field(default_factory=Spent, init=False)
+    spent: TotalCost = field(default_factory=TotalCost, init=False)
 
     def __post_init__(self) -> None:
         if isinstance(self.objective, str):
@@ -109,17 +109,19 @@ class LiveAttack:
         for start in range(0, len(active_rows), max(self.batch, 1)):
             rows = active_rows[start : start + max(self.batch, 1)]
             rows_truth = [truth[row_index] for row_index in rows] if _is_truth(truth, len(frames)) else None
-            attacked[rows] = self._some(frames[rows], victim, rows_truth, [keys[row_index] for row_index in rows])
+            attacked[rows] = self._attack_batch(
+                frames[rows], victim, rows_truth, [keys[row_index] for row_index in rows]
+            )
         self.spent.images += len(active_rows)
         return attacked
 
-    def _some(
+    def _attack_batch(
         self, frames: Frames, victim: Any, truth: Sequence[Truth] | None, keys: Sequence[tuple[object, ...]]
     ) -> Frames:
         """Attack one batch of images."""
         if isinstance(self.attack, Universal | RandomNoise):
             images = torch.from_numpy(frames).float() / LEVELS
-            clean_images = Pictures(images, keys)
+            clean_images = CleanImages(images, keys)
             return quantise(self.attack.perturb(clean_images, self.budget), codes_of(images), self.budget).numpy()
         detector = attacked_detector(victim) if self.detector is None else self.detector
         device = _device_of(detector)
@@ -158,18 +160,18 @@ class LiveAttack:
 
 
 def own_truth(
-    detector: Detector, images: Tensor, intrinsic: Tensor | None = None, *, least: float = SURE
+    detector: Detector, images: Tensor, intrinsic: Tensor | None = None, *, min_score: float = MIN_SCORE
 ) -> list[Truth]:
-    """What a detector finds in clean images, taken for the truth: what an attacker knows whom nobody tells it.
+    """Return the detections in clean images as pseudo ground truth, for an attacker without the truth.
 
     Args:
-        detector: Who looks.
+        detector: Detector of the objects.
         images: [B, 3, H, W].
         intrinsic: [B, 3, 3], for 3D.
-        least: Least score of what is taken for an object.
+        min_score: Minimum score of an object.
     """
     with steady(detector), torch.no_grad():
-        detections = detector.predict(images, intrinsic, threshold=least)
+        detections = detector.predict(images, intrinsic, threshold=min_score)
     intrinsics: list[Tensor | None] = [None] * len(detections) if intrinsic is None else list(intrinsic.cpu())
     return [
         _as_truth(image_detections, image_intrinsic)
@@ -177,8 +179,8 @@ def own_truth(
     ]
 
 
-def _as_truth(found: Detections, intrinsic: Tensor | None) -> Truth:
-    solid = found.solid
+def _as_truth(detections: Detections, intrinsic: Tensor | None) -> Truth:
+    solid = detections.solid
     if solid is not None:
         solid = replace(
             solid,
@@ -188,7 +190,7 @@ def _as_truth(found: Detections, intrinsic: Tensor | None) -> Truth:
             velocity=solid.velocity.cpu(),
             attribute=solid.attribute.cpu(),
         )
-    return Truth(found.label.cpu(), found.box.cpu(), solid, None if solid is None else intrinsic)
+    return Truth(detections.label.cpu(), detections.box.cpu(), solid, None if solid is None else intrinsic)
 
 
 def attacked_detector(victim: Any) -> Detector:

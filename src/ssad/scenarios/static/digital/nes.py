@@ -73,17 +73,17 @@ class NES:
             best = keep_best(best, images, victim.loss(images).float())
         return best[0]
 
-    def estimate(self, victim: Victim, images: Tensor, use: object = 0) -> Tensor:
-        """The estimated gradient [B, 3, H, W] of the loss at images; probes are kept in [0, 1].
+    def estimate(self, victim: Victim, images: Tensor, step_index: object = 0) -> Tensor:
+        """Return the estimated gradient [B, 3, H, W] of the loss at images; probes are kept in [0, 1].
 
         Args:
-            victim: What is asked.
+            victim: Detector and images under attack.
             images: [B, 3, H, W].
-            use: Which estimate it is: others draw other directions.
+            step_index: Number of the estimate; each draws its own directions.
         """
         total = torch.zeros_like(images)
         for sample_index in range(self.samples):
-            direction = self._direction(victim, use, sample_index)
+            direction = self._direction(victim, step_index, sample_index)
             if self.directions == "signs":
                 direction = torch.where(direction < 0, -1.0, 1.0).to(images)
             loss_difference = victim.loss((images + self.sigma * direction).clamp(0.0, 1.0))
@@ -91,9 +91,9 @@ class NES:
             total += loss_difference.to(images)[:, None, None, None] * direction
         return total / (2 * self.sigma * self.samples)
 
-    def _direction(self, victim: Victim, *use: object) -> Tensor:
-        """A normal direction [B, 3, H, W], constant over tiles."""
-        coarse = draw(victim.clean[:, :, :: self.tile, :: self.tile], victim.keys, "gaussian", self.name, *use)
+    def _direction(self, victim: Victim, *purpose: object) -> Tensor:
+        """Return a normal direction [B, 3, H, W], constant over tiles."""
+        coarse = draw(victim.clean[:, :, :: self.tile, :: self.tile], victim.keys, "gaussian", self.name, *purpose)
         height, width = victim.clean.shape[2:]
         return coarse.repeat_interleave(self.tile, 2).repeat_interleave(self.tile, 3)[:, :, :height, :width]
 

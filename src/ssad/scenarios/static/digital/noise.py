@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ssad.scenarios.static.digital.attack import Access
 from ssad.scenarios.static.digital.budget import Budget
-from ssad.scenarios.static.digital.victim import Pictures, Victim
+from ssad.scenarios.static.digital.victim import CleanImages, Victim
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class RandomNoise:
     name: str = "noise"
     access: Access = "none"
 
-    def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
+    def perturb(self, victim: Victim | CleanImages, budget: Budget) -> Tensor:
         """Add random noise of the size of the budget."""
         draws = victim.draw("gaussian", "noise")
         change = draws.sign() if budget.norm == "linf" else budget.steepest(draws)

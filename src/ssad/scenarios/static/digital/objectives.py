@@ -70,14 +70,14 @@ class Aim:
         is_attacked = assignment.label >= 0
         names = list(self.becomes) if self.becomes else self.classes
         if names is not None:
-            class_indices = [_index(detector, name) for name in names]
+            class_indices = [_class_index(detector, name) for name in names]
             is_attacked &= torch.isin(assignment.label, torch.tensor(class_indices, device=is_attacked.device))
         if self.objects is not None:
             is_attacked &= torch.isin(assignment.owner, torch.tensor(self.objects, device=is_attacked.device))
         return is_attacked
 
     @property
-    def everything(self) -> bool:
+    def attacks_all(self) -> bool:
         """True if all objects are under attack and no target class is given."""
         return self.classes is None and self.objects is None and not self.becomes
 
@@ -128,7 +128,7 @@ class TrainingLosses:
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """Return the sum of the selected training losses of each image."""
-        if not situation.aim.everything:
+        if not situation.aim.attacks_all:
             raise ConfigError(f"loss '{self.name}' is of all objects; for some of them use vanish, margin or mislabel")
         losses = situation.detector.losses(dense, situation.assignment, reduction="image")
         selected_losses = [value for name, value in losses.items() if self.terms is None or name in self.terms]
@@ -154,7 +154,7 @@ class Vanish:
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """Return the summed log-probability of absence of each image."""
         absent = torch.log1p(-log_scores(dense).exp())
-        if not situation.aim.everything:
+        if not situation.aim.attacks_all:
             absent = absent * _weights(dense, situation)[..., None]
         return absent.sum((1, 2))
 
@@ -185,7 +185,7 @@ class Margin:
         """Return the negative summed margin of each image."""
         best_log_odds = log_odds(log_scores(dense)).amax(-1)
         excess = (best_log_odds - (math.log(self.threshold / (1 - self.threshold)) - self.confidence)).clamp_min(0.0)
-        if not situation.aim.everything:
+        if not situation.aim.attacks_all:
             excess = excess * _weights(dense, situation)
         return -excess.sum(1)
 
@@ -242,7 +242,7 @@ class Fabricate:
         Raises:
             ConfigError: The aim selects classes or objects.
         """
-        if not situation.aim.everything:
+        if not situation.aim.attacks_all:
             raise ConfigError("fabricate makes objects where there are none; it takes no classes and no objects")
         return log_scores(dense).amax(-1).mean(1)
 
@@ -277,7 +277,7 @@ class Mislabel:
         if situation.aim.becomes:
             wrong_class_of = torch.arange(len(detector.classes), device=label.device)
             for name, wrong_class in situation.aim.becomes.items():
-                wrong_class_of[_index(detector, name)] = _index(detector, wrong_class)
+                wrong_class_of[_class_index(detector, name)] = _class_index(detector, wrong_class)
             rival_logit = dense.logit.gather(-1, wrong_class_of[true_label])[..., 0]
         else:
             rival_logit = dense.logit.scatter(-1, true_label, -torch.inf).amax(-1)
@@ -332,15 +332,15 @@ def _weights(dense: Dense, situation: Situation) -> Tensor:
     is_weighted = situation.aim.places(situation.detector, situation.assignment)
     for image_index, truth in enumerate(situation.assignment.truth):
         object_indices = torch.unique(situation.assignment.owner[image_index][is_weighted[image_index]])
-        is_weighted[image_index] |= _on(dense.place, truth.box.to(dense.place)[object_indices])
+        is_weighted[image_index] |= _lie_in_boxes(dense.place, truth.box.to(dense.place)[object_indices])
     return is_weighted.to(dense.logit.dtype)
 
 
 def objects_of(situation: Situation, image: int) -> list[int]:
-    """Indices of the objects of an image that are under attack: those of the aim's numbers and classes."""
+    """Return the indices of the objects of an image that the aim puts under attack."""
     aim, truth = situation.aim, situation.assignment.truth[image]
     names = list(aim.becomes) if aim.becomes else aim.classes
-    class_indices = None if names is None else {_index(situation.detector, name) for name in names}
+    class_indices = None if names is None else {_class_index(situation.detector, name) for name in names}
     candidates = range(len(truth.label)) if aim.objects is None else aim.objects
     labels = truth.label.tolist()
     return [
@@ -350,13 +350,13 @@ def objects_of(situation: Situation, image: int) -> list[int]:
     ]
 
 
-def _on(place: Tensor, box: Tensor) -> Tensor:
+def _lie_in_boxes(place: Tensor, box: Tensor) -> Tensor:
     """Return a mask of the places [P, 2] that lie in one of the boxes [N, 4]."""
     inside = (place[:, None] >= box[None, :, :2]) & (place[:, None] < box[None, :, 2:])
     return inside.all(-1).any(1)
 
 
-def _index(detector: Detector, name: str) -> int:
+def _class_index(detector: Detector, name: str) -> int:
     if name not in detector.classes:
         raise unknown_name("class", name, detector.classes)
     return detector.classes.index(name)

@@ -11,7 +11,7 @@ from ssad.core.source import source_version
 from ssad.scenarios.static.digital.budget import Budget, px
 from ssad.scenarios.static.digital.live import LiveAttack
 from ssad.scenarios.static.digital.live_universal import universal_change
-from ssad.scenarios.static.digital.saved_images import FOLDER, SavedPictures
+from ssad.scenarios.static.digital.saved_images import FOLDER, SavedImages
 from ssad.scenarios.static.digital.scene_attacker import SceneAttacker
 from ssad.scenarios.static.digital.spec import AttackSpec
 from ssad.scenarios.static.digital.universal import UniversalFit
@@ -20,7 +20,7 @@ from ssad.scenarios.static.perturbation import Perturbation, PerturbedScene, Rec
 if TYPE_CHECKING:
     from ssad.rendering.sensor_suite import SensorSuite
 
-AT_ONCE, AT_ONCE_GPU = 8, 24  # images that are attacked at once in the loop; other processes may share the GPU
+BATCH_CPU, BATCH_GPU = 8, 24  # images that are attacked at once in the loop; other processes may share the GPU
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +69,17 @@ class DigitalAttack(Perturbation):
             raise ConfigError(f"attack '{self.name}' needs a detector to attack")
         saved_images = None
         if scene.folder is not None:
-            place = f"{self.spec.name}{f'@{file_name(victim.name)}' if victim.name else ''}/{scene.data.record.name}"
-            saved_images = SavedPictures(scene.folder / FOLDER / place)
+            scene_folder = (
+                f"{self.spec.name}{f'@{file_name(victim.name)}' if victim.name else ''}/{scene.data.record.name}"
+            )
+            saved_images = SavedImages(scene.folder / FOLDER / scene_folder)
         attacker = SceneAttacker(self.spec, scene, victim, victim.name, saved_images)
         return PerturbedScene(
             attacker.look,
             attacker.tally.notes,
             ahead=False,
             images_at_once=scene.batch,
-            done=saved_images.forget if saved_images else _nothing,
+            done=saved_images.forget if saved_images else _do_nothing,
         )
 
     def in_loop(self, suite: SensorSuite, *, target: int, victim: Any, seed: int) -> SensorSuite:
@@ -91,7 +93,7 @@ class DigitalAttack(Perturbation):
             raise ConfigError(f"attack '{self.name}': an object or the draws of a defence are of recorded scenes only")
         if not suite.cameras:
             raise ConfigError(f"attack '{self.name}' changes camera images, and this system has no camera")
-        budget, batch = Budget(px(spec.radius), spec.norm), AT_ONCE if suite.device == "cpu" else AT_ONCE_GPU
+        budget, batch = Budget(px(spec.radius), spec.norm), BATCH_CPU if suite.device == "cpu" else BATCH_GPU
         for channel, camera in suite.cameras.items():
             attack: Any = spec.make()
             if isinstance(attack, UniversalFit):
@@ -109,5 +111,5 @@ class DigitalAttack(Perturbation):
         return suite
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     """Do nothing: no images were saved."""

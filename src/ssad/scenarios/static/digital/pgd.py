@@ -19,13 +19,13 @@ Start = Literal["none", "uniform", "gaussian"]
 
 
 def starts(victim: Victim, budget: Budget, first: Start, restarts: int) -> Iterator[Tensor]:
-    """Images [B, 3, H, W] from which an attack begins: as `first` says, then random ones of the ball.
+    """Yield the images [B, 3, H, W] from which an attack begins: first as `first` says, then at random in the ball.
 
     Args:
-        victim: What is attacked.
+        victim: Detector and images under attack.
         budget: The ball.
-        first: Where the first start lies.
-        restarts: How many follow; where `first` is the clean image, they are uniform.
+        first: Position of the first start.
+        restarts: Number of further starts; uniform if `first` is the clean image.
     """
     for start_index in range(1 + restarts):
         kind: Start = first if start_index == 0 or first != "none" else "uniform"
@@ -92,7 +92,7 @@ class PGD:
         return keep_best(best, images, victim.loss(images).float())
 
     def share(self, k: int) -> float:
-        """Length of step `k` as a share of the radius."""
+        """Return the length of step `k` as a share of the radius."""
         constant = self.schedule == "constant"
         first_share = self.step if self.step is not None else min(2.5 / self.steps * (1 if constant else 2), 1.0)
         return first_share if constant else first_share * 0.5 * (1 + math.cos(math.pi * k / self.steps))

@@ -19,7 +19,7 @@ FOLDER = "unfinished"
 
 
 @dataclass(frozen=True, slots=True)
-class SavedPictures:
+class SavedImages:
     """Images of one scene under one attack, a file each.
 
     Attributes:
@@ -44,15 +44,15 @@ class SavedPictures:
         except (SSADError, KeyError, ValueError):
             return None
 
-    def write(self, token: str, picture: U8, notes: Mapping[str, Any]) -> None:
-        """Keep a picture.
+    def write(self, token: str, image: U8, notes: Mapping[str, Any]) -> None:
+        """Store an image.
 
         Args:
-            token: Of the camera frame.
-            picture: [H, W, 3].
-            notes: What its attack took, plain data.
+            token: Token of the camera frame.
+            image: [H, W, 3].
+            notes: Cost of its attack, plain data.
         """
-        columns = {"picture": picture, "notes": np.array(safeio.dump_json(dict(notes)))}
+        columns = {"picture": image, "notes": np.array(safeio.dump_json(dict(notes)))}
         safeio.write_atomic(self._path(token), safeio.npz_bytes(columns))
 
     def forget(self) -> None:

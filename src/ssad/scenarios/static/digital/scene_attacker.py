@@ -28,15 +28,15 @@ from ssad.scenarios.static.digital.chosen_object import chosen_first
 from ssad.scenarios.static.digital.defences import RandomResize
 from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
-from ssad.scenarios.static.digital.saved_images import SavedPictures
+from ssad.scenarios.static.digital.saved_images import SavedImages
 from ssad.scenarios.static.digital.spec import AttackSpec
-from ssad.scenarios.static.digital.tally import Tally
+from ssad.scenarios.static.digital.tally import AttackTally
 from ssad.scenarios.static.digital.transfer import translate
 from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.scenarios.static.digital.victim import NothingToAttackError, Victim, steady
 from ssad.scenarios.static.perturbation import RecordedScene, SceneVictim
 
-_INSPECTED: dict[tuple[Any, ...], tuple[float | None, float | None]] = {}  # of this process
+_INSPECTIONS: dict[tuple[Any, ...], tuple[float | None, float | None]] = {}  # of this process
 
 
 @dataclass(slots=True)
@@ -61,9 +61,9 @@ class SceneAttacker:
     recorded: RecordedScene
     watched: SceneVictim
     source: str = ""
-    saved: SavedPictures | None = None
+    saved: SavedImages | None = None
     attack: Attack = field(init=False)
-    tally: Tally = field(init=False)
+    tally: AttackTally = field(init=False)
     batch: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class SceneAttacker:
         defence = getattr(self.watched.detector, "defence", None)
         if self.spec.draws and isinstance(defence, RandomResize):
             self.attack = Expected(self.attack, defence, self.spec.draws)
-        self.tally = Tally(self.attack.access)
+        self.tally = AttackTally(self.attack.access)
         self.batch = 1 if self.recorded.device == "cpu" else self.recorded.batch
 
     def look(self, frames: Sequence[SensorFrame]) -> list[U8]:
@@ -91,7 +91,7 @@ class SceneAttacker:
             for image_size in sorted({image.shape[:2] for image in images}):
                 rows = [row for row, image in enumerate(images) if image.shape[:2] == image_size]
                 for row, attacked_image in zip(
-                    rows, self._all([frames[row] for row in rows], [images[row] for row in rows]), strict=True
+                    rows, self._attack_all([frames[row] for row in rows], [images[row] for row in rows]), strict=True
                 ):
                     images[row] = attacked_image
         except Exception as error:  # whatever a stranger's detector raises
@@ -115,13 +115,13 @@ class SceneAttacker:
             truth = camera_truth(frame, visible_annotations.take(np.arange(0)))
         return truth
 
-    def _all(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> list[U8]:
-        """Pictures of one size, in batches; smaller ones from where memory does not suffice."""
+    def _attack_all(self, frames: Sequence[SensorFrame], images: Sequence[U8]) -> list[U8]:
+        """Attack images of one size in batches, in smaller ones once memory does not suffice."""
         attacked_images: list[U8] = []
         while len(attacked_images) < len(frames):
             batch_slice = slice(len(attacked_images), len(attacked_images) + self.batch)
             try:
-                attacked_images += self._some(frames[batch_slice], pictures[batch_slice])
+                attacked_images += self._attack_batch(frames[batch_slice], images[batch_slice])
                 continue
             except torch.OutOfMemoryError:
                 count = len(frames[batch_slice])
@@ -137,18 +137,18 @@ class SceneAttacker:
         self.batch = count // 2
         self.tally.halved += 1
 
-    def _some(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> list[U8]:
-        """One batch."""
-        saved_pictures = self.saved if len(frames) == 1 and self.attack.access != "none" else None
-        if saved_pictures and (stored := saved_pictures.read(frames[0].token)):
+    def _attack_batch(self, frames: Sequence[SensorFrame], clean_images: Sequence[U8]) -> list[U8]:
+        """Attack one batch."""
+        saved_images = self.saved if len(frames) == 1 and self.attack.access != "none" else None
+        if saved_images and (stored := saved_images.read(frames[0].token)):
             self.tally.absorb(stored[1])
             return [stored[0]]
         spec = self.spec
         budget = Budget(px(spec.radius), spec.norm)
-        images, intrinsics = self._tensors(frames, pictures)
+        images, intrinsics = self._tensors(frames, clean_images)
         truth = [self._truth(frame) for frame in frames]
         active = self._attackable(images, intrinsics, truth)
-        result_images = list(pictures)
+        result_images = list(clean_images)
         self.tally.images += len(frames) - len(active)
         self.tally.idle += len(frames) - len(active)
         if not active:
@@ -167,30 +167,30 @@ class SceneAttacker:
             precision=spec.precision,
             keys=[(self.recorded.seed, frames[row].token) for row in active],
         )
-        batch_tally = Tally(self.attack.access)
+        batch_tally = AttackTally(self.attack.access)
         batch_tally.add(attacked, active_images, budget)
         self.tally.absorb(batch_tally.notes())
         code_values = (attacked.images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
         for row, attacked_image in zip(active, code_values, strict=True):
             result_images[row] = np.ascontiguousarray(attacked_image)
-        if saved_pictures:
-            saved_pictures.write(frames[0].token, result_images[0], batch_tally.notes())
+        if saved_images:
+            saved_images.write(frames[0].token, result_images[0], batch_tally.notes())
         return result_images
 
-    def _tensors(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> tuple[Tensor, Tensor]:
-        """Images [B, 3, H, W] and intrinsics [B, 3, 3] on the device."""
+    def _tensors(self, frames: Sequence[SensorFrame], images: Sequence[U8]) -> tuple[Tensor, Tensor]:
+        """Return images [B, 3, H, W] and intrinsics [B, 3, 3] on the device."""
         device = self.recorded.device
         intrinsics = np.stack([np.asarray(frame.intrinsic, np.float32) for frame in frames])
-        return to_images(pictures, device), torch.from_numpy(intrinsics).to(device)
+        return to_images(images, device), torch.from_numpy(intrinsics).to(device)
 
-    def _attackable(self, images: Tensor, lens: Tensor, truth: Sequence[Truth]) -> list[int]:
-        """Images in which there is something to attack, for this loss: in any batch the same."""
+    def _attackable(self, images: Tensor, intrinsics: Tensor, truth: Sequence[Truth]) -> list[int]:
+        """Return the images with something to attack for this loss; the same in any batch."""
         aim = self.spec.aim
-        if not make_objective(self.spec.loss).needs_objects and aim.everything:
+        if not make_objective(self.spec.loss).needs_objects and aim.attacks_all:
             return list(range(len(images)))
         detector: Any = self.watched.detector
         with steady(detector), torch.no_grad():
-            object_places = aim.places(detector, detector.assign(detector.dense(images, lens), truth))
+            object_places = aim.places(detector, detector.assign(detector.dense(images, intrinsics), truth))
         return [row for row, is_attackable in enumerate(object_places.any(1).tolist()) if is_attackable]
 
     def _inspect(self) -> None:
@@ -206,12 +206,12 @@ class SceneAttacker:
         frames = _key_frames(self.recorded.data)
         if self.attack.access == "none" or not self.source:
             return
-        recorded, spec = self.recorded, self.spec
+        recording, spec = self.recorded, self.spec
         cache_key = (
-            str(recorded.root),
-            recorded.version,
-            recorded.inputs,
-            recorded.device,
+            str(recording.root),
+            recording.version,
+            recording.inputs,
+            recording.device,
             self.source,
             self.recorded.data.record.name,
             spec.loss,
@@ -220,9 +220,9 @@ class SceneAttacker:
             spec.object,
             self.attack.access,
         )
-        if cache_key not in _INSPECTED:
-            _INSPECTED[cache_key] = self._inspected(frames)
-        self.tally.gradient_error, self.tally.coupling = _INSPECTED[cache_key]
+        if cache_key not in _INSPECTIONS:
+            _INSPECTIONS[cache_key] = self._measure_checks(frames)
+        self.tally.gradient_error, self.tally.coupling = _INSPECTIONS[cache_key]
 
     def _fit(self) -> None:
         """Find the perturbation of a universal attack, on frames of this drive or of others."""
@@ -239,7 +239,7 @@ class SceneAttacker:
         detector, budget = self.watched.detector, Budget(px(spec.radius), spec.norm)
         victims = []
         with steady(detector):
-            for frames, scene in self._fitted_to(fit):
+            for frames, scene in self._frames_to_fit(fit):
                 for start in range(0, len(frames), self.batch):
                     batch_frames = frames[start : start + self.batch]
                     truth = [self._truth(frame, scene) for frame in batch_frames]
@@ -263,7 +263,7 @@ class SceneAttacker:
         self.attack = fit.fit(victims, budget)
         self.tally.gradients += sum(map(len, victims)) * (fit.steps + 1)
 
-    def _fitted_to(self, fit: UniversalFit) -> list[tuple[list[SensorFrame], SceneData]]:
+    def _frames_to_fit(self, fit: UniversalFit) -> list[tuple[list[SensorFrame], SceneData]]:
         """Return frames spread evenly over this drive, or over others of the data set.
 
         Raises:
@@ -271,9 +271,11 @@ class SceneAttacker:
         """
         scene_name = self.recorded.data.record.name
         if fit.over == "drive":
-            return [(_spread(_key_frames(self.recorded.data), fit.frames), self.recorded.data)]
+            return [(_spread_evenly(_key_frames(self.recorded.data), fit.frames), self.recorded.data)]
         with NuScenes(self.recorded.root, self.recorded.version) as dataset:
-            names = _spread([record.name for record in dataset.scenes() if record.name != scene_name], fit.frames)
+            names = _spread_evenly(
+                [record.name for record in dataset.scenes() if record.name != scene_name], fit.frames
+            )
             if not names:
                 raise ConfigError(f"universal: there is no drive besides {scene_name}; use over: drive, or more scenes")
             # The shares differ by one at most, and their sum is exact.
@@ -282,11 +284,11 @@ class SceneAttacker:
             ]
             scenes = [dataset.scene(other_name) for other_name in names]
         return [
-            (_spread(_key_frames(other_scene), count), other_scene)
+            (_spread_evenly(_key_frames(other_scene), count), other_scene)
             for other_scene, count in zip(scenes, shares, strict=True)
         ]
 
-    def _inspected(self, frames: Sequence[SensorFrame]) -> tuple[float | None, float | None]:
+    def _measure_checks(self, frames: Sequence[SensorFrame]) -> tuple[float | None, float | None]:
         """Return the error of the gradient and the coupling; None if it cannot be measured."""
         names = self.spec.wanted or MMDET3D_CLASSES
         detector_classes = self.watched.classes
@@ -330,7 +332,7 @@ def _key_frames(scene: SceneData) -> list[SensorFrame]:
 T = TypeVar("T")
 
 
-def _spread(values: Sequence[T], count: int) -> list[T]:
+def _spread_evenly(values: Sequence[T], count: int) -> list[T]:
     """Return this many of some values, spread evenly; all if there are fewer."""
     selected_count = min(count, len(values))
     return [values[(2 * index + 1) * len(values) // (2 * selected_count)] for index in range(selected_count)]

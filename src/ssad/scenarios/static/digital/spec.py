@@ -117,7 +117,7 @@ class AttackSpec:
         return attack
 
 
-def takes(attack: str, option: str) -> bool:
+def has_option(attack: str, option: str) -> bool:
     """Return True if a built-in attack has an option.
 
     Args:

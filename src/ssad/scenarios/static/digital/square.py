@@ -57,7 +57,7 @@ class Square:
         clean = victim.clean
         generators = [victim.generator(key, "square") for key in victim.keys]
         initial_change = _stripes if budget.norm == "linf" else _tiles
-        propose = _square if budget.norm == "linf" else _moved
+        propose = _square if budget.norm == "linf" else _move_mass
         initial_changes = torch.stack(
             [
                 initial_change(image_values, image_generator)
@@ -72,7 +72,7 @@ class Square:
         proposal_count = self.queries - 2
         for proposal in range(proposal_count):
             square_side = self.side(
-                proposal / proposal_count, clean.shape[2], clean.shape[3], least=1 if budget.norm == "linf" else 3
+                proposal / proposal_count, clean.shape[2], clean.shape[3], min_side=1 if budget.norm == "linf" else 3
             )
             change = best[0] - clean
             for image_values, image_generator in zip(change, generators, strict=True):
@@ -82,83 +82,83 @@ class Square:
         # The clean image counts too: an image that no square makes worse is returned as it is.
         return keep_best((clean, victim.loss(clean).float()), *best)[0]
 
-    def side(self, done: float, height: int, width: int, *, least: int = 1) -> int:
-        """Side of the squares in pixels.
+    def side(self, progress: float, height: int, width: int, *, min_side: int = 1) -> int:
+        """Return the side of the squares in pixels.
 
         Args:
-            done: Share of the proposals that have been made.
-            height: Of the image.
-            width: Of the image.
-            least: The smallest side.
+            progress: Share of the proposals that have been made.
+            height: Height of the image.
+            width: Width of the image.
+            min_side: The smallest side.
         """
-        area = self.share / 2 ** sum(int(done * 10_000) > halving for halving in HALVINGS)
-        return max(min(max(round(math.sqrt(area * height * width)), least), min(height, width) - 1), 1)
+        area = self.share / 2 ** sum(int(progress * 10_000) > halving for halving in HALVINGS)
+        return max(min(max(round(math.sqrt(area * height * width)), min_side), min(height, width) - 1), 1)
 
 
-def _stripes(clean: Tensor, chance: np.random.Generator) -> Tensor:
-    """A change of 1 up or down [3, H, W], the same along each column."""
-    signs = chance.choice([-1.0, 1.0], (3, 1, clean.shape[2]))
+def _stripes(clean: Tensor, random: np.random.Generator) -> Tensor:
+    """Return a change of 1 up or down [3, H, W], the same along each column."""
+    signs = random.choice([-1.0, 1.0], (3, 1, clean.shape[2]))
     return torch.from_numpy(signs).to(clean).expand(clean.shape).clone()
 
 
-def _square(change: Tensor, side: int, radius: float, chance: np.random.Generator) -> None:
-    """Sets one square of a change [3, H, W] to the radius, up or down by channel, other than it was."""
-    window = change[_place(change, side, chance)]
+def _square(change: Tensor, side: int, radius: float, random: np.random.Generator) -> None:
+    """Set one square of a change [3, H, W] to the radius, up or down by channel, other than it was."""
+    window = change[_random_window(change, side, random)]
     for _ in range(TRIES):
-        signs = torch.from_numpy(chance.choice([-1.0, 1.0], (3, 1, 1))).to(change)
+        signs = torch.from_numpy(random.choice([-1.0, 1.0], (3, 1, 1))).to(change)
         if bool((signs != window.sign()).any()):
             break
     window.copy_((radius * signs).expand_as(window))
 
 
-def _tiles(clean: Tensor, chance: np.random.Generator) -> Tensor:
-    """Bumps side by side [3, H, W], each up or down by channel."""
+def _tiles(clean: Tensor, random: np.random.Generator) -> Tensor:
+    """Return bumps side by side [3, H, W], each up or down by channel."""
     height, width = clean.shape[1:]
     tile_side = max(min(height, width) // TILES, 1)
     change = torch.full_like(clean, TINY)
     for top in range(height % tile_side // 2, height - tile_side + 1, tile_side):
         for left in range(width % tile_side // 2, width - tile_side + 1, tile_side):
-            change[:, top : top + tile_side, left : left + tile_side] += _bump(tile_side, chance).to(clean) * _signs(
-                clean, chance
+            change[:, top : top + tile_side, left : left + tile_side] += _bump(tile_side, random).to(clean) * _signs(
+                clean, random
             )
     return change
 
 
-def _moved(change: Tensor, side: int, radius: float, chance: np.random.Generator) -> None:
+def _move_mass(change: Tensor, side: int, radius: float, random: np.random.Generator) -> None:
     """Empty one window of a change [3, H, W], and add a bump to another.
 
     The new length of the second window combines the lengths of both windows and what is left of the ball.
     """
     side = min(side + 1 - side % 2, *change.shape[1:])
-    target_window, source_window = _place(change, side, chance), _place(change, side, chance)
+    target_window, source_window = _random_window(change, side, random), _random_window(change, side, random)
     target_change = change[target_window]
     window_change = torch.zeros_like(change)
     window_change[target_window] = change[target_window]
     window_change[source_window] = change[source_window]
     free_mass = max(radius**2 - float((change**2).sum()), 0.0) / len(change)
     target_length = ((window_change**2).sum((1, 2), keepdim=True) + free_mass).sqrt()
-    new_change = _bump(side, chance).to(change) * _signs(change, chance)
+    new_change = _bump(side, random).to(change) * _signs(change, random)
     new_change = new_change + target_change / (TINY + (target_change**2).sum((1, 2), keepdim=True).sqrt())
     change[source_window] = 0.0
     change[target_window] = new_change / (TINY + (new_change**2).sum((1, 2), keepdim=True).sqrt()) * target_length
     change *= radius / (TINY + float((change**2).sum()) ** 0.5)
 
 
-def _place(change: Tensor, side: int, chance: np.random.Generator) -> tuple[slice, slice, slice]:
-    """A square window of a change [3, H, W] at random."""
-    top = int(chance.integers(0, change.shape[1] - side + 1))
-    left = int(chance.integers(0, change.shape[2] - side + 1))
+def _random_window(change: Tensor, side: int, random: np.random.Generator) -> tuple[slice, slice, slice]:
+    """Return a random square window of a change [3, H, W]."""
+    top = int(random.integers(0, change.shape[1] - side + 1))
+    left = int(random.integers(0, change.shape[2] - side + 1))
     return slice(None), slice(top, top + side), slice(left, left + side)
 
 
-def _signs(like: Tensor, chance: np.random.Generator) -> Tensor:
-    return torch.from_numpy(chance.choice([-1.0, 1.0], (3, 1, 1))).to(like)
+def _signs(template: Tensor, random: np.random.Generator) -> Tensor:
+    return torch.from_numpy(random.choice([-1.0, 1.0], (3, 1, 1))).to(template)
 
 
-def _bump(side: int, chance: np.random.Generator) -> Tensor:
-    """A hill and a hollow side by side [side, side] of length 1, above each other or beside each other at random."""
+def _bump(side: int, random: np.random.Generator) -> Tensor:
+    """Return a hill and a hollow [side, side] of length 1, above or beside each other at random."""
     shape = _hill_and_hollow(side)
-    return shape.T if chance.random() > 0.5 else shape
+    return shape.T if random.random() > 0.5 else shape
 
 
 @lru_cache(maxsize=64)

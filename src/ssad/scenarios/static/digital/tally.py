@@ -9,12 +9,12 @@ from typing import Any
 
 from torch import Tensor
 
-from ssad.scenarios.static.digital import Attacked, Budget
+from ssad.scenarios.static.digital import AttackResult, Budget
 from ssad.scenarios.static.digital.budget import LEVELS
 
 
 @dataclass(slots=True)
-class Tally:
+class AttackTally:
     """Accumulated cost of attacks on the images of a scene.
 
     Attributes:
@@ -45,23 +45,23 @@ class Tally:
     gradient_error: float | None = None
     coupling: float | None = None
 
-    def add(self, found: Attacked, clean: Tensor, budget: Budget) -> None:
-        """Counts a batch of attacked images."""
-        count = len(found.images)
+    def add(self, result: AttackResult, clean: Tensor, budget: Budget) -> None:
+        """Count a batch of attacked images."""
+        count = len(result.images)
         self.images += count
-        self.idle += int(found.idle.sum())
-        self.gradients += count * found.cost.gradients
-        self.queries += count * found.cost.queries
-        self.before += float(found.before.double().sum())
-        self.after += float(found.after.double().sum())
+        self.idle += int(result.idle.sum())
+        self.gradients += count * result.cost.gradients
+        self.queries += count * result.cost.queries
+        self.before += float(result.before.double().sum())
+        self.after += float(result.after.double().sum())
         # Rounded to code values, as the written images are.
-        change = ((found.images - clean).double() * LEVELS).round().abs().flatten(1)
+        change = ((result.images - clean).double() * LEVELS).round().abs().flatten(1)
         radius = max(budget.radius * LEVELS, 1e-9)
         change_sizes, mean_change = change.amax(1), change.mean(1)
         if budget.norm == "l2":
             change_sizes = mean_change = change.norm(dim=1)
         self.change = max(self.change, float(change_sizes.max()))
-        self.used += float((mean_change / radius)[~found.idle].sum())
+        self.used += float((mean_change / radius)[~result.idle].sum())
         self.batch = min(self.batch or count, count)
 
     def absorb(self, notes: Mapping[str, Any]) -> None:
@@ -77,7 +77,7 @@ class Tally:
 
 
 def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Sum the notes of the scenes of a cell (see `Tally`) into columns of its record.
+    """Sum the notes of the scenes of a cell (see `AttackTally`) into columns of its record.
 
     Args:
         notes: of each scene.
@@ -117,16 +117,16 @@ def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def sum_members(noted: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """What an attack noted in its scenes, summed; of an ensemble what its members noted together.
+def sum_members(notes_by_member: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Sum the notes of an attack over its scenes; those of an ensemble over its members too.
 
     Args:
-        noted: of each member, what its scenes noted.
+        notes_by_member: notes of the scenes of each member.
 
     Returns:
         The columns of `sum_notes`.
     """
-    member_sums = [sum_notes(member_notes) for member_notes in noted]
+    member_sums = [sum_notes(member_notes) for member_notes in notes_by_member]
     total = dict(member_sums[0])
     if len(member_sums) > 1:
         for name in ("gradients", "queries"):

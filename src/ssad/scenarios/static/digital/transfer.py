@@ -66,21 +66,21 @@ class Transfer:
         ]
         if self.surrogate.task == "3d" and any(image_truth.solid is None for image_truth, _ in translations):
             raise ConfigError(f"{self.name}: {self.surrogate.name} finds 3D boxes, and the truth has none")
-        aims = [_translated(aim, kept_objects, self.surrogate) for _, kept_objects in translations]
+        aims = [_translate_aim(aim, kept_objects, self.surrogate) for _, kept_objects in translations]
         # object indices differ between images once some are omitted, so such images are attacked one by one
         perturbed = victim.clean.clone()
         groups = [[index] for index in range(len(victim))] if aim.objects is not None else [list(range(len(victim)))]
         loss, any_attacked = self._loss(), False
-        needs_objects = loss.needs_objects or not aim.everything
+        needs_objects = loss.needs_objects or not aim.attacks_all
         with steady(self.surrogate):
             for group in groups:
                 attackable = [
                     index
                     for index in group
-                    if not needs_objects or _attacked(translations[index][0], aims[index], self.surrogate)
+                    if not needs_objects or _has_attacked_object(translations[index][0], aims[index], self.surrogate)
                 ]
                 if attackable:
-                    perturbed[attackable] = self._on_surrogate(
+                    perturbed[attackable] = self._attack_surrogate(
                         victim,
                         attackable,
                         [translations[index][0] for index in attackable],
@@ -92,11 +92,11 @@ class Transfer:
             raise ConfigError(f"{self.name}: {self.surrogate.name} knows the class of none of the attacked objects")
         return perturbed
 
-    def _on_surrogate(
-        self, victim: Victim, own: Sequence[int], truth: Sequence[Truth], aim: Aim, budget: Budget
+    def _attack_surrogate(
+        self, victim: Victim, rows: Sequence[int], truth: Sequence[Truth], aim: Aim, budget: Budget
     ) -> Tensor:
-        """What the inner attack finds for some images of the batch."""
-        intrinsic = None if victim.intrinsic is None else victim.intrinsic[list(own)]
+        """Return the images that the inner attack finds for some rows of the batch."""
+        intrinsic = None if victim.intrinsic is None else victim.intrinsic[list(rows)]
         intrinsics = [image_truth.intrinsic for image_truth in truth if image_truth.intrinsic is not None]
         if intrinsic is None and len(intrinsics) == len(truth):
             intrinsic = torch.stack(intrinsics).to(victim.clean)
@@ -104,12 +104,12 @@ class Transfer:
             raise ConfigError(f"{self.name}: {self.surrogate.name} finds 3D boxes, and the intrinsics are missing")
         surrogate_victim = Victim(
             self.surrogate,
-            victim.clean[list(own)],
+            victim.clean[list(rows)],
             truth,
             self._loss(),
             intrinsic=intrinsic,
             aim=aim,
-            keys=[victim.keys[index] for index in own],
+            keys=[victim.keys[index] for index in rows],
         )
         if self.check and self.inner.access == "white-box":
             check_gradient(surrogate_victim)
@@ -117,18 +117,20 @@ class Transfer:
         return torch.where(surrogate_victim.idle[:, None, None, None], surrogate_victim.clean, images)
 
 
-def translate(truth: Truth, known: Sequence[str], wanted: Sequence[str]) -> tuple[Truth, tuple[int, ...]]:
-    """The truth of an image with the labels of another detector.
+def translate(
+    truth: Truth, source_classes: Sequence[str], target_classes: Sequence[str]
+) -> tuple[Truth, tuple[int, ...]]:
+    """Return the truth of an image with the labels of another detector.
 
     Args:
-        truth: With labels that are indices into `known`.
-        known: Names of classes.
-        wanted: Names of the classes of the other detector.
+        truth: Truth whose labels are indices into `source_classes`.
+        source_classes: Names of the classes of the truth.
+        target_classes: Names of the classes of the other detector.
 
     Returns:
-        The truth of the objects whose class is among the wanted ones, and which objects these are.
+        The truth of the objects of these classes, and their indices.
     """
-    label_map = [wanted.index(name) if name in wanted else -1 for name in known]
+    label_map = [target_classes.index(name) if name in target_classes else -1 for name in source_classes]
     label = torch.tensor([label_map[label_index] for label_index in truth.label.tolist()], dtype=truth.label.dtype)
     kept_objects = torch.nonzero(label >= 0).flatten()
     solid = truth.solid
@@ -145,13 +147,14 @@ def translate(truth: Truth, known: Sequence[str], wanted: Sequence[str]) -> tupl
     return Truth(label, truth.box[kept_objects], solid, truth.intrinsic, crowd), tuple(kept_objects.tolist())
 
 
-def _translated(aim: Aim, kept: Sequence[int], surrogate: Detector) -> Aim:
-    """The aim in an image of which some objects are kept, with the classes that the surrogate knows."""
+def _translate_aim(aim: Aim, kept_objects: Sequence[int], surrogate: Detector) -> Aim:
+    """Return the aim in an image of which some objects are kept, with the classes that the surrogate knows."""
     if aim.classes is not None:
         aim = replace(aim, classes=tuple(name for name in aim.classes if name in surrogate.classes))
     if aim.objects is not None:
         aim = replace(
-            aim, objects=tuple(new_index for new_index, old_index in enumerate(kept) if old_index in aim.objects)
+            aim,
+            objects=tuple(new_index for new_index, old_index in enumerate(kept_objects) if old_index in aim.objects),
         )
     becomes = {
         name: wrong_class
@@ -164,7 +167,7 @@ def _translated(aim: Aim, kept: Sequence[int], surrogate: Detector) -> Aim:
     return replace(aim, becomes=becomes)
 
 
-def _attacked(truth: Truth, aim: Aim, surrogate: Detector) -> bool:
+def _has_attacked_object(truth: Truth, aim: Aim, surrogate: Detector) -> bool:
     """Check an image for an object under attack that is no crowd."""
     names = list(aim.becomes) if aim.becomes else aim.classes
     for index, label in enumerate(truth.label.tolist()):

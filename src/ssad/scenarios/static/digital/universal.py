@@ -13,14 +13,14 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital.attack import Access
 from ssad.scenarios.static.digital.budget import Budget
-from ssad.scenarios.static.digital.victim import Pictures, Victim, steady
+from ssad.scenarios.static.digital.victim import CleanImages, Victim, steady
 
 Batches = Iterable[Victim] | Callable[[], Iterable[Victim]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Universal:
-    """Adds one change to every picture; it asks nothing.
+    """Attack that adds one change to every image, without queries.
 
     Attributes:
         change: [1, 3, H, W], as `fit_universal` finds it; it is held to the budget of each run.
@@ -38,7 +38,7 @@ class Universal:
         if len(shape) != 4 or shape[:2] != (1, 3) or not bool(self.change.isfinite().all()):
             raise ConfigError(f"universal: the change must be finite and of shape [1, 3, H, W], not {list(shape)}")
 
-    def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
+    def perturb(self, victim: Victim | CleanImages, budget: Budget) -> Tensor:
         """Add the change, projected onto the budget."""
         _check_size(tuple(self.change.shape), victim)
         return budget.project(victim.clean + self.change.to(victim.clean), victim.clean)
@@ -46,14 +46,14 @@ class Universal:
 
 @dataclass(frozen=True, slots=True)
 class UniversalFit:
-    """How a change is found for many pictures of a drive: what a suite calls `universal`.
+    """Fit of one change for many images of a drive; the attack `universal` of a suite.
 
-    It asks nothing of the pictures that it is added to; whoever runs it first finds the change (`fit`).
+    It does not query the images that it is added to; the change must be fitted first (`fit`).
 
     Attributes:
         over: "others": the change is fitted to frames of other drives, so that it is new to the pictures it is added
             to. "drive": to frames of the same drive, which shows what the best fixed change could do there.
-        frames: How many frames, spread evenly.
+        frames: Number of frames, spread evenly.
         steps: Passes over all of them.
         step: See `fit_universal`.
         method: See `fit_universal`.
@@ -85,7 +85,7 @@ class UniversalFit:
         """Return the attack that adds the change fitted to these images."""
         return Universal(fit_universal(victims, budget, epochs=self.steps, step=self.step, method=self.method))
 
-    def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
+    def perturb(self, victim: Victim | CleanImages, budget: Budget) -> Tensor:
         """Raise an error, since the change must be fitted first.
 
         Raises:
@@ -135,7 +135,7 @@ def fit_universal(
     adam = torch.optim.Adam([change], eps=1e-30, maximize=True)
     unit_length = math.sqrt(change.numel()) if budget.norm == "l2" else 1.0  # norm of a change of all ones
     for epoch in range(epochs + 1):
-        total, gradient = _summed(victims() if callable(victims) else victims, change)
+        total, gradient = _sum_losses(victims() if callable(victims) else victims, change)
         if total > best_total:
             best_change, best_total = change.clone(), total
         # The last pass only evaluates the final change.
@@ -152,15 +152,15 @@ def fit_universal(
     return best_change.to(first_victim.clean.dtype)
 
 
-def _summed(batches: Iterable[Victim], change: Tensor) -> tuple[float, Tensor]:
+def _sum_losses(batches: Iterable[Victim], change: Tensor) -> tuple[float, Tensor]:
     """Return the sum of all losses and its gradient with respect to the change, in float64."""
     total, gradient = 0.0, torch.zeros_like(change)
     for victim in batches:
         _check_size(tuple(change.shape), victim)
-        moved = victim.clean + change.to(victim.clean)
-        is_inside = (moved >= 0.0) & (moved <= 1.0)
+        perturbed = victim.clean + change.to(victim.clean)
+        is_inside = (perturbed >= 0.0) & (perturbed <= 1.0)
         with steady(victim.detector):
-            losses, gradients = victim.gradient(moved.clamp(0.0, 1.0))
+            losses, gradients = victim.gradient(perturbed.clamp(0.0, 1.0))
         # Image by image in float64: the result is the same for any batching.
         for index in range(len(victim)):
             if not bool(victim.idle[index]):
@@ -169,7 +169,7 @@ def _summed(batches: Iterable[Victim], change: Tensor) -> tuple[float, Tensor]:
     return total, gradient
 
 
-def _check_size(shape: tuple[int, ...], victim: Victim | Pictures) -> None:
+def _check_size(shape: tuple[int, ...], victim: Victim | CleanImages) -> None:
     image_shape = tuple(victim.clean.shape[1:])
     if shape[1:] != image_shape:
         raise ConfigError(

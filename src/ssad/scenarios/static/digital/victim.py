@@ -41,7 +41,7 @@ class NothingToAttackError(ConfigError):
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
+class CleanImages:
     """Clean images and their random keys: the input of attacks that do not query a detector.
 
     Attributes:
@@ -52,9 +52,9 @@ class Pictures:
     clean: Tensor
     keys: Sequence[tuple[object, ...]]
 
-    def draw(self, kind: str, *use: object) -> Tensor:
+    def draw(self, kind: str, *purpose: object) -> Tensor:
         """See `draw`."""
-        return draw(self.clean, self.keys, kind, *use)
+        return draw(self.clean, self.keys, kind, *purpose)
 
 
 class Victim:
@@ -112,7 +112,7 @@ class Victim:
             dense = self._dense(self.clean)
             assignment = detector.assign(dense, truth)
             self.situation = Situation(detector, assignment, aim)
-            needs_objects = objective.needs_objects or not aim.everything
+            needs_objects = objective.needs_objects or not aim.attacks_all
             self.idle = ~aim.places(detector, assignment).any(1) if needs_objects else torch.zeros(len(images)) > 0
         self.idle = self.idle.to(images.device)
         if bool(self.idle.all()):
@@ -157,28 +157,28 @@ class Victim:
             raise ConfigError(f"{self.detector.name}: the gradient of loss '{self.objective.name}' is not finite")
         return loss.detach(), gradients[0]
 
-    def draw(self, kind: str, *use: object) -> Tensor:
-        """Random numbers [B, 3, H, W] of each image; see `draw`."""
-        return draw(self.clean, self.keys, kind, *use)
+    def draw(self, kind: str, *purpose: object) -> Tensor:
+        """Return random numbers [B, 3, H, W] of each image; see `draw`."""
+        return draw(self.clean, self.keys, kind, *purpose)
 
     @staticmethod
-    def generator(key: tuple[object, ...], *use: object) -> np.random.Generator:
-        """The generator of an image's key for one use."""
-        return generator("digital attack", *key, *use)
+    def generator(key: tuple[object, ...], *purpose: object) -> np.random.Generator:
+        """Return the generator of an image's key for one purpose."""
+        return generator("digital attack", *key, *purpose)
 
 
-def draw(clean: Tensor, keys: Sequence[tuple[object, ...]], kind: str, *use: object) -> Tensor:
-    """Random numbers [B, 3, H, W] of each image, from its own key: the same in any batch.
+def draw(clean: Tensor, keys: Sequence[tuple[object, ...]], kind: str, *purpose: object) -> Tensor:
+    """Return random numbers [B, 3, H, W] of each image, from its own key: the same in any batch.
 
     Args:
-        clean: [B, 3, H, W]: shape, type and device of what is drawn.
-        keys: Of each image.
+        clean: [B, 3, H, W]: shape, type and device of the result.
+        keys: Key of each image.
         kind: "uniform" in [-1, 1], or "gaussian".
-        *use: What they are for.
+        *purpose: Purpose of the numbers.
     """
     draws = np.empty(tuple(clean.shape), np.float32)
     for image_draws, key in zip(draws, keys, strict=True):
-        image_generator = Victim.generator(key, *use)
+        image_generator = Victim.generator(key, *purpose)
         if kind == "uniform":
             image_generator.random(dtype=np.float32, out=image_draws)
         else:

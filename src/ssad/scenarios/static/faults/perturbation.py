@@ -92,14 +92,14 @@ class Fault(Perturbation):
 
     def _sensors(self, fault: Any, sensors: dict[str, str]) -> list[str]:
         """Return the names of the sensors, given with their modalities, that a fault changes."""
-        wanted = set(getattr(fault, "sensors", ("camera",)))
-        chosen = [name for name, modality in sensors.items() if name in wanted or modality in wanted]
-        if not chosen:
+        sensor_names = set(getattr(fault, "sensors", ("camera",)))
+        fault_sensors = [name for name, modality in sensors.items() if name in sensor_names or modality in sensor_names]
+        if not fault_sensors:
             raise ConfigError(
-                f"fault '{self.name}' is of {', '.join(sorted(wanted))}; this system has "
+                f"fault '{self.name}' is of {', '.join(sorted(sensor_names))}; this system has "
                 f"{', '.join(sensors) or 'no such sensors'}"
             )
-        return chosen
+        return fault_sensors
 
     def on_scene(self, scene: RecordedScene, victim: SceneVictim | None) -> PerturbedScene:
         """Return the images of a scene with the fault in its cameras, in order of time.
@@ -111,22 +111,22 @@ class Fault(Perturbation):
         channels = {frame.channel: frame.modality for frame in scene.data.frames}
         if not isinstance(example, ReadingChange):
             raise ConfigError(f"fault '{self.name}' changes no readings: recorded scenes do not show it")
-        faulty = {name for name in self._sensors(example, channels) if channels[name] == "camera"}
-        if not faulty:
+        faulty_channels = {name for name in self._sensors(example, channels) if channels[name] == "camera"}
+        if not faulty_channels:
             raise ConfigError(f"fault '{self.name}' changes no camera: detectors of images do not show it")
-        objects: dict[str, Any] = {name: self.make() for name in faulty}
+        faults: dict[str, Any] = {name: self.make() for name in faulty_channels}
         start = scene.data.samples[0].timestamp if scene.data.samples else 0
 
         def look(frames: Sequence[SensorFrame]) -> list[U8]:
             images = []
             for frame in frames:
                 image = read_image(scene.root / frame.filename)
-                if frame.channel in objects:
+                if frame.channel in faults:
                     moment = RecordedMoment(np.array([(frame.timestamp_us - start) / 1e6]))
                     draws = [generator("perturbation", scene.seed, frame.scene_token, frame.channel, frame.token)]
                     readings = np.ascontiguousarray(np.moveaxis(image, -1, 0))[None]
-                    changed = objects[frame.channel].apply(readings, victim, moment, draws)
-                    image = np.ascontiguousarray(np.moveaxis(np.asarray(changed)[0], 0, -1))
+                    faulty_readings = faults[frame.channel].apply(readings, victim, moment, draws)
+                    image = np.ascontiguousarray(np.moveaxis(np.asarray(faulty_readings)[0], 0, -1))
                 images.append(image)
             return images
 

@@ -6,9 +6,14 @@
 from __future__ import annotations
 
 from ssad.scenarios.static.physical.textures.attacks import ATTACKS, default_carrier, make_physical, physical_names
-from ssad.scenarios.static.physical.textures.carrier import Camouflage, Carrier, Patch, Surface, albedo_of
+from ssad.scenarios.static.physical.textures.carrier import Camouflage, Carrier, Patch, TextureSurface, albedo_of
 from ssad.scenarios.static.physical.textures.controls import CONTROLS, control
-from ssad.scenarios.static.physical.textures.optimise import TextureAttack, Trained, View, train_texture
+from ssad.scenarios.static.physical.textures.optimise import (
+    TextureAttack,
+    TextureTrainingResult,
+    TextureView,
+    train_texture,
+)
 from ssad.scenarios.static.physical.textures.printing import Expectation
 from ssad.scenarios.static.physical.textures.spec import CARRIERS, TextureSpec, make_carrier
 
@@ -20,11 +25,11 @@ __all__ = [
     "Carrier",
     "Expectation",
     "Patch",
-    "Surface",
     "TextureAttack",
     "TextureSpec",
-    "Trained",
-    "View",
+    "TextureSurface",
+    "TextureTrainingResult",
+    "TextureView",
     "albedo_of",
     "control",
     "default_carrier",

@@ -57,11 +57,11 @@ def place_objects(spec: ShiftSpec, scene: str, poses: F64, boxes: Sequence[Track
         poses: Ego poses over the scene [N, 4, 4], in time order.
         boxes: Annotated boxes of each sample.
     """
-    path, stations = _way(poses)
+    path, stations = _ego_path(poses)
     driven_length = stations[-2]
     piece_count = max(1, round((driven_length + table.ANOMALY_AHEAD) / table.ANOMALY_EVERY))
     piece_length = (driven_length + table.ANOMALY_AHEAD) / piece_count
-    occupied_parts = [_swept(candidate) for candidate in boxes if len(candidate)]
+    occupied_parts = [_swept_ground(candidate) for candidate in boxes if len(candidate)]
     ego_centres = poses[:, :2, 3] + EGO[2] * poses[:, :2, 0]
     heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     ego_size = np.broadcast_to(EGO[:2], (len(poses), 2))
@@ -78,7 +78,7 @@ def place_objects(spec: ShiftSpec, scene: str, poses: F64, boxes: Sequence[Track
             occupied = np.concatenate(occupied_parts)
             for forward_share, lateral_share, yaw_share in attempts:
                 station = table.ANOMALY_FIRST + (piece_index + forward_share) * piece_length
-                position, path_heading = _at(path, stations, station)
+                position, path_heading = _position_at(path, stations, station)
                 lateral_offset = (2.0 * lateral_share - 1.0) * (table.ANOMALY_ASIDE + 0.5 * min(length, width))
                 position = position + lateral_offset * np.array([-np.sin(path_heading), np.cos(path_heading), 0.0])
                 yaw = float(path_heading + 2.0 * np.pi * yaw_share)
@@ -94,7 +94,7 @@ def place_objects(spec: ShiftSpec, scene: str, poses: F64, boxes: Sequence[Track
     return tuple(objects)
 
 
-def _way(poses: F64) -> tuple[F64, F64]:
+def _ego_path(poses: F64) -> tuple[F64, F64]:
     """Return the path of the ego [M, 3] and the arc length of each point, m; the last segment is straight."""
     points = [poses[0, :3, 3]]
     for position in poses[1:, :3, 3]:
@@ -108,39 +108,42 @@ def _way(poses: F64) -> tuple[F64, F64]:
     return path, stations
 
 
-def _at(way: F64, along: F64, station: float) -> tuple[F64, float]:
-    """Place [3] and course (rad) at a distance along the way."""
-    position = np.array([np.interp(station, along, way[:, axis]) for axis in range(3)])
-    segment = int(np.clip(np.searchsorted(along, station, side="right") - 1, 0, len(way) - 2))
-    direction = way[segment + 1] - way[segment]
+def _position_at(path: F64, stations: F64, station: float) -> tuple[F64, float]:
+    """Return position [3] and course (rad) at a distance along the path."""
+    position = np.array([np.interp(station, stations, path[:, axis]) for axis in range(3)])
+    segment = int(np.clip(np.searchsorted(stations, station, side="right") - 1, 0, len(path) - 2))
+    direction = path[segment + 1] - path[segment]
     return position, float(np.arctan2(direction[1], direction[0]))
 
 
-def _rectangles(middle: F64, yaw: F64, size: F64) -> F64:
-    """Corners [N, 4, 2] of rectangles: middles [N, 2], yaw [N], length and width [N, 2]; around in order."""
+def _rectangles(centre: F64, yaw: F64, size: F64) -> F64:
+    """Return the corners [N, 4, 2] of rectangles: centres [N, 2], yaw [N], length and width [N, 2]; around in order."""
     forward = np.stack([np.cos(yaw), np.sin(yaw)], -1)[:, None]
     left = np.stack([-np.sin(yaw), np.cos(yaw)], -1)[:, None]
     corner_signs = np.array([(0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5)])
-    corners = middle[:, None] + forward * (corner_signs[:, 0] * size[:, :1])[..., None]
+    corners = centre[:, None] + forward * (corner_signs[:, 0] * size[:, :1])[..., None]
     return np.asarray(corners + left * (corner_signs[:, 1] * size[:, 1:])[..., None])
 
 
-def _swept(boxes: TrackedBoxes) -> F64:
+def _swept_ground(boxes: TrackedBoxes) -> F64:
     """Return the ground [N, 4, 2] under boxes, extended by their motion between samples."""
     speed = np.nan_to_num(np.linalg.norm(boxes.velocity[:, :2], axis=1))
     size = boxes.size_lwh[:, :2] + np.stack([MOVES * speed, np.zeros(len(boxes))], 1)
     return _rectangles(boxes.centre[:, :2], np.asarray(quaternion_to_yaw(boxes.rotation)), size)
 
 
-def _overlap(own: F64, others: F64) -> Bool:
-    """Whether a rectangle [4, 2] overlaps each of others [N, 4, 2]: no line lies between the two."""
-    is_separated = np.zeros(len(others), bool)
+def _overlap(rectangle: F64, rectangles: F64) -> Bool:
+    """Return a mask of the rectangles [N, 4, 2] that overlap another one [4, 2]: no line separates the two."""
+    is_separated = np.zeros(len(rectangles), bool)
     for edge_index in range(2):
         for edge in (
-            np.broadcast_to(own[edge_index + 1] - own[edge_index], (len(others), 2)),
-            others[:, edge_index + 1] - others[:, edge_index],
+            np.broadcast_to(rectangle[edge_index + 1] - rectangle[edge_index], (len(rectangles), 2)),
+            rectangles[:, edge_index + 1] - rectangles[:, edge_index],
         ):
-            projection, other_projections = np.einsum("nk,ck->nc", edge, own), np.einsum("nk,nck->nc", edge, others)
+            projection, other_projections = (
+                np.einsum("nk,ck->nc", edge, rectangle),
+                np.einsum("nk,nck->nc", edge, rectangles),
+            )
             is_separated |= (projection.max(1) < other_projections.min(1)) | (
                 other_projections.max(1) < projection.min(1)
             )
@@ -171,10 +174,10 @@ class _Model:
 def _model(kind: str, style: str, seed: int, size: tuple[float, float, float]) -> _Model:
     draws = generator("anomaly", kind, style, seed)
     mesh = make_body(kind, style=style, size=size, generator=draws)
-    return _Model(RenderScene(None, [mesh]), draw_paint(draws), *_contact(mesh))
+    return _Model(RenderScene(None, [mesh]), draw_paint(draws), *_contact_shadow(mesh))
 
 
-def _contact(mesh: Mesh) -> tuple[F32, F64]:
+def _contact_shadow(mesh: Mesh) -> tuple[F32, F64]:
     """Return the contact shadow [h, w], the skylight that low parts of a body block, and its corner [2]."""
     lowest, highest = mesh.bounds()
     corner = lowest[:2] - AROUND
@@ -221,11 +224,11 @@ def add_anomalies(
     """Apply anomalies, in both calibrations."""
     pixels, records = batch.numpy().copy(), []
     for index, (frame, spec) in enumerate(zip(frames, specs, strict=True)):
-        records.append(_draw(pixels[index], frame, _standing(spec, frame, contexts)))
+        records.append(_draw(pixels[index], frame, _objects_in_frame(spec, frame, contexts)))
     return to_batch(pixels, batch.device), records
 
 
-def _standing(
+def _objects_in_frame(
     spec: ShiftSpec, frame: Frame | SweepFrame, contexts: Mapping[str, SceneContext] | None
 ) -> list[StandingObject]:
     """Return the objects of a severity: those of the scene, else placed along the straight path of this frame."""
@@ -236,10 +239,10 @@ def _standing(
     return [standing_object for standing_object in objects if standing_object.level <= spec.severity]
 
 
-def _draw(picture: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied:
+def _draw(image: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied:
     """Draw objects into an image [H, W, 3], the farthest first, and record the visible ones."""
     camera_pose = camera_to_world(frame)
-    canvas = _Canvas(picture, frame)
+    canvas = _Canvas(image, frame)
     offsets = [np.array(standing_object.place) - camera_pose[:3, 3] for standing_object in objects]
     depths = [float(offset @ camera_pose[:3, 2]) for offset in offsets]
     records = []
@@ -255,7 +258,7 @@ def _draw(picture: U8, frame: Frame, objects: Sequence[StandingObject]) -> Appli
                     "box": box,
                 }
             )
-    coverage = canvas.finish(picture)
+    coverage = canvas.finish(image)
     details = {"objects": records, "covered": coverage, "depth": "boxes" if frame.depth is None else "given"}
     return Applied(bool(records), details)
 
@@ -263,15 +266,15 @@ def _draw(picture: U8, frame: Frame, objects: Sequence[StandingObject]) -> Appli
 class _Canvas:
     """Image under work in linear light, with the coverage of the drawn objects."""
 
-    def __init__(self, picture: U8, frame: Frame) -> None:
+    def __init__(self, image: U8, frame: Frame) -> None:
         self.frame, self.eye = frame, camera_to_world(frame)
         self.inverse = np.linalg.inv(self.eye)
         self.intrinsic = frame.camera.intrinsic
-        self.height, self.width = picture.shape[:2]
-        self.clean = LIGHT[picture]
+        self.height, self.width = image.shape[:2]
+        self.clean = LIGHT[image]
         self.light = self.clean.copy()
-        self.drawn = np.zeros(picture.shape[:2], np.float32)  # share of each pixel that objects cover
-        self.dark = np.zeros(picture.shape[:2], bool)
+        self.coverage = np.zeros(image.shape[:2], np.float32)  # share of each pixel that objects cover
+        self.is_shaded = np.zeros(image.shape[:2], bool)
         self.corners = (frame.boxes.corners() - self.eye[:3, 3]) @ self.eye[:3, :3]  # of the boxes, in the camera
 
     def project(self, local: F64) -> F64:
@@ -298,17 +301,19 @@ class _Canvas:
             return None
         return int(lower[0]), int(lower[1]), int(upper[0]), int(upper[1])
 
-    def add(self, thing: StandingObject) -> list[float] | None:
-        """Draws an object and its shadow; the box x0, y0, x1, y1 around what is seen of it, None for nothing."""
-        model = _model(thing.kind, thing.style, thing.seed, thing.size)
-        pose = upright_pose(thing.place[0], thing.place[1], thing.yaw, thing.place[2])
+    def add(self, standing_object: StandingObject) -> list[float] | None:
+        """Draw an object and its shadow; return the box x0, y0, x1, y1 around its visible part, None without one."""
+        model = _model(standing_object.kind, standing_object.style, standing_object.seed, standing_object.size)
+        pose = upright_pose(
+            standing_object.place[0], standing_object.place[1], standing_object.yaw, standing_object.place[2]
+        )
         to_camera = self.inverse @ pose
         base_offset = np.array([0.0, 0.0, 0.5])
-        corners = ((UNIT_CORNERS + base_offset) * thing.size) @ to_camera[:3, :3].T + to_camera[:3, 3]
+        corners = ((UNIT_CORNERS + base_offset) * standing_object.size) @ to_camera[:3, :3].T + to_camera[:3, 3]
         window = self.window(corners)
         if window is None:
             return None
-        gain = self._gain(thing, to_camera)
+        gain = self._gain(standing_object, to_camera)
         self._shade(model, pose, to_camera)
         x0, y0, x1, y1 = window
         window_width, window_height = x1 - x0, y1 - y0
@@ -318,9 +323,9 @@ class _Canvas:
         intrinsic[1, 2] -= y0
         intrinsic[:2] *= supersampling
         # the object is the origin, so that its texture does not depend on where in the world it stands
-        local_pose = upright_pose(0.0, 0.0, thing.yaw)
+        local_pose = upright_pose(0.0, 0.0, standing_object.yaw)
         camera_pose = self.eye.copy()
-        camera_pose[:3, 3] -= thing.place
+        camera_pose[:3, 3] -= standing_object.place
         view = View(
             Camera(window_width * supersampling, window_height * supersampling, intrinsic),
             camera_pose,
@@ -329,7 +334,7 @@ class _Canvas:
             PLAIN_SENSOR,
         )
         rendering = render(model.stage, [view], scale=1, quality=PLAIN)
-        is_visible = (rendering.tag[0] == 1) & self._free(
+        is_visible = (rendering.tag[0] == 1) & self._visible_mask(
             window, supersampling, rendering.depth[0], float(corners[:, 2].mean())
         )
         if not is_visible.any():
@@ -348,11 +353,11 @@ class _Canvas:
         self.light[window_slice] = self.light[window_slice] * (1.0 - coverage[..., None]) + np.minimum(
             light * gain, coverage[..., None]
         )
-        self.drawn[window_slice] = np.maximum(self.drawn[window_slice], coverage)
+        self.coverage[window_slice] = np.maximum(self.coverage[window_slice], coverage)
         rows, columns = np.flatnonzero(coverage.any(1)), np.flatnonzero(coverage.any(0))
         return [float(x0 + columns[0]), float(y0 + rows[0]), float(x0 + columns[-1] + 1), float(y0 + rows[-1] + 1)]
 
-    def _known(self, x: F64, y: F64) -> F32:
+    def _depth_at(self, x: F64, y: F64) -> F32:
         """Return the depth of the image at pixels x [n] and y [m], as [m, n]; 0 where unknown."""
         depth = self.frame.depth
         if depth is None:
@@ -362,16 +367,21 @@ class _Canvas:
         values: F32 = np.nan_to_num(np.asarray(depth, np.float32)[rows][:, columns], nan=0.0, posinf=np.inf)
         return values
 
-    def _free(self, window: tuple[int, int, int, int], fine: int, depth: F32, away: float) -> Bool:
-        """Whether nothing of the picture is before an object at a depth [h, w], in `fine` samples a pixel."""
+    def _visible_mask(
+        self, window: tuple[int, int, int, int], supersampling: int, depth: F32, object_depth: float
+    ) -> Bool:
+        """Return a mask of the samples at which nothing in the image hides an object at a depth [h, w]."""
         x0, y0, x1, y1 = window
-        x, y = (start + (np.arange((end - start) * fine) + 0.5) / fine for start, end in ((x0, x1), (y0, y1)))
-        image_depth = self._known(x, y)
+        x, y = (
+            start + (np.arange((end - start) * supersampling) + 0.5) / supersampling
+            for start, end in ((x0, x1), (y0, y1))
+        )
+        image_depth = self._depth_at(x, y)
         hidden = np.zeros(depth.shape, np.uint8)
         for corners in self.corners:
-            if corners[:, 2].max() <= NEAREST or corners[:, 2].mean() >= away:
+            if corners[:, 2].max() <= NEAREST or corners[:, 2].mean() >= object_depth:
                 continue
-            pixels = (self.project(corners) - [x0, y0]) * fine
+            pixels = (self.project(corners) - [x0, y0]) * supersampling
             outline = np.clip(cv2.convexHull(pixels.astype(np.float32)), -30_000, 30_000)
             cv2.fillConvexPoly(hidden, np.floor(outline).astype(np.int32), 1)
         return np.asarray(np.where(image_depth > 0, depth < 1.02 * image_depth + 0.3, hidden == 0))
@@ -395,19 +405,19 @@ class _Canvas:
         shadow_cells = ((ground[..., :2] - model.corner) / CELL - 0.5).astype(np.float32)
         shade = cv2.remap(model.shadow, shadow_cells[..., 0], shadow_cells[..., 1], cv2.INTER_LINEAR, borderValue=0.0)
         window_depth = np.where(depth > 0, depth, np.inf).astype(np.float32)
-        is_ground = self._free(window, 1, window_depth, float(local[:, 2].mean()))
-        image_depth = self._known(x, y)
+        is_ground = self._visible_mask(window, 1, window_depth, float(local[:, 2].mean()))
+        image_depth = self._depth_at(x, y)
         is_ground &= (image_depth <= 0) | (
             window_depth > 0.95 * image_depth - 0.3
         )  # what is farther is not the ground below
         window_slice = np.s_[y0:y1, x0:x1]
-        shade = shade * (is_ground & (depth > NEAREST)) * (1.0 - self.drawn[window_slice])
+        shade = shade * (is_ground & (depth > NEAREST)) * (1.0 - self.coverage[window_slice])
         self.light[window_slice] *= (1.0 - shade)[..., None]
-        self.dark[window_slice] |= shade > 0
+        self.is_shaded[window_slice] |= shade > 0
 
-    def _gain(self, thing: StandingObject, to_camera: F64) -> F64:
-        """What a radiance of the renderings is in the picture [3]: the ground around the object is a road."""
-        length, width, _ = thing.size
+    def _gain(self, standing_object: StandingObject, to_camera: F64) -> F64:
+        """Return the gain [3] from rendered radiance to the image, with the ground around the object as a road."""
+        length, width, _ = standing_object.size
         angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
         ring_axes = [(0.5 * length + margin, 0.5 * width + margin) for margin in (0.6, 1.0, 1.5, 2.0)]
         ground = np.concatenate(
@@ -428,11 +438,11 @@ class _Canvas:
         mean_gain = float(ground_light.mean() / _road_light().mean())
         return np.asarray(np.clip(gain, TINT[0] * mean_gain, TINT[1] * mean_gain))
 
-    def finish(self, picture: U8) -> float:
+    def finish(self, image: U8) -> float:
         """Write the changed pixels into the image; returns the share that objects cover."""
-        is_changed = (self.drawn > 0) | self.dark
-        picture[is_changed] = np.rint(to_codes(np.clip(self.light[is_changed], 0.0, 1.0))).astype(np.uint8)
-        return round(float(self.drawn.mean()), 6)
+        is_changed = (self.coverage > 0) | self.is_shaded
+        image[is_changed] = np.rint(to_codes(np.clip(self.light[is_changed], 0.0, 1.0))).astype(np.uint8)
+        return round(float(self.coverage.mean()), 6)
 
 
 # ---------------------------------------------------------------- LiDAR
@@ -448,13 +458,13 @@ def hit_by_rays(
     pose = frame.ego_to_world @ frame.to_ego
     rays = cloud[:, :3].astype(np.float64) @ pose[:3, :3].T
     hit_shares, intensities = np.ones(len(cloud)), cloud[:, 3].copy()
-    for standing_object in _standing(spec, frame, contexts):
+    for standing_object in _objects_in_frame(spec, frame, contexts):
         if np.linalg.norm(np.array(standing_object.place) - pose[:3, 3]) > table.ANOMALY_FARTHEST:
             continue
         rotation = upright_pose(0.0, 0.0, standing_object.yaw)[:3, :3]
         origin = (pose[:3, 3] - standing_object.place) @ rotation
         directions = rays @ rotation
-        candidates = np.flatnonzero(_enters(origin, directions, standing_object.size))
+        candidates = np.flatnonzero(_reaches_box(origin, directions, standing_object.size))
         corners, echo_intensities = _faces(
             standing_object.kind, standing_object.style, standing_object.seed, standing_object.size
         )
@@ -472,38 +482,38 @@ def hit_by_rays(
 
 @lru_cache(maxsize=64)
 def _faces(kind: str, style: str, seed: int, size: tuple[float, float, float]) -> tuple[F64, F32]:
-    """Corners [F, 3, 3] of a coarse body in its own frame, and the intensity [F] of its echoes, 0 to 255."""
+    """Return the corners [F, 3, 3] of a coarse body in its own frame, and the intensity [F] of its echoes, 0 to 255."""
     mesh = make_body(kind, style=style, size=size, generator=generator("anomaly", kind, style, seed), detail=0)
     reflectance = np.array([np.mean(material.colour) for material in mesh.materials], np.float32)
     return mesh.corners(), np.asarray(np.clip(120.0 * reflectance, 2.0, 255.0)[mesh.material], np.float32)
 
 
-def _enters(start: F64, toward: F64, size: tuple[float, float, float]) -> Bool:
-    """Which rays [P, 3] from a place [3] reach a box on the ground before they end."""
+def _reaches_box(origin: F64, directions: F64, size: tuple[float, float, float]) -> Bool:
+    """Return a mask of the rays [P, 3] from a point [3] that reach a box on the ground before they end."""
     half_size = 0.5 * np.array(size)
-    safe_direction = np.where(np.abs(toward) < 1e-9, 1e-9, toward)
+    safe_direction = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
     lower_hits, upper_hits = (
-        (side * half_size + [0.0, 0.0, half_size[2]] - start) / safe_direction for side in (-1.0, 1.0)
+        (side * half_size + [0.0, 0.0, half_size[2]] - origin) / safe_direction for side in (-1.0, 1.0)
     )
     entry, leave = np.minimum(lower_hits, upper_hits).max(1), np.maximum(lower_hits, upper_hits).min(1)
     return np.asarray((entry < leave) & (leave > 0.0) & (entry < 1.0))
 
 
-def _first_hit(start: F64, toward: F64, corners: F64) -> tuple[F64, npt.NDArray[np.intp]]:
-    """How far along each ray [P, 3] it first meets a triangle [F, 3, 3] (2 for never), and which.
+def _first_hit(origin: F64, directions: F64, corners: F64) -> tuple[F64, npt.NDArray[np.intp]]:
+    """Return the share of each ray [P, 3] up to the first triangle [F, 3, 3] that it hits (2: none), and its index.
 
     Source: Moeller and Trumbore 1997.
     """
-    if not len(toward):
+    if not len(directions):
         return np.zeros(0), np.zeros(0, np.intp)
     vertex, edge_1, edge_2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normals = np.cross(toward[:, None], edge_2[None])
+    normals = np.cross(directions[:, None], edge_2[None])
     determinant = np.einsum("pfk,fk->pf", normals, edge_1)
     inverse = 1.0 / np.where(np.abs(determinant) < 1e-12, np.inf, determinant)
-    origin_offset = start - vertex
+    origin_offset = origin - vertex
     u = np.einsum("pfk,fk->pf", normals, origin_offset) * inverse
     offset_cross = np.cross(origin_offset, edge_1)
-    v = (toward @ offset_cross.T) * inverse
+    v = (directions @ offset_cross.T) * inverse
     t = np.einsum("fk,fk->f", edge_2, offset_cross) * inverse
     t = np.where((inverse != 0.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0), t, 2.0)
     face_index = t.argmin(1)

@@ -18,7 +18,7 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.scenarios.static.shifts.sun import add_sun
 from ssad.scenarios.static.shifts.weather import add_fog, add_precipitation
 
-_ENOUGH = 100  # minimum number of sky pixels, of an image sampled in 160 columns
+MIN_SKY_PIXELS = 100  # minimum number of sky pixels, of an image sampled in 160 columns
 
 
 def shift_images(
@@ -49,7 +49,7 @@ def shift_images(
     """
     batch = to_batch(images, device)
     if frames is None:
-        cameras = Camera.typical(batch.seen, batch.height)
+        cameras = Camera.typical(batch.image_width, batch.height)
         frames = [Frame(cameras, sample=str(index)) for index in range(batch.count)]
     elif isinstance(frames, Frame):
         frames = [frames]
@@ -60,36 +60,38 @@ def shift_images(
     # A batch is one sequence of kernel launches, hence of one shift.
     if len({(image_spec.name, image_spec.calibration) for image_spec in specs}) > 1:
         raise ConfigError("a batch has one shift and one calibration; severities and seeds may differ")
-    shifted = [index for index, image_spec in enumerate(specs) if image_spec.severity > 0]
-    if not shifted:
+    shifted_indices = [index for index, image_spec in enumerate(specs) if image_spec.severity > 0]
+    if not shifted_indices:
         return images, [Applied(True, {"severity": 0}) for _ in specs]
-    if len(shifted) < batch.count:
-        return _some(images, batch, frames=list(frames), specs=specs, chosen=shifted, contexts=contexts)
+    if len(shifted_indices) < batch.count:
+        return _shift_some(
+            images, batch, frames=list(frames), specs=specs, shifted_indices=shifted_indices, contexts=contexts
+        )
     result, records = _dispatch(batch, frames, specs, contexts)
     return like_input(result, images), records
 
 
-def _some(
+def _shift_some(
     images: Any,
     batch: Batch,
     *,
     frames: list[Frame],
     specs: list[ShiftSpec],
-    chosen: list[int],
+    shifted_indices: list[int],
     contexts: Mapping[str, SceneContext] | None,
 ) -> tuple[Any, list[Applied]]:
-    """Severity 0 among others: only the others are computed."""
+    """Shift the images of severity 1 or more; those of severity 0 stay unchanged."""
     pixels = batch.numpy().copy()
     shifted_pixels, records = shift_images(
-        pixels[chosen],
-        [frames[index] for index in chosen],
-        [specs[index] for index in chosen],
+        pixels[shifted_indices],
+        [frames[index] for index in shifted_indices],
+        [specs[index] for index in shifted_indices],
         contexts=contexts,
         device=batch.device,
     )
-    pixels[chosen] = shifted_pixels
+    pixels[shifted_indices] = shifted_pixels
     all_records = [Applied(True, {"severity": 0})] * batch.count
-    for index, record in zip(chosen, records, strict=True):
+    for index, record in zip(shifted_indices, records, strict=True):
         all_records[index] = record
     return like_input(to_batch(pixels, batch.device), images), all_records
 
@@ -124,10 +126,10 @@ def _dispatch(
     return (add_fog if name == "fog" else add_precipitation)(batch, frames, specs, image_contexts)
 
 
-def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneContext] | None) -> SceneContext:
+def _context(batch: Batch, index: int, frame: Frame, contexts: Mapping[str, SceneContext] | None) -> SceneContext:
     if contexts is not None and frame.scene in contexts:
         return contexts[frame.scene]
-    return SceneContext(frame.scene, sky_light([batch.picture(b)], [frame.depth]), viewing_direction(frame))
+    return SceneContext(frame.scene, sky_light([batch.picture(index)], [frame.depth]), viewing_direction(frame))
 
 
 def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night: bool = False) -> float:
@@ -153,9 +155,9 @@ def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night:
             columns = np.arange(luminance.shape[1]) * step * depth.shape[1] // image.shape[1]
             sky_pixels.append(luminance[np.isinf(depth[rows][:, columns])])
     known_sky = np.concatenate(sky_pixels) if sky_pixels else np.zeros(0)
-    enough = len(known_sky) >= _ENOUGH
-    sample = known_sky if enough else np.concatenate(brightness)
-    return float(np.clip(np.quantile(sample, 0.5 if night and not enough else 0.97) / 255, 0.06, 1.0))
+    has_sky = len(known_sky) >= MIN_SKY_PIXELS
+    sample = known_sky if has_sky else np.concatenate(brightness)
+    return float(np.clip(np.quantile(sample, 0.5 if night and not has_sky else 0.97) / 255, 0.06, 1.0))
 
 
 def viewing_direction(frame: Frame) -> float:

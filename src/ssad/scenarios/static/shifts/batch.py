@@ -22,14 +22,14 @@ class Batch:
     """B images of `height` x `width`, RGB interleaved, one byte per value, `stride` bytes each.
 
     The width is a multiple of four, so that four pixels are three words; images of another width are padded on the
-    right with their last column, and cropped to `seen` columns at the end.
+    right with their last column, and cropped to `image_width` columns at the end.
     """
 
     data: Any
     count: int
     height: int
     width: int
-    seen: int
+    image_width: int
     device: str
 
     @property
@@ -40,11 +40,11 @@ class Batch:
     def like(self) -> Batch:
         """Return another batch of the same shape with undefined values."""
         buffer = wp.empty(self.count * self.stride, dtype=wp.uint8, device=self.device)
-        return Batch(buffer, self.count, self.height, self.width, self.seen, self.device)
+        return Batch(buffer, self.count, self.height, self.width, self.image_width, self.device)
 
     def copy(self) -> Batch:
         """Return a copy on the same device."""
-        return Batch(wp.clone(self.data), self.count, self.height, self.width, self.seen, self.device)
+        return Batch(wp.clone(self.data), self.count, self.height, self.width, self.image_width, self.device)
 
     def words(self) -> Any:
         """Return the same memory as 32-bit words."""
@@ -56,7 +56,7 @@ class Batch:
     def picture(self, index: int) -> U8:
         """Return one image [H, W, 3] in main memory."""
         pixels = self.data[index * self.stride : (index + 1) * self.stride].numpy()
-        return np.asarray(pixels.reshape(self.height, self.width, 3)[:, : self.seen])
+        return np.asarray(pixels.reshape(self.height, self.width, 3)[:, : self.image_width])
 
     def launch(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], *outputs: Any) -> None:
         """Launch a kernel of `dim` threads on the device of the batch."""
@@ -74,7 +74,7 @@ class Batch:
     def numpy(self) -> U8:
         """Return the images [B, H, W, 3] in main memory."""
         rows = self.data.numpy().reshape(self.count, self.height, self.width, 3)
-        return np.ascontiguousarray(rows[:, :, : self.seen])
+        return np.ascontiguousarray(rows[:, :, : self.image_width])
 
 
 def to_batch(images: Any, device: str | None = None) -> Batch:
@@ -138,21 +138,21 @@ def like_input(batch: Batch, images: Any) -> Any:
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(images, torch.Tensor):
         flat_bytes = wp.to_torch(batch.data).to(images.device)
-        values = flat_bytes.reshape(batch.count, batch.height, batch.width, 3)[:, :, : batch.seen]
+        values = flat_bytes.reshape(batch.count, batch.height, batch.width, 3)[:, :, : batch.image_width]
         if images.is_floating_point():
             return values.permute(0, 3, 1, 2).to(images.dtype) / 255
         return values.reshape(images.shape).clone()
     return batch.numpy().reshape(np.asarray(images).shape)
 
 
-def on(batch: Batch, values: Any, dtype: Any = wp.float32) -> Any:
+def to_device(batch: Batch, values: Any, dtype: Any = wp.float32) -> Any:
     """Copy small parameters to the device of a batch."""
     return wp.array(values, dtype=dtype, device=batch.device)
 
 
 def keys_on(batch: Batch, keys: Sequence[int]) -> Any:
     """Copy 64-bit keys to the device of a batch."""
-    return on(batch, np.asarray(keys, np.uint64), wp.uint64)
+    return to_device(batch, np.asarray(keys, np.uint64), wp.uint64)
 
 
 def file_keys(batch: Batch, specs: Sequence[ShiftSpec], frames: Sequence[Frame], purpose: str) -> Any:
@@ -170,12 +170,13 @@ def check_batch(batch: Batch, frames: Sequence[Frame]) -> None:
         raise ConfigError(f"{batch.count} images, but {len(frames)} frames")
     for frame in frames:
         camera = frame.camera
-        if (camera.height, camera.width) != (batch.height, batch.seen):
+        if (camera.height, camera.width) != (batch.height, batch.image_width):
             raise ConfigError(
-                f"camera {camera.channel} is {camera.width} x {camera.height}, its image {batch.seen} x {batch.height}"
+                f"camera {camera.channel} is {camera.width} x {camera.height}, "
+                f"its image {batch.image_width} x {batch.height}"
             )
 
 
 def structs(batch: Batch, rows: Sequence[tuple[Any, ...]], kind: Any) -> Any:
     """Copy rows of a kernel's struct to the device of a batch."""
-    return on(batch, np.array(rows, dtype=kind.numpy_dtype()), kind)
+    return to_device(batch, np.array(rows, dtype=kind.numpy_dtype()), kind)

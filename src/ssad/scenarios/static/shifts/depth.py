@@ -17,7 +17,7 @@ import warp as wp
 
 from ssad.core.frames import Frame, camera_to_world
 from ssad.core.types import F32
-from ssad.scenarios.static.shifts.batch import Batch, on
+from ssad.scenarios.static.shifts.batch import Batch, to_device
 
 FARTHEST = 1000.0
 _ROAD_WEIGHT, _SKY_WEIGHT = 0.02, 0.002
@@ -39,18 +39,18 @@ def depth_grid(batch: Batch, frames: Sequence[Frame]) -> tuple[Any, list[str]]:
         depth_of(frame, None if pixels is None else pixels[index], rows, columns) for index, frame in enumerate(frames)
     ]
     grids, sources = zip(*results, strict=True)
-    return on(batch, np.stack(grids)), list(sources)
+    return to_device(batch, np.stack(grids)), list(sources)
 
 
 def depth_of(frame: Frame, image: Any, rows: int, columns: int) -> tuple[F32, str]:
     """Return the depth [rows, columns] of a frame, and its source; the image [H, W, 3] fills in missing depth."""
     if frame.depth is not None:
-        return _given(np.asarray(frame.depth, np.float32), rows, columns), "given"
+        return _resample(np.asarray(frame.depth, np.float32), rows, columns), "given"
     source = "assumed" if frame.points is None or not len(frame.points) else "lidar"
     return fill_depth(frame, image, rows, columns), source
 
 
-def _given(depth: F32, rows: int, columns: int) -> F32:
+def _resample(depth: F32, rows: int, columns: int) -> F32:
     """Resample a depth map to the quarter grid and fill in unknown cells (0, NaN)."""
     if depth.shape != (rows, columns):
         row_indices = np.minimum(((np.arange(rows) + 0.5) / rows * depth.shape[0]).astype(int), depth.shape[0] - 1)
@@ -102,7 +102,7 @@ def fill_depth(frame: Frame, image: Any, rows: int, columns: int) -> F32:
     weight[is_sky] = 0.5
     inverse[ray_height > 0] = 0
 
-    _boxes(frame, inverse, weight, (fx, fy, cx, cy))
+    _write_boxes(frame, inverse, weight, (fx, fy, cx, cy))
     points = frame.points
     if points is None or not len(points):
         # upright surfaces without any return: assume houses along a street
@@ -123,17 +123,17 @@ def fill_depth(frame: Frame, image: Any, rows: int, columns: int) -> F32:
         )
         inverse[rows_hit, columns_hit] = 1 / depth
         weight[rows_hit, columns_hit] = 1
-        _upwards(inverse, weight, (rows_hit, columns_hit), small_image, is_sky)
+        _extend_walls(inverse, weight, (rows_hit, columns_hit), small_image, is_sky)
     filled = _guided(luminance, _pull_push(inverse, weight))
     return np.asarray(1 / np.maximum(filled, 1 / FARTHEST), np.float32)
 
 
-def _boxes(frame: Frame, inverse: F32, weight: F32, lens: tuple[float, float, float, float]) -> None:
+def _write_boxes(frame: Frame, inverse: F32, weight: F32, intrinsic: tuple[float, float, float, float]) -> None:
     """Write the depth of annotated boxes into both grids, the nearest last."""
     boxes = frame.boxes
     if not len(boxes):
         return
-    fx, fy, cx, cy = lens
+    fx, fy, cx, cy = intrinsic
     pose = camera_to_world(frame)
     local = (boxes.corners() - pose[:3, 3]) @ pose[:3, :3]
     nearest = local[..., 2].min(1)
@@ -146,7 +146,7 @@ def _boxes(frame: Frame, inverse: F32, weight: F32, lens: tuple[float, float, fl
         cv2.fillConvexPoly(weight, outline, 0.2)
 
 
-def _upwards(inverse: F32, weight: F32, hits: tuple[Any, Any], image: Any, sky: Any) -> None:
+def _extend_walls(inverse: F32, weight: F32, hits: tuple[Any, Any], image: Any, sky: Any) -> None:
     """Extend the topmost return of each column up to the sky, since walls continue above the top beam.
 
     A cell that looks like sky is still wall if its colour matches that of the return below it.
@@ -197,7 +197,7 @@ def _guided(guide: F32, value: F32) -> F32:
 def lens(batch: Batch, frames: Sequence[Frame]) -> Any:
     """Return (fx, fy, cx, cy) of each image, pixels, on the device."""
     intrinsics = [frame.camera.intrinsic for frame in frames]
-    return on(
+    return to_device(
         batch,
         np.array([[intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]] for intrinsic in intrinsics]),
         wp.vec4,

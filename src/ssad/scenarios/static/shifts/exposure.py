@@ -11,7 +11,7 @@ import warp as wp
 from ssad.core.frames import Applied
 from ssad.core.types import U8
 from ssad.rendering.camera.sensor import BRIGHTEST, KNEE, SHOULDER
-from ssad.scenarios.static.shifts.batch import Batch, on
+from ssad.scenarios.static.shifts.batch import Batch, to_device
 from ssad.scenarios.static.shifts.kernels.exposure import recode
 from ssad.scenarios.static.shifts.light import to_codes, to_linear
 from ssad.scenarios.static.shifts.parameters import OVEREXPOSURE
@@ -40,6 +40,6 @@ def overexpose(batch: Batch, specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Ap
     stops = [OVEREXPOSURE[spec.severity - 1] for spec in specs]
     result = batch.like()
     thread_shape, word_count, chunk_size = batch.chunks()
-    tables = on(batch, np.stack([exposure_table(value) for value in stops]), wp.uint8)
+    tables = to_device(batch, np.stack([exposure_table(value) for value in stops]), wp.uint8)
     batch.launch(recode, thread_shape, [batch.words(), tables, word_count, chunk_size], result.words())
     return result, [Applied(True, {"stops": value}) for value in stops]

@@ -54,24 +54,24 @@ def shift_points(
         return hit_by_rays(cloud, frame, spec, contexts)
     draws = spec.generator("lidar", frame.scene, frame.sample)
     if spec.family == "sensor":
-        return _noise(cloud, spec, draws)
+        return _add_noise(cloud, spec, draws)
     if spec.family == "object":
-        return _objects(cloud, frame, spec, draws)
+        return _move_objects(cloud, frame, spec, draws)
     if spec.name == "sunlight":
         context = (contexts or {}).get(frame.scene, SceneContext(frame.scene))
         if spec.calibration == "physical" and context.light < NIGHT:
             return cloud, Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1})
-        return _sun(cloud, frame, spec, context, draws)
+        return _add_sun_noise(cloud, frame, spec, context, draws)
     if spec.name == "fog":
-        return _fog(cloud, spec, draws)
-    return _precipitation(cloud, spec, draws)
+        return _add_fog(cloud, spec, draws)
+    return _add_precipitation(cloud, spec, draws)
 
 
 def _ranges(cloud: F32) -> F64:
     return np.asarray(np.maximum(np.linalg.norm(cloud[:, :3].astype(np.float64), axis=1), 1e-3))
 
 
-def _noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
     """Add range noise (paper: noise of each coordinate); for impulse noise, replace some ranges."""
     count, level_index = len(cloud), spec.severity - 1
     is_paper = spec.calibration == "paper"
@@ -96,13 +96,13 @@ def _noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32
     return cloud, Applied(count > 0, {"level_m": level})
 
 
-def inside(cloud: F32 | F64, matrix: F64, centre: F64) -> Bool:
+def is_inside_box(cloud: F32 | F64, matrix: F64, centre: F64) -> Bool:
     """Return a mask of the points [P] in the box that the matrix [3, 3] makes of the unit cube."""
     local = (cloud[:, :3] - centre) @ np.linalg.inv(matrix).T
     return np.asarray((np.abs(local) <= 0.5).all(1))
 
 
-def _objects(cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _move_objects(cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
     """Move the points in each box with it. Each point belongs to the first box that contains it."""
     boxes = frame.boxes
     if not len(boxes) or not len(cloud):
@@ -123,7 +123,7 @@ def _objects(cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.random.Ge
         nearby = np.flatnonzero(
             is_unassigned & (np.abs(cloud[:, :2] - old_centres[box_index, :2]).max(1) < reach[box_index])
         )
-        object_points = nearby[inside(cloud[nearby], old_maps[box_index], old_centres[box_index])]
+        object_points = nearby[is_inside_box(cloud[nearby], old_maps[box_index], old_centres[box_index])]
         if not len(object_points):
             continue
         is_unassigned[object_points] = False
@@ -153,7 +153,7 @@ def _streak(local: F64, velocity: F64, spec: ShiftSpec, draws: np.random.Generat
     return np.asarray(time_offset[:, None] * velocity, np.float32)
 
 
-def _sun(
+def _add_sun_noise(
     cloud: F32, frame: SweepFrame, spec: ShiftSpec, context: SceneContext, draws: np.random.Generator
 ) -> tuple[F32, Applied]:
     """Remove the points around the sun, where the receiver is blind, and replace some ranges by noise of 2 m."""
@@ -200,7 +200,7 @@ def fog_response(beta: float) -> tuple[F64, F64, F64]:
     return ranges, strongest, ranges[strongest_index]
 
 
-def _fog(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_fog(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
     """Attenuate echoes by exp(-2 beta R); a stronger echo of the fog replaces that of the target."""
     beta = extinction(spec)
     ranges = _ranges(cloud)
@@ -225,7 +225,7 @@ def _detected(intensity: F32, ranges: F64, beta: float) -> Bool:
     return np.asarray(clear_echo * np.exp(-2 * beta * ranges) >= np.minimum(1.0 / FARTHEST**2, 0.5 * clear_echo))
 
 
-def _precipitation(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_precipitation(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
     """Attenuate echoes and replace some by nearby drops or flakes (Goodin et al. 2019)."""
     beta = extinction(spec)
     ranges = _ranges(cloud)

@@ -53,13 +53,15 @@ class ShiftedCamera:
                 for row, agent_view in enumerate(batch)
             ]
             episodes = [simulator.episodes[simulator.assigned[scene]] for scene in scenes]
-            shifted = self._shifted(batch, frames, images, episodes)
+            shifted = self._shift_batch(batch, frames, images, episodes)
             shifted_images[[agent_view.row for agent_view in batch]] = shifted
         return np.moveaxis(shifted_images, -1, 1)
 
-    def _shifted(self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]) -> U8:
+    def _shift_batch(
+        self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
+    ) -> U8:
         """Return the images [N, H, W, 3] under the shift."""
-        self._learn(sights, frames, images, episodes)
+        self._measure_contexts(sights, frames, images, episodes)
         device = self.camera.onboard.device  # images and depths are on the host, but the kernels are fast there
         shifted: U8 = shift_images(images, frames, self.spec, contexts=self._contexts, device=device)[0]
         return shifted
@@ -75,8 +77,10 @@ class ShiftedCamera:
         boxes, ego_velocity = boxes_of(sight, speed) if self._needs_boxes else (TrackedBoxes.empty(), np.zeros(3))
         return Frame(self.camera.camera, key, sample, step * dt, sight.pose, ego_velocity, boxes, depth=depth)
 
-    def _learn(self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]) -> None:
-        """What stays as it is over a drive, from its first picture."""
+    def _measure_contexts(
+        self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
+    ) -> None:
+        """Measure the constants of each drive on its first image."""
         for agent_view, frame, image, episode in zip(sights, frames, images, episodes, strict=True):
             if frame.scene not in self._contexts:
                 heading = float(agent_view.moment.pose[agent_view.agent, 2])
@@ -103,17 +107,19 @@ class OwnShiftedCamera(ShiftedCamera):
         """True: nothing is known of what the shift uses."""
         return True
 
-    def _shifted(self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]) -> U8:
+    def _shift_batch(
+        self, sights: Sequence[Sight], frames: Sequence[Frame], images: U8, episodes: Sequence[Episode]
+    ) -> U8:
         """Return the images [N, H, W, 3] under the shift, each by itself: no result depends on the batch."""
         return np.stack([self.shift(image[None], [frame])[0] for image, frame in zip(images, frames, strict=True)])
 
 
 def boxes_of(sight: Sight, speed: F32) -> tuple[TrackedBoxes, F64]:
-    """Who is there but who looks, as boxes, and the velocity [3] of who looks, m/s.
+    """Return the boxes of all other agents, and the velocity [3] of the observing agent, m/s.
 
     Args:
-        sight: What can be seen.
-        speed: [A] of all agents, m/s.
+        sight: View of the observing agent.
+        speed: Speeds [A] of all agents, m/s.
     """
     pose = sight.moment.pose.astype(np.float64)
     heading_vectors = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2]), np.zeros(len(pose))], 1)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import warp as wp
 
 from ssad.core.frames import Applied, Frame
-from ssad.scenarios.static.shifts.batch import Batch, file_keys, keys_on, on
+from ssad.scenarios.static.shifts.batch import Batch, file_keys, keys_on, to_device
 from ssad.scenarios.static.shifts.kernels import noise as kernels
 from ssad.scenarios.static.shifts.parameters import GAUSSIAN, IMPULSE, STUCK, UNIFORM
 from ssad.scenarios.static.shifts.spec import ShiftSpec
@@ -46,7 +46,7 @@ def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec])
     thread_shape, word_count, chunk_size = batch.chunks()
     keys = file_keys(batch, specs, frames, "noise")
     tables = np.stack([noise_table(spec.name, spec.severity, spec.calibration) for spec in specs])
-    inputs = [batch.words(), keys, on(batch, tables, wp.int16), word_count, chunk_size]
+    inputs = [batch.words(), keys, to_device(batch, tables, wp.int16), word_count, chunk_size]
     batch.launch(kernels.add_noise, thread_shape, inputs, result.words())
     levels = {"gaussian": GAUSSIAN, "uniform": UNIFORM}
     return result, [Applied(True, {"level": levels[image_spec.name][image_spec.severity - 1]}) for image_spec in specs]
@@ -71,7 +71,7 @@ def add_impulses(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
         batch, [spec.key("stuck", frame.camera.channel) for spec, frame in zip(specs, frames, strict=True)]
     )
     rates = [
-        on(batch, [round(share_value * 32768) * 2 for share_value in shares], wp.int32)
+        to_device(batch, [round(share_value * 32768) * 2 for share_value in shares], wp.int32)
         for shares in (fresh_shares, stuck_shares)
     ]
     inputs = [batch.words(), keys, fixed_keys, *rates, word_count, chunk_size]

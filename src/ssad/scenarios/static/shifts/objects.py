@@ -23,31 +23,31 @@ from ssad.core.nuscenes_names import VISIBILITY
 from ssad.core.rotations import quaternion_product, quaternion_to_matrix, yaw_to_quaternion
 from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.batch import Batch, on, structs
+from ssad.scenarios.static.shifts.batch import Batch, structs, to_device
 from ssad.scenarios.static.shifts.depth import lens
 from ssad.scenarios.static.shifts.kernels import objects as kernels
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
-LEAST_VISIBLE = VISIBILITY["2"]  # objects with a lower visibility have too few pixels to move
-LEAST_PIXELS = 6.0
+MIN_VISIBILITY = VISIBILITY["2"]  # objects with a lower visibility have too few pixels to move
+MIN_PIXELS = 6.0
 NEAREST = 0.3  # m before the camera
-LONGEST = 200.0  # px of a streak
+MAX_STREAK = 200.0  # px of a streak
 MARGIN = 8
 
 
 @lru_cache(maxsize=65536)
-def _draw(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[float, ...], ...]:
+def _draw_deformation(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[float, ...], ...]:
     """Draw the deformation [3, 3] of an object in its own axes (x forward, y left, z up), as nested tuples."""
     if spec.severity == 0 or spec.name == "motion_blur":
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    draws = spec.generator("object", *scope)
+    random = spec.generator("object", *scope)
     level = spec.severity - 1
-    sign = draws.choice([-1.0, 1.0], size=4)
-    spread = draws.uniform(-1.0, 1.0, size=4)
+    sign = random.choice([-1.0, 1.0], size=4)
+    spread = random.uniform(-1.0, 1.0, size=4)
     is_paper_lidar = lidar and spec.calibration == "paper"  # the paper's LiDAR has separate figures and draws
     if spec.name == "scale" and is_paper_lidar:
         matrix = np.eye(3)
-        axis = int(draws.integers(3))
+        axis = int(random.integers(3))
         matrix[axis, axis] += sign[0] * table.PAPER_LIDAR_SCALE[level]
     elif spec.name == "scale":
         matrix = np.eye(3) * (1 + sign[0] * table.SCALE[level])
@@ -69,9 +69,9 @@ def _draw(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[f
 def deformations(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False) -> F64:
     """Return the deformation [N, 3, 3] of each object in its own axes; the paper's LiDAR has separate draws."""
     if spec.calibration == "paper":
-        deformation = _draw(spec, ("lidar" if lidar else "sample", sample), lidar)
+        deformation = _draw_deformation(spec, ("lidar" if lidar else "sample", sample), lidar)
         return np.broadcast_to(np.array(deformation), (len(boxes), 3, 3))
-    instance_deformations = [_draw(spec, ("instance", scene, name), lidar) for name in boxes.instance]
+    instance_deformations = [_draw_deformation(spec, ("instance", scene, name), lidar) for name in boxes.instance]
     return np.array(instance_deformations).reshape(-1, 3, 3)
 
 
@@ -159,10 +159,16 @@ class _Plan:
         return offset, len(points)
 
 
-def _pixels(corners: F64, k: F64) -> F64:
-    """Pixels [N, 8, 2] of points in the camera frame [N, 8, 3]."""
+def _pixels(corners: F64, intrinsic: F64) -> F64:
+    """Return the pixels [N, 8, 2] of points in the camera frame [N, 8, 3]."""
     depth = np.maximum(corners[..., 2], 1e-3)
-    return np.stack([k[0, 0] * corners[..., 0] / depth + k[0, 2], k[1, 1] * corners[..., 1] / depth + k[1, 2]], -1)
+    return np.stack(
+        [
+            intrinsic[0, 0] * corners[..., 0] / depth + intrinsic[0, 2],
+            intrinsic[1, 1] * corners[..., 1] / depth + intrinsic[1, 2],
+        ],
+        -1,
+    )
 
 
 def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Applied:
@@ -200,9 +206,9 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
             old_outline, new_outline = _outline(pixels[box_index]), _outline(new_pixels[box_index])
             extent = old_outline.max(0) - old_outline.min(0)
             reason = ""
-            if extent.min() < LEAST_PIXELS or new_outline.shape[0] < 3 or old_outline.shape[0] < 3:
+            if extent.min() < MIN_PIXELS or new_outline.shape[0] < 3 or old_outline.shape[0] < 3:
                 reason = "too small in the image"
-            elif spec.calibration == "physical" and boxes.visible[box_index] < LEAST_VISIBLE:
+            elif spec.calibration == "physical" and boxes.visible[box_index] < MIN_VISIBILITY:
                 reason = "hidden by others"
             elif spec.calibration == "paper" and is_cut[box_index]:
                 reason = "partly outside the image"
@@ -220,7 +226,7 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
                 index,
                 maps=(new_maps[box_index], new_centres[box_index], old_maps[box_index], old_centres[box_index]),
                 outlines=(old_outline, new_outline),
-                place=(rank, bool(reason)),
+                rank_and_skip=(rank, bool(reason)),
                 streak=streaks[box_index],
                 size=(width, height),
             )
@@ -228,14 +234,16 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
     return Applied(painted_count > 0, {"objects": painted_count}, dict(skipped))
 
 
-def _streaks(frame: Frame, spec: ShiftSpec, boxes: TrackedBoxes, centre: F64, turn: F64) -> tuple[F64, list[str]]:
-    """Displacement [N, 2] of each object's centre in the image over the exposure, and why there is none."""
+def _streaks(
+    frame: Frame, spec: ShiftSpec, boxes: TrackedBoxes, centre: F64, world_to_camera: F64
+) -> tuple[F64, list[str]]:
+    """Return the displacement [N, 2] of each object's centre in the image over the exposure, or the reason for none."""
     count = len(boxes)
     streaks, reasons = np.zeros((count, 2)), [""] * count
     if spec.name != "motion_blur" or spec.calibration == "paper":
         return streaks, reasons
     intrinsic = frame.camera.intrinsic
-    relative = (boxes.velocity - frame.ego_velocity) @ turn.T * table.BLUR_EXPOSURE[spec.severity - 1]
+    relative = (boxes.velocity - frame.ego_velocity) @ world_to_camera.T * table.BLUR_EXPOSURE[spec.severity - 1]
     end_points = np.stack([centre - relative / 2, centre + relative / 2], 1)
     end_points[..., 2] = np.maximum(end_points[..., 2], NEAREST)
     displacements = np.diff(_pixels(end_points, intrinsic), axis=1)[:, 0]
@@ -246,7 +254,7 @@ def _streaks(frame: Frame, spec: ShiftSpec, boxes: TrackedBoxes, centre: F64, tu
             reasons[box_index] = "it does not move in the image"
         else:
             streaks[box_index] = displacements[box_index] * min(
-                1.0, LONGEST / float(np.abs(displacements[box_index]).max())
+                1.0, MAX_STREAK / float(np.abs(displacements[box_index]).max())
             )
     return streaks, reasons
 
@@ -257,14 +265,14 @@ def _add_item(
     *,
     maps: tuple[F64, F64, F64, F64],
     outlines: tuple[F64, F64],
-    place: tuple[int, bool],
+    rank_and_skip: tuple[int, bool],
     streak: F64,
     size: tuple[int, int],
 ) -> None:
-    """One row of the kernels' `Item`."""
+    """Add one row of the kernels' `Item`."""
     new_map, new_centre, old_map, old_centre = maps
     old_outline, new_outline = outlines
-    rank, is_skipped = place
+    rank, is_skipped = rank_and_skip
     inverse_map = np.linalg.inv(new_map)
     smaller_outline = (
         old_outline if np.ptp(old_outline, axis=0).prod() < np.ptp(new_outline, axis=0).prod() else new_outline
@@ -311,7 +319,7 @@ def _add_item(
 def _stamp(batch: Batch, plan: _Plan) -> tuple[Any, Any, Any, Any]:
     """Return items, outlines and offsets on the device, and the rank of the box that owns each pixel."""
     items = structs(batch, plan.items, kernels.Item)
-    points, offsets = on(batch, np.concatenate(plan.points), wp.vec2), on(batch, plan.first, wp.int32)
+    points, offsets = to_device(batch, np.concatenate(plan.points), wp.vec2), to_device(batch, plan.first, wp.int32)
     owner_ranks = wp.zeros((batch.count, batch.height, batch.width), dtype=wp.int16, device=batch.device)
     batch.launch(kernels.stamp, (batch.count, batch.height), [items, offsets, points], owner_ranks)
     return items, points, offsets, owner_ranks
@@ -344,7 +352,7 @@ def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
         # One launch per rank, far to near, so that a nearer streak is laid over a farther one.
         for rank in sorted({item_rank for item_rank, _, _ in plan.lines}):
             ranked_lines = [(item, line_count) for item_rank, item, line_count in plan.lines if item_rank == rank]
-            item_indices = on(batch, [item for item, _ in ranked_lines], wp.int32)
+            item_indices = to_device(batch, [item for item, _ in ranked_lines], wp.int32)
             thread_shape = (len(ranked_lines), max(line_count for _, line_count in ranked_lines) * 2)
             batch.launch(
                 kernels.smear, thread_shape, [batch.data, items, item_indices, owner_ranks, batch.stride], result.data

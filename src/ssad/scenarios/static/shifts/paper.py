@@ -17,7 +17,7 @@ import warp as wp
 
 from ssad.core.frames import Applied, Frame
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.batch import Batch, file_keys, on
+from ssad.scenarios.static.shifts.batch import Batch, file_keys, to_device
 from ssad.scenarios.static.shifts.kernels import falling, layers
 from ssad.scenarios.static.shifts.noise import unit_normal
 from ssad.scenarios.static.shifts.objects import owners
@@ -35,11 +35,11 @@ def paper_shift(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
     return implementations[specs[0].name](batch, frames, specs)
 
 
-def _draws(spec: ShiftSpec, frame: Frame) -> np.random.Generator:
+def _frame_generator(spec: ShiftSpec, frame: Frame) -> np.random.Generator:
     return spec.generator("paper", frame.scene, frame.sample, frame.camera.channel)
 
 
-def _places(scale: float) -> int:
+def _samples_per_side(scale: float) -> int:
     """Return the samples along a side of each pixel for the mean of a layer; a smaller image averages more."""
     return max(1, round(1 / scale))
 
@@ -51,7 +51,7 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     mean, deviation, zoom, threshold, radius, sigma, kept_share = zip(*parameters, strict=True)
     angles_deg = np.array(
         [
-            _draws(image_spec, image_frame).uniform(-135, -45)
+            _frame_generator(image_spec, image_frame).uniform(-135, -45)
             for image_spec, image_frame in zip(specs, frames, strict=True)
         ]
     )
@@ -65,14 +65,21 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     noise_shape = (batch.count, *np.max(shapes, axis=0).tolist())
     noise = wp.empty(noise_shape, dtype=float, device=batch.device)
     keys = file_keys(batch, specs, frames, "paper")
-    inputs = [keys, on(batch, mean), on(batch, deviation), on(batch, unit_normal())]
+    inputs = [keys, to_device(batch, mean), to_device(batch, deviation), to_device(batch, unit_normal())]
     batch.launch(falling.specks, noise_shape[:2], inputs, noise)
     # flakes fall steeply, so half the rows are enough
     half_shape = (batch.count, -(-batch.height // 2))
     flake_layer, streak_layer = (
         wp.empty((*half_shape, batch.width), dtype=float, device=batch.device) for _ in range(2)
     )
-    inputs = [noise, on(batch, cell_steps, wp.vec2), on(batch, threshold), scale, _places(scale), batch.height]
+    inputs = [
+        noise,
+        to_device(batch, cell_steps, wp.vec2),
+        to_device(batch, threshold),
+        scale,
+        _samples_per_side(scale),
+        batch.height,
+    ]
     batch.launch(falling.flakes, half_shape, inputs, flake_layer)
     # half a gaussian over 2 radius + 1 published pixels, as far as it is not negligible
     offsets, weights = [], []
@@ -92,8 +99,8 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         )
     inputs = [
         flake_layer.flatten(),
-        on(batch, offset_table, wp.vec2i),
-        on(batch, weight_table),
+        to_device(batch, offset_table, wp.vec2i),
+        to_device(batch, weight_table),
         half_shape[1],
         batch.width,
     ]
@@ -103,7 +110,7 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     inputs = [
         batch.words(),
         streak_layer.flatten(),
-        on(batch, kept_share),
+        to_device(batch, kept_share),
         table.PAPER_GREY,
         batch.height,
         batch.width,
@@ -124,7 +131,7 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     gate_maps = np.empty((batch.count, GATE, 2 * GATE), np.float32)
     density, streak_lengths, streak_rows, gate_coordinates, layer_coordinates, first_rows = [], [], [], [], [], []
     for index, (spec, frame) in enumerate(zip(specs, frames, strict=True)):
-        draws = _draws(spec, frame)
+        draws = _frame_generator(spec, frame)
         density.append(draws.uniform(*table.PAPER_RAIN[spec.severity - 1]))
         cells_per_pixel = 1.0 - draws.uniform(0.4, 0.6)  # cells a published pixel
         angle = draws.uniform(-15, 15)
@@ -145,24 +152,29 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         gate_coordinates.append([gate_columns, slope * gate_columns, -left_columns * gate_columns, gate_rows])
         layer_coordinates.append([cells_per_pixel / scale, -slope, left_columns])
         first_rows.append(row_count)
-    inputs = [file_keys(batch, specs, frames, "paper"), on(batch, density)]
+    inputs = [file_keys(batch, specs, frames, "paper"), to_device(batch, density)]
     max_cells = 0.6 / scale
     row_count, column_count = int(batch.height * max_cells) + 3 + max(streak_rows), int(batch.width * max_cells) + 4
     layer_shape = (batch.count, row_count, column_count + int(np.ceil(row_count * np.tan(np.radians(15)))))
     drop_layer, rain_layer = (wp.empty(layer_shape, dtype=float, device=batch.device) for _ in range(2))
-    inputs += [on(batch, gate_coordinates, wp.vec4), on(batch, first_rows), on(batch, gate_maps)]
+    inputs += [to_device(batch, gate_coordinates, wp.vec4), to_device(batch, first_rows), to_device(batch, gate_maps)]
     batch.launch(falling.drops, layer_shape[:2], inputs, drop_layer)
     running_sums = [wp.zeros((batch.count, layer_shape[2]), dtype=float, device=batch.device) for _ in range(2)]
     # the source enlarges with cubic splines and cuts off negative values, which adds light (measured)
     gains = [1.28 - 0.95 * density_value + 0.9 * density_value**2 for density_value in density]
     # columns per thread: neighbours in memory on the CPU, as many threads as possible on a GPU
     block_width = 64 if batch.device == "cpu" else 1
-    inputs = [drop_layer, on(batch, streak_rows, wp.int32), on(batch, gains), block_width, *running_sums]
+    inputs = [drop_layer, to_device(batch, streak_rows, wp.int32), to_device(batch, gains), block_width, *running_sums]
     thread_shape = (batch.count, -(-layer_shape[2] // block_width))
     batch.launch(falling.fall, thread_shape, inputs, rain_layer)
     thread_shape = (batch.count, batch.height)
     opacity = wp.empty((*thread_shape, batch.width), dtype=wp.uint8, device=batch.device)
-    inputs = [rain_layer, on(batch, layer_coordinates, wp.vec3), on(batch, first_rows), _places(scale)]
+    inputs = [
+        rain_layer,
+        to_device(batch, layer_coordinates, wp.vec3),
+        to_device(batch, first_rows),
+        _samples_per_side(scale),
+    ]
     batch.launch(falling.curtain, thread_shape, inputs, opacity)
     result, highest = batch.like(), wp.empty(thread_shape, dtype=int, device=batch.device)
     size = batch.count * batch.stride // 12
@@ -178,12 +190,14 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     ]
 
 
-def _darken(out: Batch, highest: Any) -> None:
-    """The brightest value becomes 0.7 of 256, the others in proportion, in place."""
+def _darken(batch: Batch, highest: Any) -> None:
+    """Scale the values in place so that the brightest becomes 0.7 of 256."""
     brightest = np.maximum(highest.numpy().max(1), 1)
     gains = np.rint(table.PAPER_DARK * 256 / brightest * 256).astype(np.int32)
-    thread_shape, word_count, chunk_size = out.chunks()
-    out.launch(falling.darken, thread_shape, [on(out, gains, wp.int32), word_count, chunk_size], out.words())
+    thread_shape, word_count, chunk_size = batch.chunks()
+    batch.launch(
+        falling.darken, thread_shape, [to_device(batch, gains, wp.int32), word_count, chunk_size], batch.words()
+    )
 
 
 def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
@@ -193,7 +207,7 @@ def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
     cloud_side = CLOUDS // 4
     level_count = cloud_side.bit_length() - 1
     # the source squares its amplitude: an octave is 1 / decay ** 2 of the one before
-    amplitudes = on(
+    amplitudes = to_device(
         batch, [[float(decay_value) ** (-2 * level) for level in range(level_count)] for decay_value in decays]
     )
     clouds = wp.zeros((batch.count, cloud_side, cloud_side), dtype=float, device=batch.device)
@@ -211,8 +225,8 @@ def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
     batch.launch(layers.brightest, thread_shape, inputs, highest)
     brightest = highest.numpy().max(1) / 255
     result = batch.like()
-    numbers = [on(batch, values) for values in (lowest, span, amounts, brightest, grey_shares)]
-    inputs = [batch.data, clouds, *numbers, WIDTH / batch.width / 4, batch.width, batch.stride]
+    cloud_parameters = [to_device(batch, values) for values in (lowest, span, amounts, brightest, grey_shares)]
+    inputs = [batch.data, clouds, *cloud_parameters, WIDTH / batch.width / 4, batch.width, batch.stride]
     batch.launch(layers.blend_clouds, thread_shape, inputs, result.data)
     return result, [
         Applied(True, {"amount": float(amount_value), "decay": float(decay_value)})
@@ -225,7 +239,7 @@ def _sun(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
     scale = batch.width / WIDTH
     suns, flares, colours, strengths, records = [], [], [], [], []
     for spec, frame in zip(specs, frames, strict=True):
-        draws = _draws(spec, frame)
+        draws = _frame_generator(spec, frame)
         x, y = draws.uniform(0.25, 0.75) * batch.width, draws.uniform(0.30, 0.45) * batch.height
         x_offset = batch.width / 2 - x
         slope = (batch.height / 2 - y) / (x_offset if abs(x_offset) > 1e-6 else 1e-6)
@@ -243,8 +257,8 @@ def _sun(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
         suns.append([x, y, table.PAPER_SUN[spec.severity - 1] * scale])
         records.append(Applied(True, {"x": round(float(x)), "y": round(float(y)), "radius_px": float(suns[-1][2])}))
     result = batch.copy()
-    disc_parameters = [on(batch, values, wp.vec3) for values in (suns, flares, colours)]
-    inputs = [batch.data, *disc_parameters, on(batch, strengths), batch.width, batch.stride]
+    disc_parameters = [to_device(batch, values, wp.vec3) for values in (suns, flares, colours)]
+    inputs = [batch.data, *disc_parameters, to_device(batch, strengths), batch.width, batch.stride]
     thread_shape = (batch.count, batch.height)
     batch.launch(layers.blend_sun, thread_shape, inputs, result.data)
     return result, records
@@ -263,6 +277,6 @@ def _blur(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     result = batch.copy()
     thread_shape = (batch.count, batch.height)
     for kernel, values, dtype in ((layers.smear_rows, lengths, wp.int32), (layers.zoom_blur, zooms, wp.float32)):
-        inputs = [batch.data, owner, on(batch, values, dtype), batch.stride]
+        inputs = [batch.data, owner, to_device(batch, values, dtype), batch.stride]
         batch.launch(kernel, thread_shape, inputs, result.data)
     return result, records

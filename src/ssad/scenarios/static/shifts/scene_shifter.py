@@ -29,24 +29,31 @@ from ssad.scenarios.static.shifts import (
     sky_light,
     transformed_boxes,
 )
-from ssad.scenarios.static.shifts.sun import choose_sun, free_sun, sun_angle, sun_depth, sun_direction, sun_in_picture
+from ssad.scenarios.static.shifts.sun import (
+    choose_sun,
+    sun_angle,
+    sun_depth,
+    sun_direction,
+    sun_in_image,
+    visible_sun_share,
+)
 
 
-def boxes_of(found: Annotations) -> tuple[TrackedBoxes, npt.NDArray[np.intp]]:
-    """Annotations as boxes, and their rows [N]; an unknown visibility counts as visible.
+def boxes_of(annotations: Annotations) -> tuple[TrackedBoxes, npt.NDArray[np.intp]]:
+    """Return annotations as boxes, and their rows [N]; an unknown visibility counts as visible.
 
     Boxes without a volume are left out: no shift of an object can be made of them.
     """
-    rows = np.flatnonzero((found.size_lwh > 0).all(axis=1))
-    solid_annotations = found.take(rows)
-    visible = np.array([VISIBILITY.get(token, 1.0) for token in solid_annotations.visibility])
+    rows = np.flatnonzero((annotations.size_lwh > 0).all(axis=1))
+    solid_annotations = annotations.take(rows)
+    visibility = np.array([VISIBILITY.get(token, 1.0) for token in solid_annotations.visibility])
     return TrackedBoxes(
         solid_annotations.centre,
         solid_annotations.size_lwh,
         solid_annotations.rotation,
         solid_annotations.velocity,
         solid_annotations.instance,
-        visible,
+        visibility,
     ), rows
 
 
@@ -82,10 +89,10 @@ class SceneShifter:
     @property
     def context(self) -> SceneContext:
         """Brightness of the sky, heading of the ego and place of the sun, from the first readable sample."""
-        return self._opening[1]
+        return self._measured_context[1]
 
     @cached_property
-    def _opening(self) -> tuple[str, SceneContext]:
+    def _measured_context(self) -> tuple[str, SceneContext]:
         """Context, and the token of the sample that it was measured on ("" if none can be read)."""
         start = self.scene.frames[0].timestamp_us / 1e6 if self.scene.frames else 0.0
         token = self.scene.record.token
@@ -121,10 +128,10 @@ class SceneShifter:
         """
         basis_fields = {}
         if self.base.family == "environment":
-            basis_fields["context"] = self._opening[0]
+            basis_fields["context"] = self._measured_context[0]
         if frame.modality == "camera" and self._uses_depth and self._sweeps:
-            sweep = self._nearest(frame)
-            basis_fields["sweep"] = sweep.filename if self._read(sweep) is not None else ""
+            sweep = self._nearest_sweep(frame)
+            basis_fields["sweep"] = sweep.filename if self._read_sweep(sweep) is not None else ""
         if frame.modality == "camera" and self._has_sun:
             basis_fields["sun"] = self._sun(frame.sample_token)[0]
         return basis_fields
@@ -133,7 +140,7 @@ class SceneShifter:
         """Return True if a frame made on this basis would now have a better one."""
         sample_order = {sample.token: index for index, sample in enumerate(self.scene.samples)}
         used_index = sample_order.get(str(basis["context"]), len(sample_order)) if "context" in basis else 0
-        if used_index and sample_order.get(self._opening[0], len(sample_order)) < used_index:
+        if used_index and sample_order.get(self._measured_context[0], len(sample_order)) < used_index:
             return True
         current_basis = self.basis(frame)
         return any(basis.get(name) == "" and current_basis.get(name) != "" for name in ("sweep", "sun"))
@@ -168,11 +175,11 @@ class SceneShifter:
         """True if images take depth from the LiDAR."""
         return self.base.calibration == "physical" and self.base.name in ("fog", "rain", "snow", "sunlight")
 
-    def _nearest(self, frame: SensorFrame) -> SensorFrame:
+    def _nearest_sweep(self, frame: SensorFrame) -> SensorFrame:
         """Return the nearest sweep in time."""
         return self._sweeps[int(np.abs(self._sweep_times - frame.timestamp_us).argmin())]
 
-    def _read(self, sweep: SensorFrame) -> F32 | None:
+    def _read_sweep(self, sweep: SensorFrame) -> F32 | None:
         """Return the points of a sweep; None if they cannot be read."""
         try:
             return self.cloud(sweep)
@@ -183,8 +190,8 @@ class SceneShifter:
         """Return the nearest sweep in the frame of a camera; None without LiDAR or if it cannot be read."""
         if not self._sweeps:
             return None
-        sweep = self._nearest(frame)
-        cloud = self._read(sweep)
+        sweep = self._nearest_sweep(frame)
+        cloud = self._read_sweep(sweep)
         if cloud is None:
             return None
         to_camera = np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego) @ sweep.ego_to_world @ sweep.sensor_to_ego
@@ -248,14 +255,14 @@ class SceneShifter:
                 for frame in self._cameras(sample_token)
                 if _has_lens(frame)
             ]
-            views = [(frame, view) for frame, view in views if sun_in_picture(view, sun_vector)]
+            views = [(frame, view) for frame, view in views if sun_in_image(view, sun_vector)]
             self._suns[sample_token] = "", None
             for frame, bare_view in sorted(views, key=lambda pair: sun_angle(pair[1], sun_vector)):
                 try:
                     depth = sun_depth(self._view(frame), self.read(frame))
                 except FormatError:
                     continue
-                self._suns[sample_token] = frame.filename, free_sun(bare_view, depth, sun_vector)
+                self._suns[sample_token] = frame.filename, visible_sun_share(bare_view, depth, sun_vector)
                 break
         return self._suns[sample_token]
 
@@ -371,7 +378,7 @@ class SceneShifter:
         return next((frame for frame in self._sweeps if frame.key_frame and frame.sample_token == sample_token), None)
 
     def labels(self, sample_token: str, *, lidar: bool | None = True) -> Annotations:
-        """The boxes of a sample after the shift, with the number of points in each.
+        """Return the boxes of a sample after the shift, with the number of points in each.
 
         Severity 0 changes nothing, counts included.
 
@@ -393,7 +400,7 @@ class SceneShifter:
         centre[rows], size[rows], rotation[rows] = boxes.centre, boxes.size_lwh, boxes.rotation
         point_counts, sweep = original.lidar_points.copy(), self.key_sweep(sample_token)
         if sweep is not None and lidar is not None:
-            point_counts[rows] = _count(self.points(sweep)[0] if lidar else self.cloud(sweep), sweep, boxes)
+            point_counts[rows] = _count_points(self.points(sweep)[0] if lidar else self.cloud(sweep), sweep, boxes)
         return replace(original, centre=centre, size_lwh=size, rotation=rotation, lidar_points=point_counts)
 
 
@@ -401,13 +408,15 @@ def _has_lens(frame: SensorFrame) -> bool:
     return frame.intrinsic is not None and min(frame.intrinsic[0, 0], frame.intrinsic[1, 1]) > 0
 
 
-def _count(cloud: F32, sweep: SensorFrame, boxes: TrackedBoxes) -> npt.NDArray[np.int32]:
+def _count_points(cloud: F32, sweep: SensorFrame, boxes: TrackedBoxes) -> npt.NDArray[np.int32]:
     """Count the points in each box."""
-    from ssad.scenarios.static.shifts.lidar import inside
+    from ssad.scenarios.static.shifts.lidar import is_inside_box
     from ssad.scenarios.static.shifts.objects import affine
 
     pose = sweep.ego_to_world @ sweep.sensor_to_ego
     world_points = np.asarray(cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3])
     matrix, centre = affine(boxes)
-    counts = [int(inside(world_points, matrix[box_index], centre[box_index]).sum()) for box_index in range(len(boxes))]
+    counts = [
+        int(is_inside_box(world_points, matrix[box_index], centre[box_index]).sum()) for box_index in range(len(boxes))
+    ]
     return np.array(counts, np.int32)

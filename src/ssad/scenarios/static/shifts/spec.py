@@ -89,11 +89,11 @@ class ShiftSpec:
         return replace(self, severity=severity)
 
     def key(self, *scope: object) -> int:
-        """64 bits for what the random numbers are for, such as ("air", scene)."""
+        """Return a key of 64 bits for a purpose of random numbers, such as ("air", scene)."""
         return int(digest("shift", VERSIONS[self.calibration], self.name, self.calibration, self.seed, *scope)[:16], 16)
 
     def generator(self, *scope: object) -> np.random.Generator:
-        """A generator for what the random numbers are for."""
+        """Return the generator for a purpose of random numbers."""
         return generator("shift", VERSIONS[self.calibration], self.name, self.calibration, self.seed, *scope)
 
 

@@ -12,7 +12,7 @@ import warp as wp
 from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
 from ssad.core.types import F32, F64, U8
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.batch import Batch, on
+from ssad.scenarios.static.shifts.batch import Batch, to_device
 from ssad.scenarios.static.shifts.depth import depth_of, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import veil
 from ssad.scenarios.static.shifts.spec import ShiftSpec
@@ -33,7 +33,7 @@ def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
 
 
 def choose_sun(
-    spec: ShiftSpec, context: SceneContext, pictures: Sequence[tuple[Frame, U8]]
+    spec: ShiftSpec, context: SceneContext, camera_images: Sequence[tuple[Frame, U8]]
 ) -> tuple[float, float, float]:
     """Return a sun that is visible in one of the images of a moment.
 
@@ -42,7 +42,7 @@ def choose_sun(
     Args:
         spec: The shift.
         context: The scene.
-        pictures: Frame and image [H, W, 3] of each camera.
+        camera_images: Frame and image [H, W, 3] of each camera.
 
     Returns:
         Unit vector, world: the first direction in which the sun is visible; the first of all if it is always hidden.
@@ -51,12 +51,12 @@ def choose_sun(
     depths: dict[int, F32 | None] = {}
     for candidate in candidates:
         direction = np.array(candidate)
-        for camera_index, (frame, image) in enumerate(pictures):
-            if sun_in_picture(frame, direction):
+        for camera_index, (frame, image) in enumerate(camera_images):
+            if sun_in_image(frame, direction):
                 # Depth is costly, so it is computed once, and only for cameras that a candidate falls into.
                 if camera_index not in depths:
                     depths[camera_index] = sun_depth(frame, image)
-                if free_sun(frame, depths[camera_index], direction) > 0.5:
+                if visible_sun_share(frame, depths[camera_index], direction) > 0.5:
                     return candidate
     return candidates[0]
 
@@ -71,25 +71,25 @@ def _draws(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, floa
         yield float(direction[0]), float(direction[1]), float(direction[2])
 
 
-def sun_angle(frame: Frame, toward: F64) -> float:
-    """Angle between a direction [3] in the world and the optical axis, degrees."""
-    cosine = camera_to_world(frame)[:3, 2] @ toward
+def sun_angle(frame: Frame, direction: F64) -> float:
+    """Return the angle between a direction [3] in the world and the optical axis, degrees."""
+    cosine = camera_to_world(frame)[:3, 2] @ direction
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def _place(frame: Frame, toward: F64) -> tuple[float, float]:
-    """Pixel x, y of a direction [3] in the world that lies in front of the camera."""
-    local, intrinsic = camera_to_world(frame)[:3, :3].T @ toward, frame.camera.intrinsic
+def _sun_pixel(frame: Frame, direction: F64) -> tuple[float, float]:
+    """Return the pixel x, y of a direction [3] in the world that lies in front of the camera."""
+    local, intrinsic = camera_to_world(frame)[:3, :3].T @ direction, frame.camera.intrinsic
     return float(intrinsic[0, 0] * local[0] / local[2] + intrinsic[0, 2]), float(
         intrinsic[1, 1] * local[1] / local[2] + intrinsic[1, 2]
     )
 
 
-def sun_in_picture(frame: Frame, toward: F64) -> bool:
-    """Whether the sun stands within the borders of the picture, whatever is before it."""
-    if sun_angle(frame, toward) > FACING:
+def sun_in_image(frame: Frame, direction: F64) -> bool:
+    """Return True if the sun stands within the borders of the image, hidden or not."""
+    if sun_angle(frame, direction) > FACING:
         return False
-    x, y = _place(frame, toward)
+    x, y = _sun_pixel(frame, direction)
     return 0 <= x < frame.camera.width and 0 <= y < frame.camera.height
 
 
@@ -100,20 +100,20 @@ def sun_depth(frame: Frame, image: U8) -> F32 | None:
     return None if source == "assumed" else grid
 
 
-def free_sun(frame: Frame, depth: F32 | None, toward: F64) -> float:
-    """Share of the sun's disc that is visible in a picture that contains it.
+def visible_sun_share(frame: Frame, depth: F32 | None, direction: F64) -> float:
+    """Return the visible share of the sun's disc in an image that contains it.
 
     Args:
-        frame: The picture's frame.
+        frame: Frame of the image.
         depth: From `sun_depth`.
-        toward: Unit vector towards the sun [3], world.
+        direction: Unit vector towards the sun [3], world.
 
     Returns:
         Share in [0, 1]; 1 if `depth` is None.
     """
     if depth is None:
         return 1.0
-    x, y = _place(frame, toward)
+    x, y = _sun_pixel(frame, direction)
     row, column, radius = int(y / 4), int(x / 4), max(2, depth.shape[1] // 65)
     neighbourhood = depth[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1]
     return float((neighbourhood > SKY).mean())
@@ -140,11 +140,13 @@ def add_sun(
                 Applied(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1})
             )
             continue
-        x, y = _place(frame, direction)
+        x, y = _sun_pixel(frame, direction)
         sun_pixels[index] = x, y, 1
-        in_image, visible_share = sun_in_picture(frame, direction), frame.sun
+        in_image, visible_share = sun_in_image(frame, direction), frame.sun
         if visible_share is None:
-            visible_share = free_sun(frame, sun_depth(frame, batch.picture(index)), direction) if in_image else 1.0
+            visible_share = (
+                visible_sun_share(frame, sun_depth(frame, batch.picture(index)), direction) if in_image else 1.0
+            )
         details: dict[str, Any] = {"angle_deg": round(angle, 1), "in_view": in_image, "free": round(visible_share, 2)}
         details["direction"] = [round(float(coordinate), 6) for coordinate in direction]
         if not visible_share:
@@ -161,10 +163,16 @@ def add_sun(
         float(image_spec.generator("star", image_frame.camera.channel).uniform(0, 1))
         for image_spec, image_frame in zip(specs, frames, strict=True)
     ]
-    camera_inputs = [on(batch, local_directions, wp.vec3), on(batch, sun_pixels, wp.vec3), lens(batch, frames)]
-    batch.launch(veil.glare, (batch.count, rows), [*camera_inputs, on(batch, strength), on(batch, rays)], glare)
+    camera_inputs = [
+        to_device(batch, local_directions, wp.vec3),
+        to_device(batch, sun_pixels, wp.vec3),
+        lens(batch, frames),
+    ]
+    batch.launch(
+        veil.glare, (batch.count, rows), [*camera_inputs, to_device(batch, strength), to_device(batch, rays)], glare
+    )
     result = batch.like()
-    tint = on(batch, np.tile([1.0, 0.97, 0.9], (batch.count, 1)), wp.vec3)
-    inputs = [batch.words(), glare, tint, on(batch, gain), batch.width, batch.stride // 4]
+    tint = to_device(batch, np.tile([1.0, 0.97, 0.9], (batch.count, 1)), wp.vec3)
+    inputs = [batch.words(), glare, tint, to_device(batch, gain), batch.width, batch.stride // 4]
     batch.launch(veil.blend_glare, (batch.count, batch.height), inputs, result.words())
     return result, records

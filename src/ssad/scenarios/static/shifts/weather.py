@@ -16,7 +16,7 @@ import warp as wp
 from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
 from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.batch import Batch, keys_on, on, structs
+from ssad.scenarios.static.shifts.batch import Batch, keys_on, structs, to_device
 from ssad.scenarios.static.shifts.depth import FARTHEST, depth_grid, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import particles, veil
 from ssad.scenarios.static.shifts.light import tables, to_linear
@@ -33,7 +33,7 @@ _CELLS = 16  # pixels per node of the fog's patchiness
 
 
 @dataclass(frozen=True, slots=True)
-class Weather:
+class WeatherDraw:
     """Random weather of a scene: wind [3] m/s (world), colour of the air [3] in 0..1 relative to the sky's light."""
 
     wind: F64
@@ -41,17 +41,17 @@ class Weather:
     patches: float
 
 
-def scene_weather(spec: ShiftSpec, scene: str) -> Weather:
+def scene_weather(spec: ShiftSpec, scene: str) -> WeatherDraw:
     """Return the weather of a scene."""
     draws = spec.generator("weather", scene)
     heading = draws.uniform(-np.pi, np.pi)
     speed = draws.uniform(0.5, 4.0) if spec.name != "snow" else draws.uniform(0.2, 2.5)
     warmth = draws.uniform(-0.02, 0.02)
     wind = np.array([np.cos(heading) * speed, np.sin(heading) * speed, 0.0])
-    return Weather(wind, np.array([0.97 + warmth, 0.98, 1.0 - warmth]), float(draws.uniform(0.25, 0.5)))
+    return WeatherDraw(wind, np.array([0.97 + warmth, 0.98, 1.0 - warmth]), float(draws.uniform(0.25, 0.5)))
 
 
-def _ages(frames: Sequence[Frame], contexts: Sequence[SceneContext]) -> list[float]:
+def _scene_times(frames: Sequence[Frame], contexts: Sequence[SceneContext]) -> list[float]:
     """Return the seconds since the start of the scene."""
     return [(frame.time - context.start) % _CLOCK for frame, context in zip(frames, contexts, strict=True)]
 
@@ -69,9 +69,9 @@ def extinction(spec: ShiftSpec) -> float:
     return table.snow_extinction(table.SNOW_RATE[level])
 
 
-def _clear(
+def _view_through_air(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[list[Weather], Any, Any, list[str]]:
+) -> tuple[list[WeatherDraw], Any, Any, list[str]]:
     """Return weathers, transmittance and depth [B, h, w] on the quarter grid, and the sources of depth."""
     weathers = [scene_weather(spec, frame.scene) for spec, frame in zip(specs, frames, strict=True)]
     rows, columns = grid_size(batch)
@@ -79,16 +79,18 @@ def _clear(
     coarse_shape = (batch.count, -(-batch.height // _CELLS), -(-batch.width // _CELLS))
     density = wp.empty(coarse_shape, dtype=float, device=batch.device)
     keys = keys_on(batch, [spec.key("air", frame.scene) for spec, frame in zip(specs, frames, strict=True)])
-    poses = on(batch, np.stack([camera_to_world(frame) for frame in frames]), wp.mat44)
+    poses = to_device(batch, np.stack([camera_to_world(frame) for frame in frames]), wp.mat44)
     lenses = lens(batch, frames)
-    drift = np.stack([weather.wind * age for weather, age in zip(weathers, _ages(frames, contexts), strict=True)])
-    patches = on(
+    drift = np.stack(
+        [weather.wind * age for weather, age in zip(weathers, _scene_times(frames, contexts), strict=True)]
+    )
+    patches = to_device(
         batch, [weather.patches if spec.name == "fog" else 0.0 for weather, spec in zip(weathers, specs, strict=True)]
     )
-    inputs = [keys, poses, lenses, depth, on(batch, drift, wp.vec3), patches, float(_CELLS)]
+    inputs = [keys, poses, lenses, depth, to_device(batch, drift, wp.vec3), patches, float(_CELLS)]
     batch.launch(veil.patchiness, coarse_shape, inputs, density)
     transmittance = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
-    inputs = [depth, lenses, density, on(batch, [extinction(spec) for spec in specs]), FARTHEST]
+    inputs = [depth, lenses, density, to_device(batch, [extinction(spec) for spec in specs]), FARTHEST]
     batch.launch(veil.transmittance, (batch.count, rows), inputs, transmittance)
     return weathers, transmittance, depth, sources
 
@@ -100,7 +102,7 @@ def add_fog(
 
     image * exp(-beta * range) + airlight * (1 - exp(-beta * range))
     """
-    weathers, transmittance, _, sources = _clear(batch, frames, specs, contexts)
+    weathers, transmittance, _, sources = _view_through_air(batch, frames, specs, contexts)
     airlight = np.stack(
         [to_linear(weather.colour * context.light * 245) for weather, context in zip(weathers, contexts, strict=True)]
     )
@@ -108,7 +110,7 @@ def add_fog(
     inputs = [
         batch.words(),
         transmittance,
-        on(batch, airlight, wp.vec3),
+        to_device(batch, airlight, wp.vec3),
         *tables(batch.device),
         batch.width,
         batch.stride // 4,
@@ -121,7 +123,7 @@ def add_fog(
     return result, records
 
 
-def _air(spec: ShiftSpec, frame: Frame, weather: Weather) -> tuple[Any, ...]:
+def _air_row(spec: ShiftSpec, frame: Frame, weather: WeatherDraw) -> tuple[Any, ...]:
     """Return the parameters of the particles, as a row of the kernel's `Air`."""
     is_snow = spec.name == "snow"
     tile, min_diameter, max_diameter = (
@@ -149,7 +151,7 @@ def _air(spec: ShiftSpec, frame: Frame, weather: Weather) -> tuple[Any, ...]:
     )
 
 
-def _count(spec: ShiftSpec) -> int:
+def _lens_drop_count(spec: ShiftSpec) -> int:
     """Return the number of drops on the lens."""
     return table.LENS_DROPS[spec.severity - 1] if spec.name == "rain" else 0
 
@@ -166,7 +168,7 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
         centres = draws.uniform(0, 1, (max_drops, 2)) * [batch.width, batch.height]
         radius = np.minimum(np.exp(draws.normal(2.3, 0.55, max_drops)), 40) * batch.width / 1600
         aspect = draws.uniform(1.0, 1.4, max_drops)
-        for drop_index in range(_count(spec)):
+        for drop_index in range(_lens_drop_count(spec)):
             lens_drops.append(
                 (
                     index,
@@ -183,19 +185,19 @@ def add_precipitation(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
     """Apply rain or snow: a veil over the distance and streaks nearby; rain also wets the ground."""
-    weathers, transmittance, depth, sources = _clear(batch, frames, specs, contexts)
+    weathers, transmittance, depth, sources = _view_through_air(batch, frames, specs, contexts)
     if specs[0].name == "rain":
         batch = wet_ground(batch, frames, specs, (depth, sources))
-    air_rows = [_air(spec, frame, weather) for spec, frame, weather in zip(specs, frames, weathers, strict=True)]
+    air_rows = [_air_row(spec, frame, weather) for spec, frame, weather in zip(specs, frames, weathers, strict=True)]
     max_particles = max(air_row[-1] for air_row in air_rows)
     poses = np.stack([camera_to_world(frame) for frame in frames])
     layer = wp.zeros((batch.count, -(-batch.height // 2), -(-batch.width // 2)), dtype=int, device=batch.device)
     inputs = [
         structs(batch, air_rows, particles.Air),
-        on(batch, _ages(frames, contexts)),
-        on(batch, np.swapaxes(poses[:, :3, :3], 1, 2), wp.mat33),
-        on(batch, poses[:, :3, 3] % np.array([air_row[1] for air_row in air_rows]), wp.vec3),
-        on(batch, np.stack([frame.ego_velocity for frame in frames]), wp.vec3),
+        to_device(batch, _scene_times(frames, contexts)),
+        to_device(batch, np.swapaxes(poses[:, :3, :3], 1, 2), wp.mat33),
+        to_device(batch, poses[:, :3, 3] % np.array([air_row[1] for air_row in air_rows]), wp.vec3),
+        to_device(batch, np.stack([frame.ego_velocity for frame in frames]), wp.vec3),
         lens(batch, frames),
         table.EXPOSURE,
         table.APERTURE,
@@ -205,8 +207,8 @@ def add_precipitation(
     grey_levels = np.array([255.0 if spec.name == "snow" else 235.0 for spec in specs])[:, None]
     result, thread_shape = batch.like(), (batch.count, batch.height)
     veil_light, particle_light = (
-        on(batch, to_linear(sky_colour * 235), wp.vec3),
-        on(batch, to_linear(sky_colour * grey_levels), wp.vec3),
+        to_device(batch, to_linear(sky_colour * 235), wp.vec3),
+        to_device(batch, to_linear(sky_colour * grey_levels), wp.vec3),
     )
     inputs = [
         batch.words(),
@@ -222,7 +224,7 @@ def add_precipitation(
     lens_drops = _lens_drops(batch, frames, specs)
     if len(lens_drops):
         drop_rows = structs(batch, lens_drops, particles.LensDrop)
-        offsets = on(
+        offsets = to_device(
             batch, np.searchsorted([lens_drop[0] for lens_drop in lens_drops], np.arange(batch.count + 1)), wp.int32
         )
         batch.launch(
@@ -230,7 +232,7 @@ def add_precipitation(
         )
     rates = [(table.SNOW_RATE if spec.name == "snow" else table.RAIN_RATE)[spec.severity - 1] for spec in specs]
     records = [
-        Applied(True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _count(spec), "depth": source})
+        Applied(True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _lens_drop_count(spec), "depth": source})
         for rate, air, source, spec in zip(rates, air_rows, sources, specs, strict=True)
     ]
     return result, records

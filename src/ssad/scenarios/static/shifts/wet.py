@@ -10,7 +10,7 @@ import warp as wp
 
 from ssad.core.frames import Frame, camera_to_world
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.batch import Batch, keys_on, on, structs
+from ssad.scenarios.static.shifts.batch import Batch, keys_on, structs, to_device
 from ssad.scenarios.static.shifts.depth import grid_size, lens
 from ssad.scenarios.static.shifts.kernels import wet as kernels
 from ssad.scenarios.static.shifts.light import tables
@@ -20,25 +20,25 @@ _AROUND = 0.15  # m: margin around a box, since labels are not pixel-accurate
 
 
 def wet_ground(
-    batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], known: tuple[Any, Sequence[str]]
+    batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], depth_and_sources: tuple[Any, Sequence[str]]
 ) -> Batch:
-    """The pictures with wet ground.
+    """Return the images with wet ground.
 
     Args:
-        batch: The pictures.
-        frames: Their frames.
-        specs: Their shifts.
-        known: Depth and sources of `depth_grid`; filled-in depth of the road is replaced by that of its plane.
+        batch: The images.
+        frames: Frame of each image.
+        specs: Shift of each image.
+        depth_and_sources: Depth and sources of `depth_grid`; filled-in depth of the road becomes that of its plane.
     """
-    depth, sources = known
+    depth, sources = depth_and_sources
     rows, columns = grid_size(batch)
     shape, thread_shape = (batch.count, rows, columns), (batch.count, rows)
     lenses = lens(batch, frames)
-    to_ego = on(batch, np.stack([frame.camera.to_ego for frame in frames]), wp.mat44)
-    to_world = on(batch, np.stack([camera_to_world(frame) for frame in frames]), wp.mat44)
+    to_ego = to_device(batch, np.stack([frame.camera.to_ego for frame in frames]), wp.mat44)
+    to_world = to_device(batch, np.stack([camera_to_world(frame) for frame in frames]), wp.mat44)
     linear, codes = tables(batch.device)
     ground = wp.empty(shape, dtype=float, device=batch.device)
-    is_depth_given = on(batch, [int(source == "given") for source in sources], wp.int32)
+    is_depth_given = to_device(batch, [int(source == "given") for source in sources], wp.int32)
     batch.launch(
         kernels.find_ground, thread_shape, [lenses, to_ego, is_depth_given, *_footprints(batch, frames)], depth, ground
     )
@@ -47,8 +47,8 @@ def wet_ground(
     mean_light = wp.empty((batch.count, -(-rows // 8), -(-columns // 8)), dtype=float, device=batch.device)
     batch.launch(kernels.usual_light, mean_light.shape, [ground, cell_light], mean_light)
     keys = keys_on(batch, [spec.key("hollows", frame.scene) for spec, frame in zip(specs, frames, strict=True)])
-    film = on(batch, [table.WET_FILM[spec.severity - 1] for spec in specs])
-    roughness = on(batch, [table.WET_ROUGH[spec.severity - 1] for spec in specs])
+    film = to_device(batch, [table.WET_FILM[spec.severity - 1] for spec in specs])
+    roughness = to_device(batch, [table.WET_ROUGH[spec.severity - 1] for spec in specs])
     shine = wp.empty(shape, dtype=wp.vec4, device=batch.device)
     batch.launch(
         kernels.mirror,
@@ -56,7 +56,7 @@ def wet_ground(
         [depth, ground, cell_light, lenses, to_ego, to_world, keys, film, roughness],
         shine,
     )
-    darkening = on(batch, [table.WET_DARK[spec.severity - 1] for spec in specs])
+    darkening = to_device(batch, [table.WET_DARK[spec.severity - 1] for spec in specs])
     result = batch.like()
     inputs = [batch.words(), ground, shine, mean_light, darkening, linear, codes, batch.width, batch.stride // 4]
     batch.launch(kernels.blend_wet, (batch.count, batch.height), inputs, result.words())
@@ -80,4 +80,4 @@ def _footprints(batch: Batch, frames: Sequence[Frame]) -> tuple[Any, Any]:
         ]
         offsets.append(len(rows))
     # Warp arrays must not be empty, hence one dummy row.
-    return structs(batch, rows or [(0.0,) * 7], kernels.Footprint), on(batch, offsets, wp.int32)
+    return structs(batch, rows or [(0.0,) * 7], kernels.Footprint), to_device(batch, offsets, wp.int32)

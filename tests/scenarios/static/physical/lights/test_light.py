@@ -24,23 +24,23 @@ from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
 from ssad.scenarios.static.physical.lights import (
     LIGHTS,
-    Budget,
     Flashlight,
     Laser,
     Projector,
+    SearchBudget,
     Shadow,
-    Target,
+    TargetSize,
     make_light,
     random_settings,
     search,
 )
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec, budget_of
-from ssad.scenarios.static.physical.lights.laser import matching
-from ssad.scenarios.static.physical.lights.light import LightAttack, Ranges, at_values
-from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitPicture, lit_picture
+from ssad.scenarios.static.physical.lights.laser import colour_matching
+from ssad.scenarios.static.physical.lights.light import LightAttack, Ranges, value_tensors
+from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitImage, render_lit_image
 
 TAG = 5
-TARGET = Target(4.0, 2.0, 1.5)
+TARGET = TargetSize(4.0, 2.0, 1.5)
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 CAMERA = Camera(128, 96, np.array([[220.0, 0, 64.0], [0, 220.0, 48.0], [0, 0, 1]]))
 PLAIN = SensorModel(blur=0.0, mosaic=False)
@@ -93,8 +93,8 @@ HOURS = {
 }
 
 
-def lit(scene: RenderScene, name: str) -> LitPicture:
-    return lit_picture(scene, view(HOURS[name]), TAG, slice(0, 96), slice(0, 128), blind=2)
+def lit(scene: RenderScene, name: str) -> LitImage:
+    return render_lit_image(scene, view(HOURS[name]), TAG, slice(0, 96), slice(0, 128), blind=2)
 
 
 @pytest.mark.parametrize("attack", SEARCHED, ids=lambda one: str(one.name))
@@ -103,7 +103,7 @@ def test_the_quick_model_is_what_is_rendered(scene: RenderScene, attack: LightAt
     picture, given = lit(scene, attack.name), edit_of(attack.name)
     seen = given.on(view(HOURS[attack.name]), TAG, cards=range(3, 3 + len(given.cards)))
     full = render(scene, [seen])
-    change = attack.change(at_values(SETTINGS[attack.name]), picture, TARGET)[0]
+    change = attack.change(value_tensors(SETTINGS[attack.name]), picture, TARGET)[0]
     wanted = full.radiance[0] - picture.radiance.numpy()
     own = full.tag[0] == TAG
     assert (np.abs(wanted[own]).max(-1) > 0.02).mean() > 0.04, "it changes the target"
@@ -115,12 +115,12 @@ def test_the_quick_model_is_what_is_rendered(scene: RenderScene, attack: LightAt
 
 def test_a_shadow_takes_what_the_sun_gives_and_no_more(scene: RenderScene) -> None:
     picture = lit(scene, "shadow")
-    change = Shadow().change(at_values(SETTINGS["shadow"]), picture, TARGET)[0]
+    change = Shadow().change(value_tensors(SETTINGS["shadow"]), picture, TARGET)[0]
     assert float(change.max()) <= 0.0
     assert float((picture.radiance + change).min()) >= -1e-6
     assert picture.sun_direction is not None
     night = replace(picture, sun_direction=None)
-    assert not Shadow().change(at_values(SETTINGS["shadow"]), night, TARGET).any()
+    assert not Shadow().change(value_tensors(SETTINGS["shadow"]), night, TARGET).any()
 
 
 @pytest.mark.parametrize("attack", [Laser(), Flashlight()], ids=lambda one: str(one.name))
@@ -142,7 +142,7 @@ def test_a_lamp_gives_no_more_light_than_its_power(scene: RenderScene, attack: L
         fog=0.0,
         radiance=torch.zeros_like(points),
     )
-    light = attack.change(at_values(values), plane, TARGET)[0].numpy()
+    light = attack.change(value_tensors(values), plane, TARGET)[0].numpy()
     lumens = (light @ [0.2126, 0.7152, 0.0722]).sum() * (x[1] - x[0]) * (y[1] - y[0]) / per_lux(SceneWeather(-0.3))
     power = attack.power(values)
     assert power is not None
@@ -166,7 +166,7 @@ def test_a_projector_leaves_no_part_of_its_picture_beyond_its_power() -> None:
 
 def test_the_eye_sees_green_and_not_infrared() -> None:
     """Known values of the CIE 1931 functions at 450, 555 and 650 nm."""
-    found = matching(torch.tensor([450.0, 555.0, 650.0])).numpy()
+    found = colour_matching(torch.tensor([450.0, 555.0, 650.0])).numpy()
     assert found == pytest.approx(
         np.array([[0.336, 0.038, 1.772], [0.512, 1.0, 0.0057], [0.2835, 0.107, 0.0]]), abs=0.03
     )
@@ -179,10 +179,10 @@ class Toy:
     name: str = "toy"
     search: Any = "swarm"
 
-    def ranges(self, target: Target) -> Ranges:
+    def ranges(self, target: TargetSize) -> Ranges:
         return {"a": (0.0, 10.0), "b": (-1.0, 1.0)}
 
-    def change(self, values: Mapping[str, Tensor], picture: Any, target: Target) -> Tensor:
+    def change(self, values: Mapping[str, Tensor], picture: Any, target: TargetSize) -> Tensor:
         return torch.stack([values["a"] - 2.0, 5.0 * (values["b"] - 0.4)], -1)
 
 
@@ -198,7 +198,7 @@ def test_searches_find_repeat_and_count(how: Any, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(search, "_loss", lambda detector, images, truth: images[:, 0])
     views = [search.LitView(Bowl(), None)] * 2  # type: ignore[arg-type]
     given = {"detector": None, "target": TARGET, "views": views, "search": how}
-    found = [search.search_light(Toy(), budget=Budget(80, 8, 0.08, None), key=(k,), **given) for k in (0, 0, 1)]  # type: ignore[arg-type]
+    found = [search.search_light(Toy(), budget=SearchBudget(80, 8, 0.08, None), key=(k,), **given) for k in (0, 0, 1)]  # type: ignore[arg-type]
     assert found[0] == found[1]
     assert found[0].values != found[2].values
     for one in found:
@@ -224,7 +224,7 @@ def test_the_best_of_several_searches_counts(how: Any, monkeypatch: pytest.Monke
     monkeypatch.setattr(search, "_loss", lambda detector, images, truth: images[:, 0])
     given = {"detector": None, "target": TARGET, "views": [search.LitView(Egg(), None)], "search": how}
     one, many = (
-        search.search_light(Toy(), budget=Budget(20, 4, 0.08, None, searches=n), **given)  # type: ignore[arg-type]
+        search.search_light(Toy(), budget=SearchBudget(20, 4, 0.08, None, searches=n), **given)  # type: ignore[arg-type]
         for n in (1, 12)
     )
     assert many.best[: len(one.best)] == one.best
@@ -244,7 +244,7 @@ def test_what_is_found_is_kept(tmp_path: Path) -> None:
     def never(*given: object) -> Any:
         raise AssertionError
 
-    asked: dict[str, Any] = {"views": never, "projected": never, "detector": never}
+    asked: dict[str, Any] = {"views": never, "projected_views": never, "detector": never}
     edit = folder.edit(spec, TARGET, **asked)
     again = folder.edit(spec, TARGET, **asked)
     assert np.array_equal(edit.lamps[0].pose, again.lamps[0].pose)
@@ -256,7 +256,7 @@ def test_what_is_found_is_kept(tmp_path: Path) -> None:
     assert other.lamps[0].power == edit.lamps[0].power, "random lights shine at full power"
     projected = folder.edit(replace(spec, of="projector", options={}), TARGET, **asked)
     assert projected.textures[0].shape == (3, 22, 32)
-    assert folder.picture(replace(spec, of="projector", options={})).is_file()
+    assert folder.image_path(replace(spec, of="projector", options={})).is_file()
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from ssad.rendering.onboard import Onboard
 from ssad.rendering.sensor_suite import SensorSuite
 from ssad.scenarios.static.catalogue import parse_perturbation, registered_names
 from ssad.scenarios.static.physical.lights.export import export_light
-from ssad.scenarios.static.physical.lights.perturbation import Light
+from ssad.scenarios.static.physical.lights.perturbation import LightPerturbation
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +47,8 @@ def test_every_light_is_a_perturbation_and_a_shadow_takes_light_away(behind: Wor
     entries = [parse_perturbation(name) for name in names]
     assert [entry.name for entry in entries if entry.has_severities] == ["flashlight", "laser", "projector"]
     assert [entry.name for entry in entries if not entry.make(1).needs_target] == ["night"]
-    assert Light("shadow").hour == "recorded"
-    edit = Light("shadow").in_loop(SensorSuite(), target=1, victim=None, seed=0).agent_edit
+    assert LightPerturbation("shadow").hour == "recorded"
+    edit = LightPerturbation("shadow").in_loop(SensorSuite(), target=1, victim=None, seed=0).agent_edit
     assert edit is not None
     (card,) = edit.body(behind.episodes[0].agents[1].model)[1].cards
     assert card.outline.shape == (3, 3)
@@ -56,7 +56,7 @@ def test_every_light_is_a_perturbation_and_a_shadow_takes_light_away(behind: Wor
 
 
 def test_a_light_that_was_found_shines_as_it_was_found(behind: World, tmp_path: Path) -> None:
-    found = Light("flashlight", 5).shining(0)
+    found = LightPerturbation("flashlight", 5).setup(0)
     export_light(tmp_path / "light", found)
     name = str(tmp_path / "light")
     np.testing.assert_array_equal(seen(behind, name), seen(behind, "flashlight", 5))

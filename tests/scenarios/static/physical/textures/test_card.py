@@ -89,7 +89,7 @@ def test_a_suite_shows_a_texture_in_place_of_training(tmp_path: Path) -> None:
     given = {"views": lambda: pytest.fail("trained"), "detector": lambda: pytest.fail("trained")}
     colour = folder.texture(spec, surface, **given)  # type: ignore[arg-type]
     assert torch.equal(colour, load_texture(file)[0])
-    assert np.array_equal(read_image(folder.picture(spec)), picture())
+    assert np.array_equal(read_image(folder.image_path(spec)), picture())
     shuffled = folder.texture(TextureSpec.of_row(cells[1].spec), surface, **given)  # type: ignore[arg-type]
     assert not torch.equal(shuffled, colour)
     assert torch.equal(shuffled.flatten(1).sort(1).values, colour.flatten(1).sort(1).values)

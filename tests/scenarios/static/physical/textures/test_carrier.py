@@ -17,7 +17,14 @@ from ssad.rendering.camera.texture import PRINTABLE
 from ssad.rendering.meshes.mesh import Material, Mesh, box
 from ssad.rendering.target import TargetCar, TargetSign, TargetWalker
 from ssad.scenarios.static.physical import make_carrier
-from ssad.scenarios.static.physical.textures.carrier import Camouflage, Patch, Road, albedo_of, covered, metres_of
+from ssad.scenarios.static.physical.textures.carrier import (
+    Camouflage,
+    Patch,
+    RoadPatch,
+    albedo_of,
+    covered_colour,
+    metres_of,
+)
 
 PAINT = Material("paint", (0.5, 0.5, 0.5))
 CHANNEL = next(iter(RIG))
@@ -38,9 +45,9 @@ def test_what_a_texture_covers_is_paint_or_material() -> None:
     car, sign = TargetCar(paint="red"), TargetSign()
     mesh = car.mesh()
     for carrier in (Camouflage(), Patch("rear"), Patch("rear", width=0.02, height=0.02)):
-        assert covered(carrier.on(mesh), mesh, car.colour).tolist() == pytest.approx(car.colour, abs=1e-6)
-    assert max(covered(Road().on(mesh), mesh, car.colour).tolist()) < 0.1, "asphalt is dark"
-    face = covered(Patch("face", width=0.4, height=0.4).on(sign.mesh()), sign.mesh(), sign.colour)
+        assert covered_colour(carrier.on(mesh), mesh, car.colour).tolist() == pytest.approx(car.colour, abs=1e-6)
+    assert max(covered_colour(RoadPatch().on(mesh), mesh, car.colour).tolist()) < 0.1, "asphalt is dark"
+    face = covered_colour(Patch("face", width=0.4, height=0.4).on(sign.mesh()), sign.mesh(), sign.colour)
     assert face[0] > 1.3 * face[1:].max(), "red with white letters"
 
 

@@ -16,13 +16,13 @@ from ssad.core.images import read_image
 from ssad.rendering.meshes.mesh_files import load_mesh
 from ssad.rendering.target import TargetCar, TargetSign
 from ssad.scenarios.static.physical import Camouflage, Patch, control
-from ssad.scenarios.static.physical.textures.export import Print, export_texture, load_print
+from ssad.scenarios.static.physical.textures.export import PrintedTexture, export_texture, load_printed_texture
 
 
 def test_a_patch_has_its_true_size_and_lies_where_the_target_wears_it(tmp_path: Path) -> None:
     surface = Patch(width=1.2, height=0.4, texels=24).on(TargetCar().mesh())
     colour = control("random", surface.size, seed=3)
-    made = Print(colour, "patch", {"width": 1.2, "height": 0.4, "texels": 24}, "sedan:silver:0")
+    made = PrintedTexture(colour, "patch", {"width": 1.2, "height": 0.4, "texels": 24}, "sedan:silver:0")
     written = export_texture(tmp_path, made, dots=500, name="mine")
     assert all(path.is_file() for path in written)
     with Image.open(tmp_path / "print.png") as image:
@@ -44,23 +44,23 @@ def test_a_patch_has_its_true_size_and_lies_where_the_target_wears_it(tmp_path: 
     assert about["panels"]["rear"]["metres"][0] > 1.2
     assert 0.0 < about["non_printability"] < 0.5
     assert 0.0 < about["delta_e"] < 100.0
-    again = load_print(tmp_path)
+    again = load_printed_texture(tmp_path)
     assert torch.equal(again.colour, colour)
     assert again.on(TargetCar().mesh()).layer == surface.layer
     edit = again.edit(replace(TargetCar(), size=(5.2, 2.0, 2.0)).mesh())
     assert edit.textures[0].shape == (3, 8, 24), "also on a body of another size"
     (tmp_path / "texture.npz").write_bytes((tmp_path / "texture.npz").read_bytes() + b"x")
     with pytest.raises(FormatError, match="not the texture that"):
-        load_print(tmp_path)
+        load_printed_texture(tmp_path)
     (tmp_path / "texture.npz").unlink()
     with pytest.raises(SSADError, match=r"texture\.npz"):
-        load_print(tmp_path)
+        load_printed_texture(tmp_path)
 
 
 def test_the_obj_is_the_target_with_its_atlas(tmp_path: Path) -> None:
     target = TargetCar("hatchback", "red")
     mesh, surface = target.mesh(), Camouflage(texels=16).on(target.mesh())
-    made = Print(control("noise", surface.size), "camouflage", {"texels": 16}, "hatchback:red:0")
+    made = PrintedTexture(control("noise", surface.size), "camouflage", {"texels": 16}, "hatchback:red:0")
     export_texture(tmp_path, made, dots=20)
     read = load_mesh(tmp_path / "target.obj")
     assert len(read.faces) == len(mesh.faces)
@@ -81,7 +81,7 @@ def test_the_obj_is_the_target_with_its_atlas(tmp_path: Path) -> None:
 
 def test_what_cannot_be_printed_ends_in_one_line(tmp_path: Path) -> None:
     options = {"panel": "face", "width": 0.4, "height": 0.4, "texels": 8}
-    sign = Print(torch.full((3, 8, 8), 0.5), "patch", options, "stop_sign")
+    sign = PrintedTexture(torch.full((3, 8, 8), 0.5), "patch", options, "stop_sign")
     with pytest.raises(ConfigError, match="dots; from 1 to 16384"):
         export_texture(tmp_path, sign, dots=100_000)
     assert export_texture(tmp_path, sign, dots=100)

@@ -19,20 +19,25 @@ from ssad.scenarios.static.digital import Aim, make_objective
 from ssad.scenarios.static.digital.objectives import Hide, Situation
 from ssad.scenarios.static.physical import make_physical
 from ssad.scenarios.static.physical.lights.projector import AIMED, Projector
-from ssad.scenarios.static.physical.textures.attention import Distraction, Redistribution, _parts, attention
-from ssad.scenarios.static.physical.textures.carrier import Surface, albedo_of
+from ssad.scenarios.static.physical.textures.attention import (
+    Distraction,
+    Redistribution,
+    _mean_part_attention,
+    attention,
+)
+from ssad.scenarios.static.physical.textures.carrier import TextureSurface, albedo_of
 from ssad.scenarios.static.physical.textures.controls import control
 from ssad.scenarios.static.physical.textures.optimise import (
     TARGET,
     TextureAttack,
-    View,
+    TextureView,
     _order,
     train_texture,
 )
 from ssad.scenarios.static.physical.textures.printing import NOMINAL, Expectation, conspicuousness
 from tests.scenarios.static.digital.toy_detector import CELL, ToyDetector, pattern, toy_scene
 
-SURFACE = Surface(TextureLayer(0), (CELL, CELL), np.ones((CELL, CELL), bool), (1.0, 1.0))
+SURFACE = TextureSurface(TextureLayer(0), (CELL, CELL), np.ones((CELL, CELL), bool), (1.0, 1.0))
 GAIN = 0.2
 PLAIN = TextureAttack("plain", "hide", epochs=12, rate=0.1, batch=2, smooth=0.0, printed=0.0, expectation=NOMINAL)
 
@@ -61,11 +66,11 @@ class Painted:
         return torch.cat([one.show({0: texture}) for one, texture in zip(pictures, textures[0], strict=True)])
 
 
-def views(count: int = 4, *, seed: int = 0) -> list[View]:
+def views(count: int = 4, *, seed: int = 0) -> list[TextureView]:
     """Pictures of one class; the first object is the target."""
     images, truth = toy_scene(count, objects=3, classes=("car",), seed=seed)
     return [
-        View(Painted(image, tuple(one.box[0, :2].long().tolist())), one)
+        TextureView(Painted(image, tuple(one.box[0, :2].long().tolist())), one)
         for image, one in zip(images, truth, strict=True)
     ]
 
@@ -74,7 +79,7 @@ def detector() -> ToyDetector:
     return ToyDetector(("car",), spread=0.0)
 
 
-def score(colour: Tensor, seen: list[View]) -> float:
+def score(colour: Tensor, seen: list[TextureView]) -> float:
     """Mean score of the target's cell."""
     found = []
     for view in seen:
@@ -248,7 +253,7 @@ def test_a_target_that_is_never_in_view_is_said() -> None:
             return torch.stack([one.image for one in pictures]) + 0.0 * textures[0].sum()
 
     images, truth = toy_scene(2, classes=("car",))
-    seen = [View(Away(image), one) for image, one in zip(images, truth, strict=True)]
+    seen = [TextureView(Away(image), one) for image, one in zip(images, truth, strict=True)]
     with pytest.raises(ConfigError, match="never in view"):
         train_texture(PLAIN, detector(), SURFACE, seen, start=control("grey", SURFACE.size))
 
@@ -385,8 +390,10 @@ def test_parts_of_an_attention_map_by_hand() -> None:
     local = torch.zeros(7, 7)
     local[1, 1], local[1, 2], local[2, 2] = 1.0, 0.8, 0.6
     local[5, 5] = 0.6
-    assert float(_parts(local[None])) == pytest.approx(0.5 * (2.4 / 47 + 0.6 / 49))
+    assert float(_mean_part_attention(local[None])) == pytest.approx(0.5 * (2.4 / 47 + 0.6 / 49))
     snake = torch.zeros(7, 7)
     snake[0, :], snake[1, 6], snake[2, :], snake[3, 0], snake[4, :] = 1.0, 1.0, 1.0, 1.0, 1.0
-    assert float(_parts(torch.stack([local, snake]))[1]) == pytest.approx(23 / 27), "one part, however it winds"
-    assert float(_parts(torch.zeros(1, 7, 7))) == 0.0, "nothing above the mean"
+    assert float(_mean_part_attention(torch.stack([local, snake]))[1]) == pytest.approx(23 / 27), (
+        "one part, however it winds"
+    )
+    assert float(_mean_part_attention(torch.zeros(1, 7, 7))) == 0.0, "nothing above the mean"

@@ -10,10 +10,16 @@ from ssad.core.registry import make, names, resolve
 from ssad.core.schema import checked
 from ssad.scenarios.static.physical.lights.flashlight import Flashlight
 from ssad.scenarios.static.physical.lights.laser import Laser
-from ssad.scenarios.static.physical.lights.light import LightAttack, Target
-from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.light import LightAttack, TargetSize
+from ssad.scenarios.static.physical.lights.lit_image import LitImage
 from ssad.scenarios.static.physical.lights.projector import Projector
-from ssad.scenarios.static.physical.lights.search import Budget, Found, LitView, random_settings, search_light
+from ssad.scenarios.static.physical.lights.search import (
+    LightSearchResult,
+    LitView,
+    SearchBudget,
+    random_settings,
+    search_light,
+)
 from ssad.scenarios.static.physical.lights.shadow import Shadow
 
 LIGHTS: dict[str, Callable[..., Shadow | Laser | Projector | Flashlight]] = {
@@ -44,16 +50,16 @@ def make_light(name: str, options: Mapping[str, Any]) -> Any:
 
 __all__ = [
     "LIGHTS",
-    "Budget",
     "Flashlight",
-    "Found",
     "Laser",
     "LightAttack",
-    "LitPicture",
+    "LightSearchResult",
+    "LitImage",
     "LitView",
     "Projector",
+    "SearchBudget",
     "Shadow",
-    "Target",
+    "TargetSize",
     "make_light",
     "random_settings",
     "search_light",

@@ -21,13 +21,13 @@ from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.hours import at_hour
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.target import TargetCar, parse_target
-from ssad.scenarios.static.physical.lights import Projector, Target, make_light
+from ssad.scenarios.static.physical.lights import Projector, TargetSize, make_light
 from ssad.scenarios.static.physical.textures.controls import texture_picture
-from ssad.scenarios.static.physical.textures.export import Print, load_print
+from ssad.scenarios.static.physical.textures.export import PrintedTexture, load_printed_texture
 
 
 @dataclass(frozen=True, slots=True)
-class Shining:
+class LightSetup:
     """Light attack with all settings that are needed to show it again.
 
     Attributes:
@@ -55,7 +55,7 @@ class Shining:
         light = make_light(self.attack, self.options)
         lower, upper = mesh.bounds()
         length, width, height = (upper - lower).tolist()
-        target = Target(length, width, height)
+        target = TargetSize(length, width, height)
         if not isinstance(light, Projector):
             edit: SceneEdit = light.edit(self.values, target)
             return edit
@@ -75,44 +75,44 @@ class Shining:
         return AgentEdit(self.edit, car, agent)
 
 
-def export_light(out: Path, made: Shining, *, name: str = "") -> list[Path]:
+def export_light(out: Path, light: LightSetup, *, name: str = "") -> list[Path]:
     """Write a light attack: light.json, and for a projector its picture as picture.png and, exactly, picture.npz.
 
     Args:
         out: Folder.
-        made: The attack.
-        name: What light.json calls it.
+        light: The light with its settings.
+        name: Name in light.json.
 
     Returns:
-        What was written.
+        Paths of the written files.
     """
-    attack = make_light(made.attack, made.options)
+    device = make_light(light.attack, light.options)
     description: dict[str, Any] = {
         "name": name,
-        "attack": made.attack,
-        "options": dict(made.options),
-        "hour": made.hour,
-        "target": made.target,
-        "values": dict(made.values),
+        "attack": light.attack,
+        "options": dict(light.options),
+        "hour": light.hour,
+        "target": light.target,
+        "values": dict(light.values),
     }
     safeio.make_folder(out)
     written = [out / "light.json"]
-    if made.colour is not None:
-        assert isinstance(attack, Projector)
+    if light.colour is not None:
+        assert isinstance(device, Projector)
         # PNG rounds to 8 bits; the file of floats is what `load_light` verifies and reads.
-        colour_bytes = safeio.npz_bytes({"colour": made.colour.numpy()})
+        colour_bytes = safeio.npz_bytes({"colour": light.colour.numpy()})
         safeio.write_atomic(out / "picture.npz", colour_bytes)
-        full_mask = np.ones(tuple(made.colour.shape[1:]), np.bool_)
-        save_picture(out / "picture.png", texture_picture(made.colour, full_mask))
-        description |= {"lumens": attack.power(made.colour), "sha256": hashlib.sha256(colour_bytes).hexdigest()}
+        full_mask = np.ones(tuple(light.colour.shape[1:]), np.bool_)
+        save_picture(out / "picture.png", texture_picture(light.colour, full_mask))
+        description |= {"lumens": device.power(light.colour), "sha256": hashlib.sha256(colour_bytes).hexdigest()}
         written += [out / "picture.png", out / "picture.npz"]
-    elif not isinstance(attack, Projector):
-        description["lumens"] = attack.power(made.values)
+    elif not isinstance(device, Projector):
+        description["lumens"] = device.power(light.values)
     safeio.write_atomic(out / "light.json", safeio.dump_json(description, indent=1) + "\n")
     return written
 
 
-def load_light(folder: Path) -> Shining:
+def load_light(folder: Path) -> LightSetup:
     """Read a light attack that `export_light` wrote.
 
     Raises:
@@ -126,7 +126,7 @@ def load_light(folder: Path) -> Shining:
             if hashlib.sha256(colour_bytes).hexdigest() != description["sha256"]:
                 raise FormatError(f"{folder / 'picture.npz'}: not what light.json describes; export it again")
             colour = torch.from_numpy(safeio.load_npz(folder / "picture.npz")["colour"].copy())
-        light = Shining(
+        light = LightSetup(
             description["attack"],
             description["options"],
             description["hour"],
@@ -142,7 +142,7 @@ def load_light(folder: Path) -> Shining:
         raise FormatError(f"{folder / 'light.json'}: no exported light ({error}); export it again") from None
 
 
-def load_worn(folder: Path) -> Print | Shining:
+def load_exported_attack(folder: Path) -> PrintedTexture | LightSetup:
     """Read the export of `ssad export texture` or `ssad export light`.
 
     Raises:
@@ -150,4 +150,4 @@ def load_worn(folder: Path) -> Print | Shining:
     """
     if (folder / "light.json").is_file():
         return load_light(folder)
-    return load_print(folder)
+    return load_printed_texture(folder)

@@ -15,8 +15,15 @@ from ssad.core.types import F64
 from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical.lights.lamps import added_light
-from ssad.scenarios.static.physical.lights.light import Away, Ranges, Target, aimed, at_values, numbers
-from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.light import (
+    LampDistance,
+    Ranges,
+    TargetSize,
+    aimed_poses,
+    first_array,
+    value_tensors,
+)
+from ssad.scenarios.static.physical.lights.lit_image import LitImage
 
 
 @dataclass(frozen=True, slots=True, config=VALUES)
@@ -37,7 +44,7 @@ class Flashlight:
     """
 
     lumens: Least = 3000.0
-    distance: Span[Away] = (4.0, 12.0)
+    distance: Span[LampDistance] = (4.0, 12.0)
     height: Span[Least] = (0.5, 3.0)
     aside: Number = 0.6
     beam: Span[Annotated[Number, Field(ge=1e-3)]] = (0.03, 0.3)
@@ -45,7 +52,7 @@ class Flashlight:
     name: str = "flashlight"
     search: Literal["swarm", "greedy", "gradient"] = "gradient"
 
-    def ranges(self, target: Target) -> Ranges:
+    def ranges(self, target: TargetSize) -> Ranges:
         """Return the ranges of power, position, aim, beam and colour."""
         return {
             "lumens": (0.0, self.lumens),
@@ -60,7 +67,7 @@ class Flashlight:
             "blue": (0.0, 1.0),
         }
 
-    def _lamp(self, values: Mapping[str, Tensor], target: Target) -> dict[str, Tensor]:
+    def _lamp(self, values: Mapping[str, Tensor], target: TargetSize) -> dict[str, Tensor]:
         """Return pose, power, spread and colour of N settings."""
         distance, aside = values["distance"], values["aside"]
         position = torch.stack(
@@ -69,19 +76,19 @@ class Flashlight:
         aim_point = torch.stack([torch.full_like(distance, target.rear), values["aim_left"], values["aim_up"]], -1)
         colour = torch.stack([values["red"], values["green"], values["blue"]], -1)
         return {
-            "pose": aimed(position, aim_point),
+            "pose": aimed_poses(position, aim_point),
             "power": values["lumens"],
             "spread": values["beam"][:, None].expand(-1, 2),
             "colour": colour,
         }
 
-    def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
+    def change(self, values: Mapping[str, Tensor], picture: LitImage, target: TargetSize) -> Tensor:
         """Return the radiance that the spot light adds to an image."""
         return added_light(SceneLamp(_IDENTITY, 1.0, soft=self.soft), picture, **self._lamp(values, target))
 
-    def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
+    def edit(self, values: Mapping[str, float], target: TargetSize) -> SceneEdit:
         """Return the spot light as a scene edit."""
-        lamp_values = {name: numbers(value) for name, value in self._lamp(at_values(values), target).items()}
+        lamp_values = {name: first_array(value) for name, value in self._lamp(value_tensors(values), target).items()}
         return SceneEdit(lamps=(lamp_of(lamp_values, soft=self.soft),))
 
     def power(self, values: Mapping[str, float]) -> float:
@@ -89,11 +96,11 @@ class Flashlight:
         return values["lumens"] * (0.2126 * values["red"] + 0.7152 * values["green"] + 0.0722 * values["blue"])
 
 
-_IDENTITY: F64 = numbers(torch.eye(4, dtype=torch.float64)[None])
+_IDENTITY: F64 = first_array(torch.eye(4, dtype=torch.float64)[None])
 
 
-def lamp_of(found: Mapping[str, F64], **more: Any) -> SceneLamp:
-    """A lamp with a pose, a power, a spread and a colour."""
-    spread_x, spread_y = found["spread"].tolist()
-    red, green, blue = found["colour"].tolist()
-    return SceneLamp(found["pose"], float(found["power"]), (spread_x, spread_y), (red, green, blue), **more)
+def lamp_of(values: Mapping[str, F64], **options: Any) -> SceneLamp:
+    """Return a lamp from a pose, a power, a spread and a colour."""
+    spread_x, spread_y = values["spread"].tolist()
+    red, green, blue = values["colour"].tolist()
+    return SceneLamp(values["pose"], float(values["power"]), (spread_x, spread_y), (red, green, blue), **options)

@@ -18,31 +18,31 @@ from ssad.core.schema import checked
 from ssad.core.seeding import digest
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical.lights import (
-    Budget,
     Projector,
-    Target,
+    SearchBudget,
+    TargetSize,
     make_light,
     random_settings,
     search_light,
 )
 from ssad.scenarios.static.physical.lights.search import LitView
 from ssad.scenarios.static.physical.textures.controls import control, texture_picture
-from ssad.scenarios.static.physical.textures.optimise import View, train_texture
+from ssad.scenarios.static.physical.textures.optimise import TextureView, train_texture
 
 
 @dataclass(frozen=True, slots=True)
 class LightSpec:
-    """All that decides a light attack.
+    """Specification of a light attack.
 
     Attributes:
         attack: Name of an attack (`LIGHTS`), or random.
-        options: Fields of the attack that differ.
-        settings: Of its search: fields of `Budget` and `search`; of a projector, of `TextureAttack`.
-        of: Of random: the attack whose settings are drawn.
-        hour: When it shines (see `ssad.rendering.hours.HOURS`).
-        source: The detector that is attacked; "" for random.
-        number: Of random.
-        pair: What it is searched on, as the suite says it.
+        options: Fields of the attack that differ from its defaults.
+        settings: Settings of its search: fields of `SearchBudget` and `search`; of a projector, of `TextureAttack`.
+        of: For random: attack whose settings are drawn.
+        hour: Hour at which it shines (see `ssad.rendering.hours.HOURS`).
+        source: Detector under attack; "" for random.
+        number: Index of a random draw.
+        pair: Data of the search, as given in the suite.
     """
 
     attack: str
@@ -90,21 +90,21 @@ class LightFolder:
     seed: int = 0
     device: str = "cpu"
 
-    def kept(self, spec: LightSpec) -> Path:
+    def record_path(self, spec: LightSpec) -> Path:
         """Return the path of a finished attack."""
         return self.path / f"{spec.name}.json"
 
-    def picture(self, spec: LightSpec) -> Path:
+    def image_path(self, spec: LightSpec) -> Path:
         """Return the path of a projector's image."""
         return self.path / f"{spec.name}.png"
 
     def edit(
         self,
         spec: LightSpec,
-        target: Target,
+        target: TargetSize,
         *,
         views: Callable[[], Sequence[LitView]],
-        projected: Callable[[SceneEdit], Sequence[View]],
+        projected_views: Callable[[SceneEdit], Sequence[TextureView]],
         detector: Callable[[], Detector],
     ) -> SceneEdit:
         """Return an attack as a scene edit, searched first if necessary.
@@ -113,15 +113,15 @@ class LightFolder:
             spec: Specification of the attack.
             target: Target that it lights.
             views: Function that renders the images of the search.
-            projected: Function that renders images whose target is lit by the projection of an edit.
+            projected_views: Function that renders images whose target is lit by the projection of an edit.
             detector: Function that creates the detector under attack.
 
         Raises:
             ConfigError: It cannot be searched.
         """
-        attack, path = make_light(spec.device, spec.options), self.kept(spec)
+        attack, path = make_light(spec.device, spec.options), self.record_path(spec)
         if isinstance(attack, Projector):
-            return self._projected(spec, attack, target, projected, detector)
+            return self._projected_edit(spec, attack, target, projected_views, detector)
         if not path.is_file():
             if spec.source:
                 budget, method = budget_of(spec.settings, attack.name)
@@ -139,39 +139,39 @@ class LightFolder:
                 record = {"values": values, "queries": 0}
             record["lumens"] = attack.power(record["values"])
             _write(path, record)
-        values, _ = self.found(spec)
+        values, _ = self.load_values(spec)
         edit: SceneEdit = attack.edit(values, target)
         return edit
 
-    def found(self, spec: LightSpec) -> tuple[dict[str, float], Tensor | None]:
+    def load_values(self, spec: LightSpec) -> tuple[dict[str, float], Tensor | None]:
         """Load the settings of a finished attack; for a projector none, but its image [3, H, W] in sRGB."""
         if spec.device != "projector":
-            return dict(safeio.read_json(self.kept(spec))["values"]), None
-        return {}, torch.from_numpy(safeio.load_npz(self.kept(spec).with_suffix(".npz"))["colour"].copy())
+            return dict(safeio.read_json(self.record_path(spec))["values"]), None
+        return {}, torch.from_numpy(safeio.load_npz(self.record_path(spec).with_suffix(".npz"))["colour"].copy())
 
-    def _projected(
+    def _projected_edit(
         self,
         spec: LightSpec,
         attack: Projector,
-        target: Target,
-        projected: Callable[[SceneEdit], Sequence[View]],
+        target: TargetSize,
+        projected_views: Callable[[SceneEdit], Sequence[TextureView]],
         detector: Callable[[], Detector],
     ) -> SceneEdit:
         """Return a projector with its image, trained first if necessary."""
-        surface, path = attack.surface(target), self.kept(spec)
+        surface, path = attack.surface(target), self.record_path(spec)
         colour_path = path.with_suffix(".npz")
         if not path.is_file():
             record: dict[str, Any] = {"queries": 0}
             if spec.source:
                 training = attack.training(**spec.settings)
-                views = projected(attack.edit(control("grey", surface.size), target))
+                views = projected_views(attack.edit(control("grey", surface.size), target))
                 trained = train_texture(
                     training,
                     detector(),
                     surface,
                     views,
                     start=control("grey", surface.size),
-                    shown=attack.light_of,
+                    appearance=attack.light_of,
                     key=(self.seed, spec.name),
                     device=self.device,
                     checkpoint=path.with_suffix(".checkpoint.npz"),
@@ -185,20 +185,20 @@ class LightFolder:
             else:
                 colour = control("random", surface.size, seed=spec.number)
             safeio.save_npz(colour_path, {"colour": colour.numpy()})
-            save_picture(self.picture(spec), texture_picture(colour, surface.mask))
+            save_picture(self.image_path(spec), texture_picture(colour, surface.mask))
             _write(path, record | {"values": {"white": attack.lumens}, "lumens": attack.power(colour)})
-        _, image_colour = self.found(spec)
+        _, image_colour = self.load_values(spec)
         assert image_colour is not None
         return attack.edit(image_colour, target)
 
     def history(self, spec: LightSpec) -> dict[str, Any]:
         """Return power, settings and queries of a finished attack for records."""
-        record = safeio.read_json(self.kept(spec))
+        record = safeio.read_json(self.record_path(spec))
         values = {name: float(f"{value:.4g}") for name, value in record.pop("values").items()}
         return {**record, "light": values}
 
 
-def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[Budget, Any]:
+def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[SearchBudget, Any]:
     """Return the budget of an attack's search, and its method (None: the attack's own).
 
     Raises:
@@ -208,9 +208,9 @@ def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[Budget, Any]:
     method = options.pop("search", None)
     if method not in (None, "swarm", "greedy", "gradient"):
         raise ConfigError(f"attack {attack}: search={method!r}: choose swarm, greedy or gradient")
-    return checked(Budget, options, what=f"attack {attack}"), method
+    return checked(SearchBudget, options, what=f"attack {attack}"), method
 
 
-def _write(path: Path, about: Mapping[str, Any]) -> None:
+def _write(path: Path, record: Mapping[str, Any]) -> None:
     safeio.make_folder(path.parent)
-    safeio.write_atomic(path, safeio.dump_json(dict(about), indent=1) + "\n")
+    safeio.write_atomic(path, safeio.dump_json(dict(record), indent=1) + "\n")

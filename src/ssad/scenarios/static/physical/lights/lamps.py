@@ -7,17 +7,17 @@ from torch import Tensor
 
 from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.torch_lamp import lamp_light
-from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.lit_image import LitImage
 
 
 def added_light(
-    lamp: SceneLamp, picture: LitPicture, *, pose: Tensor, power: Tensor, spread: Tensor, colour: Tensor
+    lamp: SceneLamp, image: LitImage, *, pose: Tensor, power: Tensor, spread: Tensor, colour: Tensor
 ) -> Tensor:
-    """What a lamp adds to the radiance of a picture under N settings [N, h, w, 3], without shadows; differentiable.
+    """Return the radiance [N, h, w, 3] that a lamp adds under N settings, without shadows; differentiable.
 
     Args:
         lamp: Its edge and reach; the rest of it is replaced.
-        picture: The picture.
+        image: Image to light.
         pose: In the target's frame [N, 4, 4].
         power: Lumen [N].
         spread: Tangents of the half angles [N, 2].
@@ -25,10 +25,8 @@ def added_light(
     """
 
     def light(pose: Tensor, power: Tensor, spread: Tensor) -> Tensor:
-        return lamp_light(
-            lamp, picture.position, picture.normal, pose=pose, power=power, spread=spread, fog=picture.fog
-        )
+        return lamp_light(lamp, image.position, image.normal, pose=pose, power=power, spread=spread, fog=image.fog)
 
-    position = picture.position
-    irradiance = torch.vmap(light)(pose.to(position), power.to(position) * picture.per_lux, spread.to(position))
-    return irradiance * colour.to(position)[:, None, None] * picture.answer
+    position = image.position
+    irradiance = torch.vmap(light)(pose.to(position), power.to(position) * image.per_lux, spread.to(position))
+    return irradiance * colour.to(position)[:, None, None] * image.answer

@@ -16,8 +16,15 @@ from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.scenarios.static.physical.lights.flashlight import _IDENTITY, lamp_of
 from ssad.scenarios.static.physical.lights.lamps import added_light
-from ssad.scenarios.static.physical.lights.light import Away, Ranges, Target, aimed, at_values, numbers
-from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.light import (
+    LampDistance,
+    Ranges,
+    TargetSize,
+    aimed_poses,
+    first_array,
+    value_tensors,
+)
+from ssad.scenarios.static.physical.lights.lit_image import LitImage
 
 LUMEN_PER_WATT = 683.0  # of light of 555 nm, by definition of the candela
 TO_SRGB = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))  # IEC 61966-2-1, from XYZ
@@ -45,7 +52,7 @@ class Laser:
     """
 
     watts: Least = 0.5
-    distance: Away = 8.0
+    distance: LampDistance = 8.0
     height: Least = 1.5
     fan: Above = 0.15
     width: Span[Annotated[Number, Field(ge=0.01)]] = (0.05, 0.3)
@@ -53,7 +60,7 @@ class Laser:
     name: str = "laser"
     search: Literal["swarm", "greedy", "gradient"] = "greedy"
 
-    def ranges(self, target: Target) -> Ranges:
+    def ranges(self, target: TargetSize) -> Ranges:
         """Return the ranges of power, wavelength, width, angle and aim."""
         return {
             "watts": (0.0, self.watts),
@@ -64,35 +71,35 @@ class Laser:
             "aim_up": (0.2 * target.height, target.height),
         }
 
-    def _lamp(self, values: Mapping[str, Tensor], target: Target) -> dict[str, Tensor]:
+    def _lamp(self, values: Mapping[str, Tensor], target: TargetSize) -> dict[str, Tensor]:
         """Return pose, power, spread and colour of N settings."""
         aim_left = values["aim_left"]
         position = aim_left.new_tensor([target.rear - self.distance, 0.0, self.height]).expand(len(aim_left), 3)
         aim_point = torch.stack([torch.full_like(aim_left, target.rear), aim_left, values["aim_up"]], -1)
         half_width = 0.5 * values["width"] / self.distance
         return {
-            "pose": aimed(position, aim_point, values["angle"]),
+            "pose": aimed_poses(position, aim_point, values["angle"]),
             "power": values["watts"] * LUMEN_PER_WATT,
             "spread": torch.stack([torch.full_like(half_width, self.fan), half_width], -1),
             "colour": spectral_colour(values["wavelength"]),
         }
 
-    def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
+    def change(self, values: Mapping[str, Tensor], picture: LitImage, target: TargetSize) -> Tensor:
         """Return the radiance that the laser adds to an image."""
         return added_light(SceneLamp(_IDENTITY, 1.0, square=True), picture, **self._lamp(values, target))
 
-    def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
+    def edit(self, values: Mapping[str, float], target: TargetSize) -> SceneEdit:
         """Return the laser as a scene edit."""
-        lamp_values = {name: numbers(value) for name, value in self._lamp(at_values(values), target).items()}
+        lamp_values = {name: first_array(value) for name, value in self._lamp(value_tensors(values), target).items()}
         return SceneEdit(lamps=(lamp_of(lamp_values, square=True),))
 
     def power(self, values: Mapping[str, float]) -> float:
         """Return the luminous flux of the laser, lumen."""
         wavelength = torch.tensor([values["wavelength"]], dtype=torch.float64)
-        return values["watts"] * LUMEN_PER_WATT * float(matching(wavelength)[0, 1])
+        return values["watts"] * LUMEN_PER_WATT * float(colour_matching(wavelength)[0, 1])
 
 
-def matching(wavelength: Tensor) -> Tensor:
+def colour_matching(wavelength: Tensor) -> Tensor:
     """Return the CIE 1931 colour matching functions x, y, z of wavelengths [N] in nm: [N, 3].
 
     Source: the multi-lobe fit of Wyman, Sloan and Shirley, Simple Analytic Approximations to the CIE XYZ Color
@@ -115,4 +122,4 @@ def spectral_colour(wavelength: Tensor) -> Tensor:
 
     White light of the same luminance is (y, y, y). Components outside the gamut of sRGB are clipped at 0.
     """
-    return (matching(wavelength) @ wavelength.new_tensor(TO_SRGB).T).clamp_min(0.0)
+    return (colour_matching(wavelength) @ wavelength.new_tensor(TO_SRGB).T).clamp_min(0.0)

@@ -14,17 +14,17 @@ from torch import Tensor
 from ssad.core.schema import Number
 from ssad.core.types import F64
 from ssad.rendering.camera.scene_edit import SceneEdit
-from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.lit_image import LitImage
 
 Ranges = Mapping[str, tuple[float, float]]
-"""Names of what is searched -> least and greatest value, in the units of their names."""
+"""Name of a searched setting -> minimum and maximum, in the unit of its name."""
 
-Away = Annotated[Number, Field(ge=1.0)]
-"""From the target's rear to a lamp, m."""
+LampDistance = Annotated[Number, Field(ge=1.0)]
+"""Distance from the target's rear to a lamp, m."""
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class TargetSize:
     """Dimensions of a target for the light on its rear.
 
     Attributes:
@@ -59,10 +59,10 @@ class LightAttack(Protocol):
     def search(self) -> Literal["swarm", "greedy", "gradient"]:
         """Default search."""
 
-    def ranges(self, target: Target) -> Ranges:
+    def ranges(self, target: TargetSize) -> Ranges:
         """Return the ranges of the searched settings."""
 
-    def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
+    def change(self, values: Mapping[str, Tensor], picture: LitImage, target: TargetSize) -> Tensor:
         """Return the radiance that settings add to an image.
 
         Args:
@@ -74,38 +74,38 @@ class LightAttack(Protocol):
             [N, h, w, 3]; differentiable where `search` is gradient.
         """
 
-    def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
+    def edit(self, values: Mapping[str, float], target: TargetSize) -> SceneEdit:
         """Return the settings as a scene edit, to be rendered."""
 
     def power(self, values: Mapping[str, float]) -> float | None:
         """Return the luminous flux of the device, lumen; None for one without light."""
 
 
-def aimed(place: Tensor, point: Tensor, roll: Tensor | None = None) -> Tensor:
-    """Poses [N, 4, 4] of lamps (x across, y down, z ahead) that stand at places and look at points [N, 3].
+def aimed_poses(position: Tensor, aim_point: Tensor, roll: Tensor | None = None) -> Tensor:
+    """Return poses [N, 4, 4] of lamps (x across, y down, z ahead) that stand at positions and aim at points [N, 3].
 
     Args:
-        place: Where they are.
-        point: Where they look, not straight up or down.
+        position: Positions of the lamps.
+        aim_point: Points that they aim at, not straight above or below.
         roll: Turn about the axis [N], rad.
     """
-    ahead = torch.nn.functional.normalize(point - place, dim=-1)
-    up = place.new_tensor([0.0, 0.0, 1.0]).expand_as(ahead)
+    ahead = torch.nn.functional.normalize(aim_point - position, dim=-1)
+    up = position.new_tensor([0.0, 0.0, 1.0]).expand_as(ahead)
     across = torch.nn.functional.normalize(torch.linalg.cross(ahead, up), dim=-1)
     down = torch.linalg.cross(ahead, across)
     if roll is not None:
         cos, sin = torch.cos(roll)[:, None], torch.sin(roll)[:, None]
         across, down = cos * across + sin * down, cos * down - sin * across
-    upper_rows = torch.cat([torch.stack([across, down, ahead], -1), place[..., None]], -1)
-    last_row = place.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(place), 1, 4)
+    upper_rows = torch.cat([torch.stack([across, down, ahead], -1), position[..., None]], -1)
+    last_row = position.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(position), 1, 4)
     return torch.cat([upper_rows, last_row], 1)
 
 
-def at_values(values: Mapping[str, float]) -> dict[str, Tensor]:
+def value_tensors(values: Mapping[str, float]) -> dict[str, Tensor]:
     """Convert one setting to tensors [1] of double precision."""
     return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
 
 
-def numbers(tensor: Any) -> F64:
+def first_array(tensor: Any) -> F64:
     """Convert the first element of a batch to an array."""
     return np.asarray(tensor[0].detach().cpu().numpy(), np.float64)

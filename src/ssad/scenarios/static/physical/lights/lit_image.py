@@ -27,7 +27,7 @@ BLIND: Final = ShadowCard(np.array([[0.0, y, z] for y, z in ((-9.0, -9.0), (9.0,
 
 
 @dataclass(frozen=True, slots=True)
-class LitPicture:
+class LitImage:
     """Image whose target can be lit and shaded.
 
     Attributes:
@@ -78,7 +78,7 @@ class LitPicture:
         return whole
 
 
-def lit_picture(
+def render_lit_image(
     scene: RenderScene,
     view: View,
     tag: int,
@@ -87,7 +87,7 @@ def lit_picture(
     *,
     blind: int,
     device: str | torch.device = "cpu",
-) -> LitPicture:
+) -> LitImage:
     """Render a view once, as a function of the light on a target.
 
     Args:
@@ -99,13 +99,13 @@ def lit_picture(
         blind: Index of the body of `BLIND` in the scene.
         device: Device of the images.
     """
-    picture = render(scene, [view], surface=True)
-    surface, crop = picture.surface, (0, rows, columns)
+    rendering = render(scene, [view], surface=True)
+    surface, crop = rendering.surface, (0, rows, columns)
     assert surface is not None
     pose = next(scene_object.pose for scene_object in view.objects if scene_object.tag == tag)
     sun = np.array(scene_light(view.weather)[0][0])
     # Two renderings, with and without the sun on the target, give the sun's share.
-    shaded = picture.radiance
+    shaded = rendering.radiance
     if sun[2] > 0.0:
         shaded = render(scene, [SceneEdit(cards=(BLIND,)).on(view, tag, cards=(blind,))]).radiance
     irradiance = surface.irradiance[crop]
@@ -114,16 +114,16 @@ def lit_picture(
     def on_device(array: Any) -> Tensor:
         return torch.from_numpy(np.array(array, np.float32)).to(device)
 
-    return LitPicture(
-        on_device(picture.image).permute(0, 3, 1, 2) / 255,
+    return LitImage(
+        on_device(rendering.image).permute(0, 3, 1, 2) / 255,
         (rows.start, columns.start),
-        on_device(picture.radiance[crop]),
-        on_device((picture.radiance - shaded)[crop]),
+        on_device(rendering.radiance[crop]),
+        on_device((rendering.radiance - shaded)[crop]),
         on_device(surface.albedo[crop] * surface_gain),
         on_device((surface.position[crop].astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]),
         on_device(surface.normal[crop] @ pose[:3, :3]),
         pose[:3, :3].T @ sun if sun[2] > 0.0 else None,
-        float(picture.exposure[0]),
+        float(rendering.exposure[0]),
         per_lux(view.weather),
         view.weather.fog,
         view.sensor,

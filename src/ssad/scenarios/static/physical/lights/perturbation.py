@@ -21,8 +21,8 @@ from ssad.rendering.camera.scene_edit import NO_EDIT
 from ssad.rendering.hours import at_hour
 from ssad.rendering.target import TargetCar, parse_target
 from ssad.scenarios.static.perturbation import EGO, Perturbation, TargetImages
-from ssad.scenarios.static.physical.lights import LIGHTS, Projector, Target, make_light, random_settings
-from ssad.scenarios.static.physical.lights.export import Shining, load_light
+from ssad.scenarios.static.physical.lights import LIGHTS, Projector, TargetSize, make_light, random_settings
+from ssad.scenarios.static.physical.lights.export import LightSetup, load_light
 from ssad.world.models import MODELS
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ LAMPS: Final = {"laser": "watts", "projector": "lumens", "flashlight": "lumens"}
 
 
 @dataclass(frozen=True)
-class Light(Perturbation):
+class LightPerturbation(Perturbation):
     """Light on a car (paper III.A.1, non-invasive attacks), or the night in which lamps shine.
 
     Attributes:
@@ -60,7 +60,7 @@ class Light(Perturbation):
     family: str = field(default="light", init=False)
 
     def __post_init__(self) -> None:
-        self.shining(0)
+        self.setup(0)
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -73,7 +73,7 @@ class Light(Perturbation):
         folder = Path(self.light).expanduser()
         return folder if self.light not in (NIGHT, *LIGHTS) and (folder / "light.json").is_file() else None
 
-    def shining(self, seed: int) -> Shining | None:
+    def setup(self, seed: int) -> LightSetup | None:
         """Return the light with all its settings; None for the night alone.
 
         Args:
@@ -90,17 +90,17 @@ class Light(Perturbation):
         light, car = make_light(self.light, options), TargetCar()
         hour = getattr(light, "hour", NIGHT if self.light in LAMPS else "recorded")
         lower, upper = car.mesh().bounds()
-        target = Target(*(upper - lower).tolist())
+        target = TargetSize(*(upper - lower).tolist())
         if isinstance(light, Projector):
             texture_size = light.surface(target).size
-            draws = generator("random light", self.light, seed).random((3, *texture_size))
-            return Shining(self.light, options, hour, "sedan", {}, torch.from_numpy(draws.astype("float32")))
-        return Shining(self.light, options, hour, "sedan", random_settings(light, target, key=("loop", seed)))
+            colours = generator("random light", self.light, seed).random((3, *texture_size))
+            return LightSetup(self.light, options, hour, "sedan", {}, torch.from_numpy(colours.astype("float32")))
+        return LightSetup(self.light, options, hour, "sedan", random_settings(light, target, key=("loop", seed)))
 
     @property
     def hour(self) -> str:
         """Hour of the episodes: "recorded" (unchanged), or one of `ssad.rendering.hours.HOURS`."""
-        light = self.shining(0)
+        light = self.setup(0)
         return NIGHT if light is None else light.hour
 
     @property
@@ -111,7 +111,7 @@ class Light(Perturbation):
     @property
     def target(self) -> str:
         """Target that the light is made for; "" for the night alone."""
-        light = self.shining(0)
+        light = self.setup(0)
         return "" if light is None else light.target
 
     def version(self) -> str:
@@ -131,7 +131,7 @@ class Light(Perturbation):
 
     def in_loop(self, suite: SensorSuite, *, target: int, victim: Any, seed: int) -> SensorSuite:
         """Return the suite in which the light shines on an agent, at its hour."""
-        light = self.shining(seed)
+        light = self.setup(seed)
         suite = replace(suite, weather=at_hour(suite.weather, self.hour))
         return suite if light is None else suite.with_agent_edit(light.live(target))
 
@@ -145,7 +145,7 @@ class Light(Perturbation):
         Raises:
             ConfigError: The light is not made for a car.
         """
-        light = self.shining(0)
+        light = self.setup(0)
         if light is None:
             return images.lit(NIGHT, NO_EDIT)
         target = parse_target(light.target)

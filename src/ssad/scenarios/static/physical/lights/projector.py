@@ -19,8 +19,8 @@ from ssad.rendering.camera.lamps import SceneLamp
 from ssad.rendering.camera.scene import TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.camera.texture import to_linear
-from ssad.scenarios.static.physical.lights.light import Away, Target, aimed, numbers
-from ssad.scenarios.static.physical.textures.carrier import Surface
+from ssad.scenarios.static.physical.lights.light import LampDistance, TargetSize, aimed_poses, first_array
+from ssad.scenarios.static.physical.textures.carrier import TextureSurface
 from ssad.scenarios.static.physical.textures.optimise import TextureAttack
 from ssad.scenarios.static.physical.textures.printing import Expectation
 
@@ -46,7 +46,7 @@ class Projector:
     """
 
     lumens: Least = 5000.0
-    distance: Away = 5.0
+    distance: LampDistance = 5.0
     aside: Number = 0.35
     height: Least = 2.0
     size: Two[Annotated[Number, Field(ge=0.05)]] = (1.0, 0.9)
@@ -55,7 +55,7 @@ class Projector:
     name: str = "projector"
     search: str = field(default="gradient", init=False)
 
-    def lamp(self, target: Target) -> SceneLamp:
+    def lamp(self, target: TargetSize) -> SceneLamp:
         """Return the projector as a lamp in the target's frame, power in lumen; it shows texture 0."""
         position = [
             target.rear - self.distance * float(np.cos(self.aside)),
@@ -63,8 +63,8 @@ class Projector:
             self.height,
         ]
         rear_centre = [target.rear, 0.0, 0.5 * target.height]
-        pose = numbers(
-            aimed(*(torch.tensor([coordinates], dtype=torch.float64) for coordinates in (position, rear_centre)))
+        pose = first_array(
+            aimed_poses(*(torch.tensor([coordinates], dtype=torch.float64) for coordinates in (position, rear_centre)))
         )
         range_to_rear = float(np.linalg.norm(np.subtract(rear_centre, position)))
         spread = (
@@ -74,18 +74,18 @@ class Projector:
         )
         return SceneLamp(pose, self.lumens, spread, square=True, texture=0)
 
-    def surface(self, target: Target) -> Surface:
+    def surface(self, target: TargetSize) -> TextureSurface:
         """Return the surface to train; all texels are visible."""
         width, height = self.size[0] * target.width, self.size[1] * target.height
         longest = max(width, height)
         size = max(1, round(self.texels * height / longest)), max(1, round(self.texels * width / longest))
-        return Surface(TextureLayer(0), size, np.ones(size, bool), (width, height))
+        return TextureSurface(TextureLayer(0), size, np.ones(size, bool), (width, height))
 
     def light_of(self, colour: Tensor) -> Tensor:
         """Return the transmitted share of the light [3, H, W] for an image in sRGB."""
         return self.leak + (1.0 - self.leak) * to_linear(colour.clamp(0.0, 1.0))
 
-    def edit(self, colour: Tensor, target: Target) -> SceneEdit:
+    def edit(self, colour: Tensor, target: TargetSize) -> SceneEdit:
         """Return an image, sRGB [3, H, W], as a scene edit."""
         return SceneEdit(lamps=(self.lamp(target),), textures={0: self.light_of(colour)})
 

@@ -20,28 +20,28 @@ from ssad.core.seeding import digest, generator
 from ssad.core.types import F64
 from ssad.scenarios.static.digital.objectives import Aim, Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
-from ssad.scenarios.static.physical.lights.light import LightAttack, Target
-from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.light import LightAttack, TargetSize
+from ssad.scenarios.static.physical.lights.lit_image import LitImage
 from ssad.scenarios.static.physical.zoom import around_target
 
 TARGET = Aim(objects=(0,))  # the target is the first object of each image's truth
 INERTIA, PULL = 0.7298, 1.4962  # of a swarm that converges (Clerc and Kennedy, IEEE Trans. Evol. Comput. 6, 2002)
-FASTEST = 0.3  # maximum speed of a particle, sides of the space per round
+MAX_SPEED = 0.3  # maximum speed of a particle, sides of the space per round
 STEPS = (0.2, 0.1, 0.05)  # step sizes of the greedy search, one after the other
 POWER = ("watts", "lumens")  # settings that determine the strength of a light
-AT_ONCE = 16  # images per call of a detector
+BATCH = 16  # images per call of a detector
 
 
 @dataclass(frozen=True, slots=True)
 class LitView:
     """Image to search on, and its ground truth, the target first."""
 
-    picture: LitPicture
+    picture: LitImage
     truth: Truth
 
 
 @checked_dataclass(frozen=True, slots=True, config=VALUES)
-class Budget:
+class SearchBudget:
     """Budget of a search.
 
     Attributes:
@@ -59,17 +59,17 @@ class Budget:
     searches: Whole = 1
 
     @model_validator(mode="after")
-    def _enough(self) -> Self:
+    def _check_members(self) -> Self:
         if self.members > self.settings:
             raise ValueError(f"members={self.members}: more than the settings that are tried ({self.settings})")
         return self
 
 
-USUAL = Budget()
+USUAL = SearchBudget()
 
 
 @dataclass(slots=True)
-class Found:
+class LightSearchResult:
     """Result of a search.
 
     Attributes:
@@ -87,20 +87,20 @@ class Found:
     best: list[float] = field(default_factory=list)
 
 
-Ask = Callable[[F64], F64]
+LossFunction = Callable[[F64], F64]
 """Settings in the unit cube [N, D] -> the loss of each [N], which is ascended."""
 
 
 def search_light(
     attack: LightAttack,
     detector: Detector,
-    target: Target,
+    target: TargetSize,
     views: Sequence[LitView],
     *,
-    budget: Budget = USUAL,
+    budget: SearchBudget = USUAL,
     search: Literal["swarm", "greedy", "gradient"] | None = None,
     key: tuple[object, ...] = (),
-) -> Found:
+) -> LightSearchResult:
     """Search for the settings of a light under which a target is detected worst.
 
     Args:
@@ -137,21 +137,21 @@ def search_light(
                     int(digest("light window", attack.name, *key, view_index)[:15], 16)
                 )
                 images, truth = around_target(images, truth, budget.window, crop_generator)
-            losses = [_loss(detector, batch_images, truth) for batch_images in torch.split(images, AT_ONCE)]
+            losses = [_loss(detector, batch_images, truth) for batch_images in torch.split(images, BATCH)]
             total = total + torch.cat(losses).to(total)
         return total / len(views)
 
     best_point, best_losses = np.empty(0), list[float]()
     for search_index in range(budget.searches):
-        draws = generator("light search", attack.name, *key, *([search_index] if search_index else []))
+        random = generator("light search", attack.name, *key, *([search_index] if search_index else []))
         with steady(detector):
             if method == "gradient":
-                candidate, losses = _descend(loss, len(ranges), budget, draws)
+                candidate, losses = _descend(loss, len(ranges), budget, random)
             else:
                 with torch.no_grad():
-                    loss_function: Ask = lambda settings: loss(torch.from_numpy(settings)).numpy()  # noqa: E731
+                    loss_function: LossFunction = lambda settings: loss(torch.from_numpy(settings)).numpy()  # noqa: E731
                     candidate, losses = (_swarm if method == "swarm" else _greedy)(
-                        loss_function, len(ranges), budget, draws
+                        loss_function, len(ranges), budget, random
                     )
         if not best_losses or losses[-1] > best_losses[-1]:
             best_point = candidate
@@ -161,13 +161,13 @@ def search_light(
         name: float(lowest + (highest - lowest) * share)
         for (name, (lowest, highest)), share in zip(ranges.items(), best_point.tolist(), strict=True)
     }
-    return Found(values, best_losses[-1], best_losses[0], query_count[0], best_losses)
+    return LightSearchResult(values, best_losses[-1], best_losses[0], query_count[0], best_losses)
 
 
-def random_settings(attack: LightAttack, target: Target, *, key: tuple[object, ...]) -> dict[str, float]:
+def random_settings(attack: LightAttack, target: TargetSize, *, key: tuple[object, ...]) -> dict[str, float]:
     """Draw settings uniformly over their ranges, at full power, the strongest that a search can choose."""
-    draws = generator("random light", attack.name, *key)
-    values = {name: float(draws.uniform(lowest, highest)) for name, (lowest, highest) in attack.ranges(target).items()}
+    random = generator("random light", attack.name, *key)
+    values = {name: float(random.uniform(lowest, highest)) for name, (lowest, highest) in attack.ranges(target).items()}
     return {name: attack.ranges(target)[name][1] if name in POWER else value for name, value in values.items()}
 
 
@@ -179,51 +179,55 @@ def _loss(detector: Detector, images: Tensor, truth: Truth) -> Tensor:
     return make_objective("hide")(dense, Situation(detector, assignment, TARGET))
 
 
-def _swarm(ask: Ask, dimensions: int, budget: Budget, draws: np.random.Generator) -> tuple[F64, list[float]]:
-    """A particle swarm in the unit cube (Kennedy and Eberhart 1995)."""
-    positions = draws.random((budget.members, dimensions))
-    velocities = draws.uniform(-FASTEST, FASTEST, positions.shape)
-    personal_best, personal_loss = positions.copy(), ask(positions)
+def _swarm(
+    loss_function: LossFunction, dimensions: int, budget: SearchBudget, random: np.random.Generator
+) -> tuple[F64, list[float]]:
+    """Run a particle swarm in the unit cube (Kennedy and Eberhart 1995)."""
+    positions = random.random((budget.members, dimensions))
+    velocities = random.uniform(-MAX_SPEED, MAX_SPEED, positions.shape)
+    personal_best, personal_loss = positions.copy(), loss_function(positions)
     best_losses = [float(personal_loss.max())]
     for _ in range(budget.settings // budget.members - 1):
         leader = personal_best[int(personal_loss.argmax())]
-        weights = draws.random((2, *positions.shape))
+        weights = random.random((2, *positions.shape))
         velocities = INERTIA * velocities + PULL * (
             weights[0] * (personal_best - positions) + weights[1] * (leader - positions)
         )
-        velocities = velocities.clip(-FASTEST, FASTEST)
+        velocities = velocities.clip(-MAX_SPEED, MAX_SPEED)
         positions = positions + velocities
         is_outside = (positions < 0.0) | (positions > 1.0)
         positions, velocities = (
             positions.clip(0.0, 1.0),
             np.where(is_outside, -0.5 * velocities, velocities),
         )  # it bounces off the walls
-        losses = ask(positions)
+        losses = loss_function(positions)
         improved = losses > personal_loss
         personal_best[improved], personal_loss[improved] = positions[improved], losses[improved]
         best_losses.append(float(personal_loss.max()))
     return personal_best[int(personal_loss.argmax())], best_losses
 
 
-def _greedy(ask: Ask, dimensions: int, budget: Budget, draws: np.random.Generator) -> tuple[F64, list[float]]:
-    """Random starts; from the best one, one coordinate after the other a step up or down while that helps.
+def _greedy(
+    loss_function: LossFunction, dimensions: int, budget: SearchBudget, random: np.random.Generator
+) -> tuple[F64, list[float]]:
+    """Step from the best of some random starts, one coordinate after the other, while that helps.
 
     The greedy search of AdvLB: of its candidates in a coordinate the best is taken if it is better than what was there.
     """
-    initial_points = draws.random((budget.members, dimensions))
-    losses = ask(initial_points)
+    initial_points = random.random((budget.members, dimensions))
+    losses = loss_function(initial_points)
     point, best_loss = initial_points[int(losses.argmax())].copy(), float(losses.max())
     best_losses, remaining = [float(losses[0]), best_loss], budget.settings - budget.members
     for step in STEPS:
         improved = True
         while improved and remaining >= 2:
             improved = False
-            for axis in draws.permutation(dimensions).tolist():
+            for axis in random.permutation(dimensions).tolist():
                 if remaining < 2:
                     break
                 candidates = np.stack([point, point])
                 candidates[:, axis] = np.clip(point[axis] + np.array([-step, step]), 0.0, 1.0)
-                candidate_losses = ask(candidates)
+                candidate_losses = loss_function(candidates)
                 remaining -= 2
                 if float(candidate_losses.max()) > best_loss:
                     point, best_loss, improved = (
@@ -236,11 +240,11 @@ def _greedy(ask: Ask, dimensions: int, budget: Budget, draws: np.random.Generato
 
 
 def _descend(
-    loss: Callable[[Tensor], Tensor], dimensions: int, budget: Budget, draws: np.random.Generator
+    loss: Callable[[Tensor], Tensor], dimensions: int, budget: SearchBudget, random: np.random.Generator
 ) -> tuple[F64, list[float]]:
     """Run Adam from the best of some random starts, with points clipped to the unit cube."""
     with torch.no_grad():
-        initial_points = torch.from_numpy(draws.random((budget.members, dimensions)))
+        initial_points = torch.from_numpy(random.random((budget.members, dimensions)))
         initial_losses = loss(initial_points)
     point = initial_points[int(initial_losses.argmax())].clone()[None].requires_grad_()
     best_point, best_loss = point.detach().clone(), float(initial_losses.max())

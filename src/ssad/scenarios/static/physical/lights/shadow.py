@@ -14,8 +14,8 @@ from torch import Tensor
 from ssad.core.schema import VALUES, Least, Number
 from ssad.core.types import F64
 from ssad.rendering.camera.scene_edit import SceneEdit, ShadowCard
-from ssad.scenarios.static.physical.lights.light import Ranges, Target
-from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.light import Ranges, TargetSize
+from ssad.scenarios.static.physical.lights.lit_image import LitImage
 
 
 @dataclass(frozen=True, slots=True, config=VALUES)
@@ -40,7 +40,7 @@ class Shadow:
     name: str = "shadow"
     search: Literal["swarm", "greedy", "gradient"] = "swarm"
 
-    def ranges(self, target: Target) -> Ranges:
+    def ranges(self, target: TargetSize) -> Ranges:
         """Return the ranges of the three corners."""
         half_width, margin = 0.5 * target.width, self.beyond
         lateral_range = -half_width * (1.0 + 2.0 * margin), half_width * (1.0 + 2.0 * margin)
@@ -51,11 +51,11 @@ class Shadow:
             for side, bounds in (("left", lateral_range), ("up", height_range))
         }
 
-    def outline(self, values: Mapping[str, float], target: Target) -> F64:
+    def outline(self, values: Mapping[str, float], target: TargetSize) -> F64:
         """Return the corners of the shadow on the plane of the rear [3, 3], target's frame."""
         return np.array([[target.rear, values[f"left_{corner}"], values[f"up_{corner}"]] for corner in "abc"])
 
-    def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
+    def change(self, values: Mapping[str, Tensor], picture: LitImage, target: TargetSize) -> Tensor:
         """Return the sunlight that the card takes from an image."""
         count = len(values["left_a"])
         if picture.sun_direction is None:
@@ -77,7 +77,7 @@ class Shadow:
         inside = ((all_sides >= 0.0).all(0) | (all_sides <= 0.0).all(0)) & is_behind_card
         return -picture.sun * inside[..., None]
 
-    def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
+    def edit(self, values: Mapping[str, float], target: TargetSize) -> SceneEdit:
         """Return the card as a scene edit."""
         return SceneEdit(cards=(ShadowCard(self.outline(values, target), self.away),))
 

@@ -46,9 +46,9 @@ class Distraction:
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """Return the negative mean attention of the parts for each image."""
         maps = attention(dense, situation, dense.features)
-        boxes = torch.stack(_targets(situation)).to(maps[0])
+        boxes = torch.stack(_target_boxes(situation)).to(maps[0])
         crops = torch.stack([_crop(level, boxes, dense.size, self.window) for level in maps])
-        return -_parts(crops.flatten(0, 1)).reshape(len(maps), -1).mean(0)
+        return -_mean_part_attention(crops.flatten(0, 1)).reshape(len(maps), -1).mean(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +71,10 @@ class Redistribution:
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """Return the weighted attention around minus on the target, for each image."""
-        boxes = _targets(situation)
+        boxes = _target_boxes(situation)
         total = torch.zeros(len(boxes), device=dense.logit.device, dtype=dense.logit.dtype)
         for level in attention(dense, situation, dense.features):
-            target_mask = _inside(level, boxes, dense.size)
+            target_mask = _box_mask(level, boxes, dense.size)
             target_attention = (level * target_mask).sum((1, 2)) / target_mask.sum((1, 2)).clamp_min(1.0)
             background_attention = (level * (1 - target_mask)).sum((1, 2)) / (1 - target_mask).sum((1, 2)).clamp_min(
                 1.0
@@ -116,7 +116,7 @@ def attention(dense: Dense, situation: Situation, features: tuple[Tensor, ...]) 
     return maps
 
 
-def _targets(situation: Situation) -> list[Tensor]:
+def _target_boxes(situation: Situation) -> list[Tensor]:
     """Return the box [4] that encloses the objects of the aim in each image."""
     target_boxes = []
     for truth in situation.assignment.truth:
@@ -125,7 +125,7 @@ def _targets(situation: Situation) -> list[Tensor]:
     return target_boxes
 
 
-def _inside(level: Tensor, boxes: list[Tensor], size: tuple[int, int]) -> Tensor:
+def _box_mask(level: Tensor, boxes: list[Tensor], size: tuple[int, int]) -> Tensor:
     """Return 1 for the cells [B, h, w] of a map whose centre lies in the box, at least for one cell."""
     _, height, width = level.shape
     y = (torch.arange(height, device=level.device) + 0.5) * (size[0] / height)
@@ -151,17 +151,18 @@ def _crop(level: Tensor, box: Tensor, size: tuple[int, int], window: float) -> T
     return functional.grid_sample(level[:, None], torch.stack([x, y], -1), align_corners=False)[:, 0]
 
 
-def _parts(local: Tensor) -> Tensor:
-    """Mean over the 4-connected parts of maps [M, 7, 7] above their mean: a part's attention over the cells left free.
+def _mean_part_attention(maps: Tensor) -> Tensor:
+    """Return the mean over the 4-connected parts of maps [M, 7, 7] of a part's attention over the cells outside it.
 
     A map without a part counts with its mean.
     """
-    cell_values = local.flatten(1)
-    above = local.detach() > local.detach().mean((1, 2), keepdim=True)
+    cell_values = maps.flatten(1)
+    is_above_mean = maps.detach() > maps.detach().mean((1, 2), keepdim=True)
     labels = [
-        cv2.connectedComponents(binary_map, connectivity=4)[1] for binary_map in above.cpu().numpy().astype(np.uint8)
+        cv2.connectedComponents(binary_map, connectivity=4)[1]
+        for binary_map in is_above_mean.cpu().numpy().astype(np.uint8)
     ]
-    part_label = torch.from_numpy(np.stack(labels).reshape(len(labels), -1).astype(np.int64)).to(local.device)
+    part_label = torch.from_numpy(np.stack(labels).reshape(len(labels), -1).astype(np.int64)).to(maps.device)
     part_attention, part_cells = (
         torch.zeros_like(cell_values).scatter_add(1, part_label, addends)[:, 1:]
         for addends in (cell_values, torch.ones_like(cell_values))

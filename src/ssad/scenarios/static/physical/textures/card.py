@@ -83,24 +83,24 @@ def load_texture(name: str) -> tuple[Tensor, TextureCard]:
         card = TextureCard(**card_data)
     except TypeError as error:
         raise FormatError(f"{path}: not the card of a texture ({error})") from None
-    picture = read_image(path.with_suffix(".png"))
-    if _hash(picture) != card.hash:
+    image = read_image(path.with_suffix(".png"))
+    if _hash(image) != card.hash:
         raise FormatError(f"{path.with_suffix('.png')}: not the texture that its card describes; get both anew")
-    return torch.from_numpy(picture.copy()).permute(2, 0, 1).float() / 255, card
+    return torch.from_numpy(image.copy()).permute(2, 0, 1).float() / 255, card
 
 
-def save_texture(path: Path, picture: U8, card: TextureCard) -> None:
+def save_texture(path: Path, image: U8, card: TextureCard) -> None:
     """Write PATH.png and PATH.json.
 
     Args:
         path: Path without a suffix.
-        picture: RGB [H, W, 3].
+        image: RGB [H, W, 3].
         card: Card; its hash and version are set here.
     """
-    card_data = asdict(card) | {"hash": _hash(picture), "version": __version__}
-    save_picture(path.with_suffix(".png"), picture)
+    card_data = asdict(card) | {"hash": _hash(image), "version": __version__}
+    save_picture(path.with_suffix(".png"), image)
     safeio.write_atomic(path.with_suffix(".json"), safeio.dump_json(card_data, indent=1) + "\n")
 
 
-def _hash(picture: U8) -> str:
-    return hashlib.sha256(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes()).hexdigest()
+def _hash(image: U8) -> str:
+    return hashlib.sha256(str(image.shape).encode() + np.ascontiguousarray(image).tobytes()).hexdigest()

@@ -24,7 +24,7 @@ Texels = Annotated[int, Field(strict=True, ge=1, le=4096)]
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class TextureSurface:
     """Carrier on a certain body: everything needed to show a texture on it.
 
     Attributes:
@@ -63,7 +63,7 @@ class Carrier(Protocol):
     def name(self) -> str:
         """Name shown in tables."""
 
-    def on(self, mesh: Mesh) -> Surface:
+    def on(self, mesh: Mesh) -> TextureSurface:
         """Return the carrier on a body.
 
         Args:
@@ -95,7 +95,7 @@ class Patch:
     texels: Texels = 96
     name: str = "patch"
 
-    def on(self, mesh: Mesh) -> Surface:
+    def on(self, mesh: Mesh) -> TextureSurface:
         """Return the patch on a panel of a body."""
         u0, v0, u1, v1 = mesh.panel_rectangle(self.panel)
         panel_width, panel_height = metres_of(mesh, self.panel)
@@ -133,7 +133,7 @@ class Camouflage:
     texels: Texels = 128
     name: str = "camouflage"
 
-    def on(self, mesh: Mesh) -> Surface:
+    def on(self, mesh: Mesh) -> TextureSurface:
         """Return the whole paint of a body."""
         if not (mesh.panel >= 0).any():
             raise ConfigError("this body has no panels to paint")
@@ -141,7 +141,7 @@ class Camouflage:
 
 
 @checked_dataclass(frozen=True, slots=True, config=VALUES)
-class Road:
+class RoadPatch:
     """Rectangle painted on the road behind the target and moving with it, a stand-in for a fixed one.
 
     Attributes:
@@ -158,7 +158,7 @@ class Road:
     texels: Texels = 96
     name: str = "road"
 
-    def on(self, mesh: Mesh) -> Surface:
+    def on(self, mesh: Mesh) -> TextureSurface:
         """Return the rectangle behind a body."""
         lowest, _ = mesh.bounds()
         pose = np.eye(4)
@@ -168,14 +168,14 @@ class Road:
         longest = max(self.width, self.length)
         size = max(1, round(self.texels * self.length / longest)), max(1, round(self.texels * self.width / longest))
         decal = TextureDecal(0, pose, (self.width, self.length), tag=0)
-        return Surface(decal, size, np.ones(size, np.bool_), (self.width, self.length))
+        return TextureSurface(decal, size, np.ones(size, np.bool_), (self.width, self.length))
 
 
-def _surface(mesh: Mesh, rectangle: Rectangle, size: tuple[int, int], metres: tuple[float, float]) -> Surface:
+def _surface(mesh: Mesh, rectangle: Rectangle, size: tuple[int, int], metres: tuple[float, float]) -> TextureSurface:
     mask = paint_mask(mesh, size, rectangle)
     if not mask.any():
         raise ConfigError("no face of the body lies under the texture; choose another place")
-    return Surface(TextureLayer(0, rectangle), size, mask, metres)
+    return TextureSurface(TextureLayer(0, rectangle), size, mask, metres)
 
 
 def metres_of(mesh: Mesh, panel: str | None = None) -> tuple[float, float]:
@@ -207,7 +207,7 @@ def metres_of(mesh: Mesh, panel: str | None = None) -> tuple[float, float]:
     return float(u_metres), float(v_metres)
 
 
-def covered(surface: Surface, mesh: Mesh, paint: tuple[float, float, float]) -> Tensor:
+def covered_colour(surface: TextureSurface, mesh: Mesh, paint: tuple[float, float, float]) -> Tensor:
     """Return the mean colour of the surface under a texture, linear RGB [3].
 
     Args:

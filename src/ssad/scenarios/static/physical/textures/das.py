@@ -10,7 +10,7 @@ from ssad.scenarios.static.physical.textures.optimise import TextureAttack
 
 
 def das(**settings: Any) -> TextureAttack:
-    """The dual attention suppression attack: the attention for the target falls into small, weak parts.
+    """Return the dual attention suppression attack: the attention for the target falls into small, weak parts.
 
     The paper runs SGD with a learning rate of 0.01, a weight decay of 1e-4 and at most 200 epochs; the authors' code
     runs Adam. Adam is the default here, since it takes fewer epochs: attention is scaled to at most one, so the slope

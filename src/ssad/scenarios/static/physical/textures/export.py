@@ -23,8 +23,8 @@ from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.meshes.mesh import Mesh
 from ssad.rendering.meshes.obj_writer import write_obj
 from ssad.rendering.target import Target, parse_target
-from ssad.scenarios.static.physical import Surface, albedo_of, make_carrier
-from ssad.scenarios.static.physical.textures.carrier import covered, metres_of
+from ssad.scenarios.static.physical import TextureSurface, albedo_of, make_carrier
+from ssad.scenarios.static.physical.textures.carrier import covered_colour, metres_of
 from ssad.scenarios.static.physical.textures.inks import printable_colours
 from ssad.scenarios.static.physical.textures.printing import conspicuousness, non_printability
 
@@ -33,7 +33,7 @@ ATLAS = 2048  # texels of a side of the atlas that shows a patch
 
 
 @dataclass(frozen=True, slots=True)
-class Print:
+class PrintedTexture:
     """Texture with all settings that are needed to put it on its target again.
 
     Attributes:
@@ -50,7 +50,7 @@ class Print:
     target: str
     hour: str = field(default="recorded", init=False)
 
-    def on(self, mesh: Mesh) -> Surface:
+    def on(self, mesh: Mesh) -> TextureSurface:
         """Return the surface of the texture on a body.
 
         Raises:
@@ -73,11 +73,11 @@ class Print:
         return SceneEdit((surface.layer,), textures=textures, masks=masks)
 
     def live(self, agent: int) -> AgentEdit:
-        """An agent of the closed loop, a car or a walker, wears it, or every stop sign."""
+        """Return the edit in which a car or a walker of the closed loop, or every stop sign, wears it."""
         return AgentEdit(self.edit, parse_target(self.target), agent)
 
 
-def load_print(folder: Path) -> Print:
+def load_printed_texture(folder: Path) -> PrintedTexture:
     """Read a texture that `export_texture` wrote.
 
     Raises:
@@ -88,29 +88,29 @@ def load_print(folder: Path) -> Print:
         if hashlib.sha256(colour_bytes).hexdigest() != description["sha256"]:
             raise FormatError(f"{folder / 'texture.npz'}: not the texture that texture.json describes; export it again")
         colour = torch.from_numpy(safeio.load_npz(folder / "texture.npz")["colour"].copy())
-        return Print(colour, description["carrier"], description["options"], description["target"])
+        return PrintedTexture(colour, description["carrier"], description["options"], description["target"])
     except (KeyError, TypeError) as error:
         raise FormatError(f"{folder / 'texture.json'}: no exported texture ({error}); export it again") from None
 
 
-def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") -> list[Path]:
+def export_texture(out: Path, texture: PrintedTexture, *, dots: int = 1000, name: str = "") -> list[Path]:
     """Write a texture for a printer, and for programs that show meshes.
 
     Args:
         out: Folder: print.png, atlas.png, target.obj, target.mtl, texture.npz and texture.json.
-        made: The texture, its carrier and its target.
-        dots: Of print.png for each metre.
-        name: What texture.json calls it.
+        texture: The texture, its carrier and its target.
+        dots: Dots of print.png per metre.
+        name: Name in texture.json.
 
     Returns:
-        What was written.
+        Paths of the written files.
 
     Raises:
         ConfigError: The print has too many dots, or none; the texture does not fit on the target.
     """
-    target, colour = parse_target(made.target), made.colour
+    target, colour = parse_target(texture.target), texture.colour
     mesh = target.mesh()
-    surface = made.on(mesh)
+    surface = texture.on(mesh)
     width, height = (round(metres * dots) for metres in surface.metres)
     if dots < 1 or not (1 <= width <= LARGEST and 1 <= height <= LARGEST):
         raise ConfigError(
@@ -132,12 +132,12 @@ def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") 
     safeio.write_atomic(out / "texture.npz", colour_bytes)
     mask = torch.from_numpy(surface.mask.copy())
     printability = float(non_printability(colour, printable_colours(), mask))
-    colour_distance = float(conspicuousness(albedo_of(colour), covered(surface, mesh, target.colour), mask))
+    colour_distance = float(conspicuousness(albedo_of(colour), covered_colour(surface, mesh, target.colour), mask))
     description = {
         "name": name,
-        "target": made.target,
-        "carrier": made.carrier,
-        "options": dict(made.options),
+        "target": texture.target,
+        "carrier": texture.carrier,
+        "options": dict(texture.options),
         "dots_per_metre": dots,
         "sha256": hashlib.sha256(colour_bytes).hexdigest(),
         "metres": [round(metre, 4) for metre in surface.metres],
@@ -160,12 +160,12 @@ def _resized(texels: Any, size: tuple[int, int]) -> U8:
     return np.asarray((enlarged.clip(0.0, 1.0) * 255).round(), np.uint8)
 
 
-def _rectangle(surface: Surface) -> tuple[float, float, float, float]:
+def _rectangle(surface: TextureSurface) -> tuple[float, float, float, float]:
     """Return the rectangle of a texture in the atlas; an empty one if it lies beside the target."""
     return (0.0, 0.0, 0.0, 0.0) if isinstance(surface.layer, TextureDecal) else surface.layer.rectangle
 
 
-def _atlas(texels: Any, surface: Surface, target: Target) -> U8:
+def _atlas(texels: Any, surface: TextureSurface, target: Target) -> U8:
     """Return the image of the whole atlas: paint, and the texture on it."""
     u0, v0, u1, v1 = _rectangle(surface)
     if (u0, v0, u1, v1) == (0.0, 0.0, 1.0, 1.0):

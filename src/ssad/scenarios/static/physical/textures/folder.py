@@ -17,10 +17,10 @@ from ssad.core.images import save_picture
 from ssad.core.protocols import Detector
 from ssad.scenarios.static.physical.textures.attacks import make_physical
 from ssad.scenarios.static.physical.textures.card import load_texture
-from ssad.scenarios.static.physical.textures.carrier import Surface
+from ssad.scenarios.static.physical.textures.carrier import TextureSurface
 from ssad.scenarios.static.physical.textures.controls import control, texture_picture
 from ssad.scenarios.static.physical.textures.inks import printable_colours
-from ssad.scenarios.static.physical.textures.optimise import View, train_texture
+from ssad.scenarios.static.physical.textures.optimise import TextureView, train_texture
 from ssad.scenarios.static.physical.textures.spec import TextureSpec
 
 
@@ -38,20 +38,20 @@ class TextureFolder:
     seed: int = 0
     device: str = "cpu"
 
-    def kept(self, spec: TextureSpec) -> Path:
+    def colour_path(self, spec: TextureSpec) -> Path:
         """Return the path of a finished texture."""
         return self.path / f"{spec.name}.npz"
 
-    def picture(self, spec: TextureSpec) -> Path:
+    def image_path(self, spec: TextureSpec) -> Path:
         """Return the path of a texture's image."""
         return self.path / spec.picture
 
     def texture(
         self,
         spec: TextureSpec,
-        surface: Surface,
+        surface: TextureSurface,
         *,
-        views: Callable[[], Sequence[View]],
+        views: Callable[[], Sequence[TextureView]],
         detector: Callable[[], Detector],
         paint: Tensor | None = None,
     ) -> Tensor:
@@ -72,24 +72,24 @@ class TextureFolder:
         """
         if spec.source:
             is_trained = spec.file is None
-            colour = self._trained(spec, surface, views, detector, paint) if is_trained else _read(spec, surface)
+            colour = self._train(spec, surface, views, detector, paint) if is_trained else _read(spec, surface)
             if spec.attack == "shuffled":
                 colour = control("shuffled", surface.size, seed=spec.number, trained=colour)
         else:
             colour = control(spec.attack, surface.size, seed=spec.number)
-        if not self.picture(spec).is_file():
-            save_picture(self.picture(spec), texture_picture(colour, surface.mask))
+        if not self.image_path(spec).is_file():
+            save_picture(self.image_path(spec), texture_picture(colour, surface.mask))
         return colour
 
-    def _trained(
+    def _train(
         self,
         spec: TextureSpec,
-        surface: Surface,
-        views: Callable[[], Sequence[View]],
+        surface: TextureSurface,
+        views: Callable[[], Sequence[TextureView]],
         detector: Callable[[], Detector],
         paint: Tensor | None,
     ) -> Tensor:
-        path = self.kept(spec)
+        path = self.colour_path(spec)
         if not path.is_file():
             trained = train_texture(
                 make_physical(spec.trained, **spec.settings),
@@ -112,11 +112,11 @@ class TextureFolder:
         """Return the training history of a texture for records; empty without training."""
         if not spec.trained:
             return {}
-        losses = safeio.load_npz(self.kept(spec))["losses"]
+        losses = safeio.load_npz(self.colour_path(spec))["losses"]
         return {"epochs": len(losses), "loss_before": float(losses[0]), "loss_after": float(losses[-1])}
 
 
-def _read(spec: TextureSpec, surface: Surface) -> Tensor:
+def _read(spec: TextureSpec, surface: TextureSurface) -> Tensor:
     """Load a texture from its file.
 
     Raises:

@@ -21,7 +21,7 @@ from ssad.core.schema import VALUES, Above, Least, Part, Whole
 from ssad.core.seeding import digest, generator
 from ssad.scenarios.static.digital.objectives import Aim, Objective, Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
-from ssad.scenarios.static.physical.textures.carrier import Surface, albedo_of
+from ssad.scenarios.static.physical.textures.carrier import TextureSurface, albedo_of
 from ssad.scenarios.static.physical.textures.printing import (
     Expectation,
     conspicuousness,
@@ -31,10 +31,10 @@ from ssad.scenarios.static.physical.textures.printing import (
 from ssad.scenarios.static.physical.zoom import STEP, around_target
 
 TARGET = Aim(objects=(0,))
-"""The target is the first object of each picture's truth."""
+"""The target is the first object of each image's truth."""
 
 
-class Shows(Protocol):
+class EditableImage(Protocol):
     """Protocol of an image whose target can wear textures."""
 
     @classmethod
@@ -45,7 +45,7 @@ class Shows(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class TextureView:
     """Image to train or test on.
 
     Attributes:
@@ -53,7 +53,7 @@ class View:
         truth: Ground truth, the target first.
     """
 
-    picture: Shows
+    picture: EditableImage
     truth: Truth
 
 
@@ -108,7 +108,7 @@ class TextureAttack:
 
 
 @dataclass(slots=True)
-class Trained:
+class TextureTrainingResult:
     """Trained texture and its training history.
 
     Attributes:
@@ -125,33 +125,33 @@ class Trained:
 def train_texture(
     attack: TextureAttack,
     detector: Detector,
-    surface: Surface,
-    views: Sequence[View],
+    surface: TextureSurface,
+    views: Sequence[TextureView],
     *,
     start: Tensor,
     printable: Tensor | None = None,
     paint: Tensor | None = None,
-    shown: Callable[[Tensor], Tensor] = albedo_of,
+    appearance: Callable[[Tensor], Tensor] = albedo_of,
     key: tuple[object, ...] = (),
     device: str | torch.device = "cpu",
     checkpoint: Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
-) -> Trained:
-    """Train a texture on pictures of its target.
+    progress: Callable[[int, int], None] = lambda completed, total: None,
+) -> TextureTrainingResult:
+    """Train a texture on images of its target.
 
     Args:
-        attack: How.
-        detector: What is attacked; its modes, flags and buffers are the same afterwards.
-        surface: What the texture is printed on.
-        views: Pictures whose target wears texture 0 on that surface; with 3D truth and a camera matrix for a 3D
+        attack: Settings of the training.
+        detector: Detector under attack; its modes, flags and buffers are restored afterwards.
+        surface: Surface that carries the texture.
+        views: Images whose target wears texture 0 on that surface; with 3D truth and a camera matrix for a 3D
             detector.
-        start: The first texture, sRGB [3, H, W].
+        start: Initial texture, sRGB [3, H, W].
         printable: Colours [N, 3] that can be printed, for `attack.printed`; None: that term is left out.
-        paint: Linear RGB [3] of what the texture covers, for `attack.stealth`.
-        shown: What pictures take of a texture's colours: the albedo of print, or the light of a projector.
-        key: What all draws come from.
-        device: Where the detector is.
-        checkpoint: Where the state is kept after each epoch; what is there already is continued, to the bit on the CPU,
+        paint: Linear RGB [3] of the covered surface, for `attack.stealth`.
+        appearance: Maps the colours of a texture to the albedo of its print, or to the light of a projector.
+        key: Key of all random draws.
+        device: Device of the detector.
+        checkpoint: File of the state after each epoch; an existing one is continued, to the bit on the CPU,
             also by more epochs than it was begun with.
         progress: Called with epochs done, and of how many.
 
@@ -188,8 +188,8 @@ def train_texture(
             loss_sum, steepest = 0.0, 0.0
             for step, batch_start in enumerate(range(0, len(order), attack.batch)):
                 batch_indices = order[batch_start : batch_start + attack.batch]
-                losses = _ascended(
-                    attack, objective, detector, views, colour, batch_indices.tolist(), shown, (*key, epoch, step)
+                losses = _ascended_losses(
+                    attack, objective, detector, views, colour, batch_indices.tolist(), appearance, (*key, epoch, step)
                 )
                 loss = -losses.mean() + attack.smooth * total_variation(colour, mask)
                 if ink_colours is not None and attack.printed > 0.0:
@@ -219,24 +219,29 @@ def train_texture(
             if checkpoint is not None:
                 state.save(checkpoint, training_id)
             progress(epoch + 1, attack.epochs)
-    return Trained(colour.detach().cpu(), state.losses, state.gradients)
+    return TextureTrainingResult(colour.detach().cpu(), state.losses, state.gradients)
 
 
-def _ascended(  # noqa: PLR0917
+def _ascended_losses(  # noqa: PLR0917
     attack: TextureAttack,
     objective: Objective,
     detector: Detector,
-    views: Sequence[View],
+    views: Sequence[TextureView],
     colour: Tensor,
-    chosen: list[int],
-    shown: Callable[[Tensor], Tensor],
+    image_indices: list[int],
+    appearance: Callable[[Tensor], Tensor],
     key: tuple[object, ...],
 ) -> Tensor:
-    """The loss [B] of some pictures, with texture, print and noise of their own."""
-    draws = [torch.Generator().manual_seed(int(digest("texture draw", *key, index)[:15], 16)) for index in chosen]
-    pictures, truth = [views[index].picture for index in chosen], [views[index].truth for index in chosen]
-    textures = shown(attack.expectation.draw(colour, draws))
-    images = type(pictures[0]).together(pictures, {0: textures}, draws)
+    """Return the loss [B] of some images, each with its own print and noise."""
+    draws = [
+        torch.Generator().manual_seed(int(digest("texture draw", *key, index)[:15], 16)) for index in image_indices
+    ]
+    images_to_dress, truth = (
+        [views[index].picture for index in image_indices],
+        [views[index].truth for index in image_indices],
+    )
+    textures = appearance(attack.expectation.draw(colour, draws))
+    images = type(images_to_dress[0]).together(images_to_dress, {0: textures}, draws)
     is_3d = detector.task == "3d"
     if attack.window is not None and not is_3d:
         crops = [
@@ -251,14 +256,16 @@ def _ascended(  # noqa: PLR0917
     return objective(dense, Situation(detector, assignment, TARGET))
 
 
-def _order(attack: TextureAttack, hard: Any, draws: np.random.Generator) -> Any:
-    """Numbers of the pictures of an epoch: each once, a share of them replaced by those that the attack fails on."""
-    order = draws.permutation(len(hard))
-    replaced = int(attack.worst * len(hard))
-    if replaced and np.ptp(hard) > 0.0:
-        standard_loss = -(hard - hard.mean()) / hard.std()  # a low loss: the target is still detected
+def _order(attack: TextureAttack, image_losses: Any, random: np.random.Generator) -> Any:
+    """Return the images of an epoch: each once, but a share replaced by those on which the attack fails."""
+    order = random.permutation(len(image_losses))
+    replaced = int(attack.worst * len(image_losses))
+    if replaced and np.ptp(image_losses) > 0.0:
+        standard_loss = (
+            -(image_losses - image_losses.mean()) / image_losses.std()
+        )  # a low loss: the target is still detected
         probability = np.exp(np.clip(standard_loss, -3.0, 3.0))
-        order[:replaced] = draws.choice(len(hard), size=replaced, p=probability / probability.sum())
+        order[:replaced] = random.choice(len(image_losses), size=replaced, p=probability / probability.sum())
     return order
 
 
@@ -273,7 +280,7 @@ class _State:
     gradients: list[float]
 
     def save(self, path: Path, name: str) -> None:
-        """Write everything, in one piece."""
+        """Write the state in one file."""
         optimiser_state = self.optimiser.state[self.colour]
         arrays = {"colour": self.colour.detach().cpu().numpy(), "hard": self.hard}
         arrays |= {"losses": np.array(self.losses), "gradients": np.array(self.gradients)}
@@ -284,7 +291,7 @@ class _State:
         safeio.save_npz(path, arrays)
 
     def load(self, path: Path, name: str) -> None:
-        """Read it again. FormatError: it is of another training."""
+        """Read the state from a file. FormatError: it is of another training."""
         arrays = safeio.load_npz(path)
         try:
             if arrays["name"].tobytes().decode() != name or arrays["colour"].shape != tuple(self.colour.shape):

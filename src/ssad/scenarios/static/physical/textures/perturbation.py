@@ -25,7 +25,7 @@ from ssad.rendering.target import TargetSign, TargetWalker, class_of_target, par
 from ssad.scenarios.static.perturbation import EGO, Perturbation, TargetImages
 from ssad.scenarios.static.physical.textures.card import load_texture
 from ssad.scenarios.static.physical.textures.carrier import albedo_of
-from ssad.scenarios.static.physical.textures.export import Print, load_print
+from ssad.scenarios.static.physical.textures.export import PrintedTexture, load_printed_texture
 from ssad.scenarios.static.physical.textures.spec import make_carrier
 from ssad.world.models import MODELS
 
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 CONTROLS: Final = {"grey": "sedan", "grey-sign": SIGN}
 """Name of a control -> its target, which is painted grey all over."""
-BESIDE: Final = 12.0  # m from a route within which its signs stand
+SIGN_DISTANCE: Final = 12.0  # m from a route within which its signs stand
 SIZES: Final = (1.0, 0.9, 0.8, 0.7, 0.6)  # sizes of a patch that are tried, as a share of the trained one
-AT_ONCE: Final = 16  # images that are shown at once on a GPU
+BATCH: Final = 16  # images that are shown at once on a GPU
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +60,16 @@ class Texture(Perturbation):
     family: str = field(default="texture", init=False)
 
     def __post_init__(self) -> None:
-        self.printed()
+        self.printed_texture()
 
     @property
     def name(self) -> str:  # type: ignore[override]
         """Name in tables and slices."""
         return self.label or (self.texture if self.texture in CONTROLS else Path(self.texture).stem)
 
-    def printed(self) -> Print:
+    def printed_texture(self) -> PrintedTexture:
         """Return the texture with all settings that put it on its target."""
-        return _printed(self.texture)
+        return _load_printed_texture(self.texture)
 
     @property
     def needs_target(self) -> bool:
@@ -79,7 +79,7 @@ class Texture(Perturbation):
     @property
     def target(self) -> str:
         """Target that the texture is made for."""
-        return self.printed().target
+        return self.printed_texture().target
 
     def version(self) -> str:
         """Return the hash of the texture; "" for the controls, which the code decides."""
@@ -87,7 +87,7 @@ class Texture(Perturbation):
 
     def applies_to(self, episode: Episode, town: LaneGraph) -> int | None:
         """Return the first car (or walker) besides the ego; for signs the ego, if one stands beside its route."""
-        target = parse_target(self.printed().target)
+        target = parse_target(self.printed_texture().target)
         if isinstance(target, TargetSign):
             route = episode.agents[EGO].route
             return EGO if route is not None and len(signs_of_route(town, route.xy)) else None
@@ -97,31 +97,31 @@ class Texture(Perturbation):
 
     def in_loop(self, suite: SensorSuite, *, target: int, victim: Any, seed: int) -> SensorSuite:
         """Return the suite in which an agent, or every stop sign, wears the texture."""
-        return suite.with_agent_edit(self.worn_by(target))
+        return suite.with_agent_edit(self.agent_edit(target))
 
-    def worn_by(self, agent: int) -> AgentEdit:
+    def agent_edit(self, agent: int) -> AgentEdit:
         """Return the edit in which an agent wears the texture; the agent is ignored for signs.
 
         A patch has its trained size, or a smaller one if the body has no room for it.
         """
-        printed = self.printed()
+        printed_texture = self.printed_texture()
         if self.texture in CONTROLS:
-            return printed.live(agent)
+            return printed_texture.live(agent)
 
         def edit(mesh: Mesh) -> SceneEdit:
             for share in SIZES:
                 options = {
                     key: share * value if key in ("width", "height") else value
-                    for key, value in printed.options.items()
+                    for key, value in printed_texture.options.items()
                 }
                 try:
-                    return replace(printed, options=options).edit(mesh)
+                    return replace(printed_texture, options=options).edit(mesh)
                 except ConfigError:
                     if share == SIZES[-1]:
                         raise
             raise AssertionError
 
-        return replace(printed.live(agent), edit=edit)
+        return replace(printed_texture.live(agent), edit=edit)
 
     def on_target(self, images: TargetImages) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image [1, 3, H, W] in 0 to 1, and truth of a recorded target that wears the texture.
@@ -129,11 +129,13 @@ class Texture(Perturbation):
         Raises:
             ConfigError: The texture does not fit on the target, or no image shows it.
         """
-        printed = self.printed()
-        return worn(images, albedo_of(printed.colour), printed.on(parse_target(printed.target).mesh()))
+        printed_texture = self.printed_texture()
+        return wearing_images(
+            images, albedo_of(printed_texture.colour), printed_texture.on(parse_target(printed_texture.target).mesh())
+        )
 
 
-def worn(images: TargetImages, albedo: Tensor, surface: Any) -> Iterator[tuple[str, Tensor, Truth]]:
+def wearing_images(images: TargetImages, albedo: Tensor, surface: Any) -> Iterator[tuple[str, Tensor, Truth]]:
     """Yield drive, image and truth of a recorded target that wears a texture.
 
     Args:
@@ -144,23 +146,23 @@ def worn(images: TargetImages, albedo: Tensor, surface: Any) -> Iterator[tuple[s
     colour = albedo.to(images.device)
     remaining = images.wearing(surface)
     # One at a time on the CPU: the bits of an image must not depend on its batch.
-    while batch := list(islice(remaining, 1 if images.device == "cpu" else AT_ONCE)):
+    while batch := list(islice(remaining, 1 if images.device == "cpu" else BATCH)):
         prepared = [view.picture for _, view in batch]
         with torch.no_grad():
-            shown = prepared[0].together(prepared, {0: colour.expand(len(batch), *colour.shape)})
-        for (drive, view), image in zip(batch, torch.split(shown, 1), strict=True):
+            worn_images = prepared[0].together(prepared, {0: colour.expand(len(batch), *colour.shape)})
+        for (drive, view), image in zip(batch, torch.split(worn_images, 1), strict=True):
             yield drive, image, view.truth
 
 
 @lru_cache(maxsize=64)
-def _printed(name: str) -> Print:
+def _load_printed_texture(name: str) -> PrintedTexture:
     if name in CONTROLS:
         surface = make_carrier("camouflage", {}).on(parse_target(CONTROLS[name]).mesh())
-        return Print(torch.full((3, *surface.size), 0.5), "camouflage", {}, CONTROLS[name])
+        return PrintedTexture(torch.full((3, *surface.size), 0.5), "camouflage", {}, CONTROLS[name])
     if is_export(name):
-        return load_print(Path(name).expanduser())
+        return load_printed_texture(Path(name).expanduser())
     texture, card = load_texture(name)
-    return Print(texture, card.carrier, card.options, card.target)
+    return PrintedTexture(texture, card.carrier, card.options, card.target)
 
 
 @lru_cache(maxsize=256)
@@ -180,12 +182,12 @@ def is_export(name: str) -> bool:
 
 def class_of_texture(name: str) -> str:
     """Return the class of the target of a texture, such as car or stop_sign."""
-    return class_of_target(parse_target(_printed(name).target))
+    return class_of_target(parse_target(_load_printed_texture(name).target))
 
 
 def signs_of_route(graph: LaneGraph, route: F32) -> F64:
     """Return the positions x, y [M, 2] of the stop signs along a route [N, 2]."""
     sign_positions = graph.sign_xy[graph.sign_kind == SignKind.STOP].astype(np.float64).reshape(-1, 2)
     route_distances = np.linalg.norm(sign_positions[:, None] - route[None], axis=-1).min(1)
-    nearby_signs: F64 = sign_positions[route_distances < BESIDE]
+    nearby_signs: F64 = sign_positions[route_distances < SIGN_DISTANCE]
     return nearby_signs

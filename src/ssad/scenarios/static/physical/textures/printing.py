@@ -152,9 +152,9 @@ def conspicuousness(albedo: Tensor, paint: Tensor, mask: Tensor | None = None) -
     return ((lab_difference.square().sum(1) + 1e-8).sqrt() - 1e-4).mean()
 
 
-def _lab(rows: Tensor) -> Tensor:
+def _lab(colours: Tensor) -> Tensor:
     """CIELAB [N, 3] of linear RGB [N, 3]."""
-    relative_xyz = rows @ rows.new_tensor(_XYZ).T / rows.new_tensor(_XYZ).sum(1)
+    relative_xyz = colours @ colours.new_tensor(_XYZ).T / colours.new_tensor(_XYZ).sum(1)
     linear_limit = (6.0 / 29.0) ** 3
     # Clamped, since the unused branch of `where` would give an infinite gradient at 0.
     f = torch.where(

@@ -11,10 +11,10 @@ from ssad.core import safeio
 from ssad.core.errors import unknown_name
 from ssad.core.schema import checked
 from ssad.core.seeding import digest
-from ssad.scenarios.static.physical.textures.carrier import Camouflage, Carrier, Patch, Road
+from ssad.scenarios.static.physical.textures.carrier import Camouflage, Carrier, Patch, RoadPatch
 from ssad.scenarios.static.physical.textures.controls import CONTROLS
 
-CARRIERS: dict[str, Callable[..., Carrier]] = {"patch": Patch, "camouflage": Camouflage, "road": Road}
+CARRIERS: dict[str, Callable[..., Carrier]] = {"patch": Patch, "camouflage": Camouflage, "road": RoadPatch}
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,29 +153,29 @@ def streaks(
 
 
 @wp.func
-def most_of(fields: wp.uint64, most: int) -> int:
-    """Return the largest of three fields of 8 bits, or `most` if that is larger; unpacked only if one is."""
-    if ((fields + wp.uint64(255 - most) * ONES) & OVER) != wp.uint64(0):
+def max_field(fields: wp.uint64, current_max: int) -> int:
+    """Return the largest of three fields of 8 bits, or `current_max` if that is larger; unpacked only if one is."""
+    if ((fields + wp.uint64(255 - current_max) * ONES) & OVER) != wp.uint64(0):
         word = gather(fields)
         red = int(word & wp.uint32(255))
         green = int((word >> wp.uint32(8)) & wp.uint32(255))
-        return wp.max(most, wp.max(red, wp.max(green, int(word >> wp.uint32(16)))))
-    return most
+        return wp.max(current_max, wp.max(red, wp.max(green, int(word >> wp.uint32(16)))))
+    return current_max
 
 
 @wp.func
-def greyed(fields: wp.uint64, rest: wp.uint64, base: wp.uint64) -> wp.uint64:
+def greyed(fields: wp.uint64, image_weight: wp.uint64, base: wp.uint64) -> wp.uint64:
     """Return (value * rest + base) / 1024, field by field."""
-    return ((fields * rest + base) >> wp.uint64(10)) & FIELDS
+    return ((fields * image_weight + base) >> wp.uint64(10)) & FIELDS
 
 
 @wp.func
 def put(
-    out: wp.array(dtype=wp.uint32), i: int, most: int, f0: wp.uint64, f1: wp.uint64, f2: wp.uint64, f3: wp.uint64
+    out: wp.array(dtype=wp.uint32), i: int, current_max: int, f0: wp.uint64, f1: wp.uint64, f2: wp.uint64, f3: wp.uint64
 ) -> int:
     """Write four pixels, given as fields, to three words from i on; returns the largest value so far."""
     put_four(out, i, gather(f0), gather(f1), gather(f2), gather(f3))
-    return most_of(f3, most_of(f2, most_of(f1, most_of(f0, most))))
+    return max_field(f3, max_field(f2, max_field(f1, max_field(f0, current_max))))
 
 
 @wp.func

@@ -82,7 +82,7 @@ def blend_clouds(
     low: wp.array(dtype=float),
     span: wp.array(dtype=float),
     amount: wp.array(dtype=float),
-    most: wp.array(dtype=float),
+    brightest: wp.array(dtype=float),
     grey: wp.array(dtype=float),
     step: float,
     width: int,
@@ -102,7 +102,7 @@ def blend_clouds(
     above = row % size
     below = (row + 1) % size
     row_start = b * stride + y * width * 3
-    image_gain = most[b] / (most[b] + amount[b]) * (1.0 - grey[b])
+    image_gain = brightest[b] / (brightest[b] + amount[b]) * (1.0 - grey[b])
     cloud_gain = amount[b] * 255.0 * image_gain / span[b]
     offset = 128.0 * grey[b] - low[b] * cloud_gain
     current_x = int(-1)

@@ -43,13 +43,13 @@ def add_noise(
 
 
 @wp.func
-def struck(value: wp.uint32, mine: int, fixed: int, rate: int, fixed_rate: int) -> wp.uint32:
+def struck(value: wp.uint32, fresh: int, fixed: int, rate: int, fixed_rate: int) -> wp.uint32:
     """Return a byte, or 0 or 255 where one of two draws is below its rate (of 65536)."""
     result = value
     if fixed < fixed_rate:
         result = wp.uint32((fixed & 1) * 255)
-    if mine < rate:
-        result = wp.uint32((mine & 1) * 255)
+    if fresh < rate:
+        result = wp.uint32((fresh & 1) * 255)
     return result
 
 

@@ -130,10 +130,10 @@ def blend_air(
 
 
 @wp.func
-def opacity(layer: wp.array3d(dtype=int), b: int, near: int, other: int, column: int) -> int:
+def opacity(layer: wp.array3d(dtype=int), b: int, near_row: int, far_row: int, column: int) -> int:
     """Return the opacity (of 65536, times 4) of a column of the half-resolution layer, between two of its rows."""
     x = wp.clamp(column, 0, layer.shape[2] - 1)
-    return 3 * layer[b, near, x] + layer[b, other, x]
+    return 3 * layer[b, near_row, x] + layer[b, far_row, x]
 
 
 @wp.func

@@ -76,7 +76,7 @@ def level(depth: wp.array3d(dtype=float), b: int, y: int, x: int, focal: wp.vec4
 def find_ground(
     lens: wp.array(dtype=wp.vec4),
     to_ego: wp.array(dtype=wp.mat44),
-    given: wp.array(dtype=int),
+    is_depth_given: wp.array(dtype=int),
     boxes: wp.array(dtype=Footprint),
     first: wp.array(dtype=int),
     depth: wp.array3d(dtype=float),
@@ -94,7 +94,7 @@ def find_ground(
     for x in range(depth.shape[2]):
         cell_depth = depth[b, y, x]
         share = float(0.0)
-        if given[b] == 0:
+        if is_depth_given[b] == 0:
             ray_slope = wp.transform_vector(pose, place_of(focal, x, y, 1.0))[2]
             if ray_slope < 0.0:
                 plane_depth = -pose[2, 3] / ray_slope
@@ -104,7 +104,7 @@ def find_ground(
                         cell_depth = plane_depth
                         depth[b, y, x] = plane_depth
         point = wp.transform_point(pose, place_of(focal, x, y, cell_depth))
-        if given[b] == 1 and cell_depth < FARTHEST_GROUND:
+        if is_depth_given[b] == 1 and cell_depth < FARTHEST_GROUND:
             share = wp.clamp(2.0 - 2.0 * wp.abs(point[2]) / (0.4 + 0.012 * cell_depth), 0.0, 1.0)
             if share > 0.0:
                 share *= level(depth, b, y, x, focal, pose)
@@ -115,7 +115,7 @@ def find_ground(
                 offset_y = point[1] - box.y
                 lateral = wp.abs(offset_y * box.cos - offset_x * box.sin)
                 if wp.abs(offset_x * box.cos + offset_y * box.sin) < box.half_length and lateral < box.half_width:
-                    share *= float(given[b]) * wp.clamp(2.0 - wp.abs(point[2] - box.base) * 20.0, 0.0, 1.0)
+                    share *= float(is_depth_given[b]) * wp.clamp(2.0 - wp.abs(point[2] - box.base) * 20.0, 0.0, 1.0)
         out[b, y, x] = share
 
 
