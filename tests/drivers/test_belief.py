@@ -16,7 +16,7 @@ from ssad.drivers import make_system
 from ssad.drivers.belief import DegradedBelief, LineOfSight
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.world.belief import Lanes, rested
+from ssad.world.belief import Lanes, rest_times
 from ssad.world.roads import load_town
 from ssad.world.rollout import Loop, rollout
 from ssad.world.sensors import SENSORS
@@ -303,7 +303,7 @@ def test_how_long_somebody_has_stood_is_remembered_from_earlier_beliefs() -> Non
     now = moved | {"kind": np.array([[1, 1, 1]])}
     before = now | {"pose": now["pose"] + [0.5, 0, 0], "waited": np.array([[2.0, 3.0, 4.0]])}
     before["kind"] = np.array([[1, 0, 1]])  # nobody was known of where the second is
-    assert rested(now, before, np.array([0.5]))[0] == pytest.approx([2.5, 0.0, 0.0])
+    assert rest_times(now, before, np.array([0.5]))[0] == pytest.approx([2.5, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("driver", [Autopilot(), Bare()])

@@ -8,7 +8,7 @@ import pytest
 from ssad.core.seeding import generator
 from ssad.metrics.rare_events import repeated_estimate, weighted_estimate, weighted_limits
 from ssad.world.rare.brute import monte_carlo
-from ssad.world.rare.importance import Proposal, importance, learn, sample
+from ssad.world.rare.importance import MixtureProposal, importance, learn, sample
 from ssad.world.rare.splitting import keys_of, splitting
 from tests.helpers.walk import Walk, chance_of
 
@@ -72,7 +72,7 @@ def test_where_everybody_stops_at_the_same_score_the_estimate_is_0() -> None:
 def test_weights_average_1_and_are_bounded_by_the_defence() -> None:
     walk = Walk(40_000, 9.26, steps=6)
     means = np.array([[0.5] * 6, [1.0, -0.5, 0.3, 0.0, 0.2, 0.1]])
-    drawn = sample(walk, Proposal(np.array([0.2, 0.5, 0.3]), means), generator("weights"), episodes=40_000)
+    drawn = sample(walk, MixtureProposal(np.array([0.2, 0.5, 0.3]), means), generator("weights"), episodes=40_000)
     assert drawn.weight.max() <= 5.0
     assert drawn.weight.mean() == pytest.approx(1.0, abs=4.0 * drawn.weight.std() / 200.0)
     # what was drawn is what the proposal says
@@ -85,7 +85,9 @@ def test_intervals_of_importance_sampling_hold(height: float, steps: int) -> Non
     truth, repeats, size = chance_of(height, steps), 1000, 300
     push = np.full((1, steps), height / steps)
     walk = Walk(repeats * size, height, steps=steps)
-    drawn = sample(walk, Proposal(np.array([0.1, 0.9]), push), generator("hold", height), episodes=repeats * size)
+    drawn = sample(
+        walk, MixtureProposal(np.array([0.1, 0.9]), push), generator("hold", height), episodes=repeats * size
+    )
     values = np.where(drawn.failed, drawn.weight, 0.0).reshape(repeats, size)
     low, high = weighted_limits(values.sum(1), (values**2).sum(1), values.max(1), size, unlike=True)
     held = ((low <= truth) & (truth <= high)).mean()

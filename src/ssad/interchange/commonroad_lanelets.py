@@ -145,7 +145,7 @@ class _Lanes:
             raise self.texts.fail(element, "a bound has fewer than two points")
         if len(sides[0]) != len(sides[1]):
             self.lost["lanelets whose bounds have different numbers of points are resampled"] += 1
-            sides = [_resampled(side, max(map(len, sides))) for side in sides]
+            sides = [_resample(side, max(map(len, sides))) for side in sides]
         middle = 0.5 * (sides[0] + sides[1])
         spacing = np.hypot(*np.diff(middle[:, :2], axis=0).T)
         is_distinct = np.concatenate([[True], spacing > _MIN_STEP])
@@ -364,7 +364,7 @@ def _kind(names: list[str]) -> LaneType:
     return lane_types[0] if lane_types else LaneType.DRIVING
 
 
-def _resampled(side: F64, count: int) -> F64:
+def _resample(side: F64, count: int) -> F64:
     distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(side[:, :2], axis=0).T))])
     sample_distances = np.linspace(0.0, distances[-1], count)
     return np.stack([np.interp(sample_distances, distances, side[:, axis]) for axis in range(3)], 1)

@@ -16,7 +16,7 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import F64, LaneType, SignalState
 from ssad.interchange import commonroad_xml as xml
-from ssad.interchange.commonroad_xml import node
+from ssad.interchange.commonroad_xml import add_element
 from ssad.scenarios.dynamic.knowledge._placing import turn_of
 from ssad.world.episode_arrays import signal_programs
 
@@ -113,58 +113,58 @@ def _lanelet(  # noqa: PLR0917
     signs: list[tuple[float, int]],
     high: bool,
 ) -> None:
-    element = node(root, "lanelet", id=lane + 1)
+    element = add_element(root, "lanelet", id=lane + 1)
     markings = graph.left_marking[lane], graph.right_marking[lane]
     for tag, bound_points, marking in zip(
         ("leftBound", "rightBound"), _bounds(graph, lane, high), markings, strict=True
     ):
-        bound = node(element, tag)
+        bound = add_element(element, tag)
         xml.points(bound, bound_points)
-        node(bound, "lineMarking", xml.MARKINGS[Marking(int(marking))])
+        add_element(bound, "lineMarking", xml.MARKINGS[Marking(int(marking))])
     for tag, neighbours in (("predecessor", graph.predecessors(lane)), ("successor", graph.successors(lane))):
         for neighbour in neighbours.tolist():
-            node(element, tag, ref=neighbour + 1)
+            add_element(element, tag, ref=neighbour + 1)
     for tag, neighbour in (("adjacentLeft", int(graph.left[lane])), ("adjacentRight", int(graph.right[lane]))):
         if neighbour >= 0:
             same_direction = graph.same_direction(lane, neighbour)
-            node(element, tag, ref=neighbour + 1, drivingDir="same" if same_direction else "opposite")
+            add_element(element, tag, ref=neighbour + 1, drivingDir="same" if same_direction else "opposite")
     if stops := lights or signs:
         x, y, yaw, width = graph.at(lane, stops[0][0])
         half_line = 0.5 * width * np.array([-math.sin(yaw), math.cos(yaw)])
-        line = node(element, "stopLine")
+        line = add_element(element, "stopLine")
         xml.points(line, [np.array([x, y]) + half_line, np.array([x, y]) - half_line])
-        node(line, "lineMarking", "solid")
+        add_element(line, "lineMarking", "solid")
         for tag, references in (("trafficSignRef", signs), ("trafficLightRef", lights)):
             for _, reference in references:
-                node(line, tag, ref=reference)
-    node(element, "laneletType", xml.LANE_TYPES[LaneType(int(graph.kind[lane]))])
+                add_element(line, tag, ref=reference)
+    add_element(element, "laneletType", xml.LANE_TYPES[LaneType(int(graph.kind[lane]))])
     if graph.junction[lane] >= 0:
-        node(element, "laneletType", "intersection")
-    node(element, "trafficSignRef", ref=speed)
+        add_element(element, "laneletType", "intersection")
+    add_element(element, "trafficSignRef", ref=speed)
     for tag, references in (("trafficSignRef", signs), ("trafficLightRef", lights)):
         for _, reference in references:
-            node(element, tag, ref=reference)
+            add_element(element, tag, ref=reference)
 
 
 def _crosswalk(root: Element, graph: LaneGraph, k: int, number: int) -> None:
     corners = graph.crosswalk(k)
     half = len(corners) // 2
-    element = node(root, "lanelet", id=number)
+    element = add_element(root, "lanelet", id=number)
     # The outline runs around the crosswalk; both bounds must run in one direction.
     for tag, bound_points in (("leftBound", corners[:half]), ("rightBound", corners[half:][::-1])):
-        xml.points(node(element, tag), bound_points)
-    node(element, "laneletType", "crosswalk")
-    node(element, "userBidirectional", "pedestrian")
+        xml.points(add_element(element, tag), bound_points)
+    add_element(element, "laneletType", "crosswalk")
+    add_element(element, "userBidirectional", "pedestrian")
 
 
 def _sign(root: Element, number: int, kind: str, place: list[float], value: float | None = None) -> None:
-    sign = node(root, "trafficSign", id=number)
-    sign_element = node(sign, "trafficSignElement")
-    node(sign_element, "trafficSignID", kind)
+    sign = add_element(root, "trafficSign", id=number)
+    sign_element = add_element(sign, "trafficSignElement")
+    add_element(sign_element, "trafficSignID", kind)
     if value is not None:
-        node(sign_element, "additionalValue", value)
-    xml.points(node(sign, "position"), [place])
-    node(sign, "virtual", value is not None)
+        add_element(sign_element, "additionalValue", value)
+    xml.points(add_element(sign, "position"), [place])
+    add_element(sign, "virtual", value is not None)
 
 
 def _light(  # noqa: PLR0917
@@ -175,17 +175,17 @@ def _light(  # noqa: PLR0917
     if state is None:
         red_duration = cycle - green - yellow
         cycle_parts = [(green, SignalState.GREEN), (yellow, SignalState.YELLOW), (red_duration, SignalState.RED)]
-    light = node(root, "trafficLight", id=number)
-    cycle_element = node(light, "cycle")
+    light = add_element(root, "trafficLight", id=number)
+    cycle_element = add_element(light, "cycle")
     for duration, colour in cycle_parts:
-        cycle_part = node(cycle_element, "cycleElement")
-        node(cycle_part, "duration", duration)
-        node(cycle_part, "color", xml.COLOURS[SignalState(int(colour))])
+        cycle_part = add_element(cycle_element, "cycleElement")
+        add_element(cycle_part, "duration", duration)
+        add_element(cycle_part, "color", xml.COLOURS[SignalState(int(colour))])
     if state is None and offset > 0:
-        node(cycle_element, "timeOffset", offset)
-    xml.points(node(light, "position"), [place])
-    node(light, "direction", "all")
-    node(light, "active", True)
+        add_element(cycle_element, "timeOffset", offset)
+    xml.points(add_element(light, "position"), [place])
+    add_element(light, "direction", "all")
+    add_element(light, "active", True)
 
 
 def _intersections(root: Element, graph: LaneGraph, numbers: _Numbers) -> None:
@@ -198,10 +198,10 @@ def _intersections(root: Element, graph: LaneGraph, numbers: _Numbers) -> None:
                     lanes_by_entry[entry_lane].append(lane)
         if not lanes_by_entry:
             continue
-        element = node(root, "intersection", id=numbers.new())
+        element = add_element(root, "intersection", id=numbers.new())
         for entry_lane, following in sorted(lanes_by_entry.items()):
-            incoming = node(element, "incoming", id=numbers.new())
-            node(incoming, "incomingLanelet", ref=entry_lane + 1)
+            incoming = add_element(element, "incoming", id=numbers.new())
+            add_element(incoming, "incomingLanelet", ref=entry_lane + 1)
             turns = {lane: turn_of(graph, lane) for lane in following}
             for tag, low, high in (
                 ("Right", -math.inf, -_TURN),
@@ -210,4 +210,4 @@ def _intersections(root: Element, graph: LaneGraph, numbers: _Numbers) -> None:
             ):
                 for lane, turn in turns.items():
                     if low <= turn < high:
-                        node(incoming, f"successors{tag}", ref=lane + 1)
+                        add_element(incoming, f"successors{tag}", ref=lane + 1)

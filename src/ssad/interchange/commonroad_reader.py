@@ -72,23 +72,23 @@ def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None
         ConfigError: The scenario cannot be driven.
     """
     root = read_xml(path, limit=MAX_BYTES)
-    where = str(path)
+    location = str(path)
     if root.tag != "commonRoad":
-        raise FormatError(f"{where}: not CommonRoad XML: its root is <{root.tag[:40]}>")
+        raise FormatError(f"{location}: not CommonRoad XML: its root is <{root.tag[:40]}>")
     version = root.get("commonRoadVersion", "")
     if version != VERSION:
-        raise FormatError(f"{where}: commonRoadVersion is '{version[:20]}'; only {VERSION} is read")
-    reader = _Reader(where, root)
+        raise FormatError(f"{location}: commonRoadVersion is '{version[:20]}'; only {VERSION} is read")
+    reader = _Reader(location, root)
     try:
         return reader.read(Path(path).stem, town or Path(path).stem, map_name)
     except (MapError, RouteError, ConfigError) as error:
         message = " ".join(str(error).split())
-        raise type(error)(message if where in message else f"{where}: {message}") from None
+        raise type(error)(message if location in message else f"{location}: {message}") from None
 
 
 class _Reader:
-    def __init__(self, where: str, root: Element) -> None:
-        self.root, self.texts = root, Texts(where)
+    def __init__(self, location: str, root: Element) -> None:
+        self.root, self.texts = root, Texts(location)
         self.lost: Counter[str] = Counter()
         self.own = own_values(root.get("source", ""))
         self.dt = self.texts.number(root.get("timeStepSize"), root, "timeStepSize")
@@ -115,7 +115,7 @@ class _Reader:
             group=self.own.get("group", ""),
             actors=self.obstacles.read(self.root, start, limits),
             signals=self._signals(lanes, graph, ego_route, limits),
-            source=f"CommonRoad {Path(self.texts.where).name}",
+            source=f"CommonRoad {Path(self.texts.location).name}",
         )
         for tag in ("phantomObstacle", "environmentObstacle", "location/environment"):
             if count := len(self.root.findall(tag)):
@@ -138,11 +138,11 @@ class _Reader:
             return lanes, (graph if is_known else replace(graph, name=town)), is_known, (map_name if is_known else town)
         if is_town(self.own.get("town", "")):
             graph = load_town(self.own["town"])
-            if _alike(graph, lanes.graph):
+            if _same_lanes(graph, lanes.graph):
                 return lanes, graph, True, graph.name
         label = self.root.get("benchmarkID", "").partition("_")[2].partition("-")[0]
         for name in town_names():
-            if benchmark_map(name) == label and _alike(load_town(name), lanes.graph):
+            if benchmark_map(name) == label and _same_lanes(load_town(name), lanes.graph):
                 return lanes, load_town(name), True, name
         if lanes.cycles:
             self.lost[f"the cycles of {lanes.cycles} traffic lights: they run this program's own"] += 1
@@ -152,9 +152,9 @@ class _Reader:
         """The plan that forces just the lights that always show the same."""
         if not lanes.states:
             return SignalPlan()
-        lanes_by_signal = _ruled(lanes.graph)
+        lanes_by_signal = _lanes_by_signal(lanes.graph)
         # Signals have no common ids: they are matched by the lanes that they stop.
-        signal_by_lanes = {stops: signal for signal, stops in _ruled(graph).items()}
+        signal_by_lanes = {stops: signal for signal, stops in _lanes_by_signal(graph).items()}
         forced_states = {
             signal_by_lanes[lanes_by_signal[signal]]: state
             for signal, state in lanes.states.items()
@@ -261,7 +261,7 @@ class _Reader:
             return route, route_along(graph, route)
         except RouteError as error:
             if _lane_under(graph, start) is None or "no way" not in str(error):
-                raise RouteError(f"{self.texts.where}: the way of the ego: {error}") from None
+                raise RouteError(f"{self.texts.location}: the way of the ego: {error}") from None
         self.lost[f"no way along the lanes leads to the goal: {WAY:g} m along the ego's lane"] += 1
         return self._ahead(graph, start)
 
@@ -269,10 +269,10 @@ class _Reader:
         """Return the route along the lane under the ego, straight on where lanes diverge."""
         place = _lane_under(graph, start)
         if place is None:
-            raise RouteError(f"{self.texts.where}: the ego does not stand on a road of '{graph.name}'")
+            raise RouteError(f"{self.texts.location}: the ego does not stand on a road of '{graph.name}'")
         path = lane_path(graph, place, WAY)
         if len(path) < 3:
-            raise RouteError(f"{self.texts.where}: the road ends before the ego")
+            raise RouteError(f"{self.texts.location}: the road ends before the ego")
         point_indices = np.unique(np.linspace(0, len(path) - 2, 9).astype(int))[1:]
         directions = path[point_indices + 1] - path[point_indices]
         rows = np.column_stack([path[point_indices], np.arctan2(directions[:, 1], directions[:, 0])])
@@ -293,16 +293,16 @@ def _lane_under(graph: LaneGraph, pose: Pose) -> LanePosition | None:
     return places[min(candidates, key=lambda index: max(float(lane_distances[index]), 0.0))] if candidates else None
 
 
-def _alike(town: LaneGraph, found: LaneGraph) -> bool:
-    """Whether the lanes of a file are those of a town."""
-    is_same_layout = town.lanes == found.lanes and np.array_equal(town.kind, found.kind)
+def _same_lanes(town: LaneGraph, lanes: LaneGraph) -> bool:
+    """Return True if the lanes of a file are those of a town."""
+    is_same_layout = town.lanes == lanes.lanes and np.array_equal(town.kind, lanes.kind)
     start_points: list[F64] = (
-        [graph.xy[graph.offset[:-1]].astype(np.float64) for graph in (town, found)] if is_same_layout else []
+        [graph.xy[graph.offset[:-1]].astype(np.float64) for graph in (town, lanes)] if is_same_layout else []
     )
     return is_same_layout and bool(np.abs(start_points[0] - start_points[1]).max() < ALIKE)
 
 
-def _ruled(graph: LaneGraph) -> Mapping[int, tuple[int, ...]]:
+def _lanes_by_signal(graph: LaneGraph) -> Mapping[int, tuple[int, ...]]:
     """Return the lanes that each signal stops."""
     lanes_by_signal: dict[int, tuple[int, ...]] = {}
     for signal, lane in zip(graph.stop_signal.tolist(), graph.stop_lane.tolist(), strict=True):

@@ -17,7 +17,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, Controller, Episode, EpisodeAgent, Pose
 from ssad.interchange.commonroad_lanes import write_lanes
-from ssad.interchange.commonroad_xml import TYPES, VERSION, decimal, node, own_source, points
+from ssad.interchange.commonroad_xml import TYPES, VERSION, add_element, decimal, own_source, points
 from ssad.world.models import model
 from ssad.world.roads import route_along
 
@@ -56,7 +56,7 @@ def benchmark_map(town: str) -> str:
 
 class _Writer:
     def __init__(self, episode: Episode, graph: LaneGraph, dt: float) -> None:
-        self.episode, self.graph, self.dt = episode, graph, _fitting(episode, dt)
+        self.episode, self.graph, self.dt = episode, graph, _fitting_step(episode, dt)
         limits = episode.limits
         self.steps = max(1, round(min(limits.max_steps * dt, limits.max_time) / self.dt))
         self.lost: list[str] = []
@@ -87,10 +87,10 @@ class _Writer:
                 "benchmarkID": f"ZAM_{benchmark_map(scenario.town)}-{number}_1{'_T-1' if recorded else ''}",
             },
         )
-        location = node(root, "location")
+        location = add_element(root, "location")
         for tag, value in (("geoNameId", -999), ("gpsLatitude", 999), ("gpsLongitude", 999)):  # a made-up place
-            node(location, tag, value)
-        node(node(root, "scenarioTags"), "simulated")
+            add_element(location, tag, value)
+        add_element(add_element(root, "scenarioTags"), "simulated")
         first_free_id = self.graph.lanes + 1
         first_id, lost = write_lanes(root, self.graph, episode.signal_override, dt=self.dt, number=first_free_id)
         self.lost += lost
@@ -117,24 +117,24 @@ class _Writer:
 
     def _shape(self, obstacle: Element, agent: EpisodeAgent) -> None:
         body = model(agent.model)
-        shape = node(node(obstacle, "shape"), "rectangle")
-        node(shape, "length", body.length)
-        node(shape, "width", body.width)
+        shape = add_element(add_element(obstacle, "shape"), "rectangle")
+        add_element(shape, "length", body.length)
+        add_element(shape, "width", body.width)
 
     def _static(self, root: Element, number: int, agent: EpisodeAgent) -> None:
-        obstacle = node(root, "staticObstacle", id=number)
+        obstacle = add_element(root, "staticObstacle", id=number)
         is_prop = model(agent.model).kind == AgentKind.PROP
-        node(obstacle, "type", _STATIC.get(agent.model, "unknown") if is_prop else "parkedVehicle")
+        add_element(obstacle, "type", _STATIC.get(agent.model, "unknown") if is_prop else "parkedVehicle")
         self._shape(obstacle, agent)
-        _state(node(obstacle, "initialState"), 0, agent.pose, 0.0)
+        _state(add_element(obstacle, "initialState"), 0, agent.pose, 0.0)
 
     def _dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
         first_step, rows = self._rows(agent)
         if len(rows) < 2:
             self.lost.append(f"{agent.name}, who is there for less than two steps")
             return
-        obstacle = node(root, "dynamicObstacle", id=number)
-        node(obstacle, "type", TYPES[model(agent.model).kind])
+        obstacle = add_element(root, "dynamicObstacle", id=number)
+        add_element(obstacle, "type", TYPES[model(agent.model).kind])
         self._shape(obstacle, agent)
         velocity = np.diff(rows[:, :2], axis=0) / self.dt
         heading_vector = np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], 1)
@@ -144,10 +144,10 @@ class _Writer:
             for offset, (row, row_speed) in enumerate(zip(rows.tolist(), speed.tolist(), strict=True))
         ]
         # The format keeps the first state apart from the trajectory.
-        _state(node(obstacle, "initialState"), *states[0])
-        trajectory = node(obstacle, "trajectory")
+        _state(add_element(obstacle, "initialState"), *states[0])
+        trajectory = add_element(obstacle, "trajectory")
         for state in states[1:]:
-            _state(node(trajectory, "state"), *state)
+            _state(add_element(trajectory, "state"), *state)
 
     def _rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
         """Return the first step, and x, y, yaw [T, 3] at each step at which an agent exists."""
@@ -165,22 +165,22 @@ class _Writer:
     def _problem(self, root: Element, number: int) -> None:
         ego = self.episode.agents[0]
         assert ego.route is not None
-        problem = node(root, "planningProblem", id=number)
-        start = node(problem, "initialState")
-        points(node(start, "position"), [[ego.pose.x, ego.pose.y]])
+        problem = add_element(root, "planningProblem", id=number)
+        start = add_element(problem, "initialState")
+        points(add_element(start, "position"), [[ego.pose.x, ego.pose.y]])
         yaw = float(wrap_angle(ego.pose.yaw))
         for tag, value in (("velocity", ego.speed), ("orientation", yaw), ("yawRate", 0.0), ("slipAngle", 0.0)):
-            node(node(start, tag), "exact", float(value))
-        node(node(start, "time"), "exact", 0)
-        goal = node(problem, "goalState")
-        _interval(node(goal, "time"), 0, self.steps)
+            add_element(add_element(start, tag), "exact", float(value))
+        add_element(add_element(start, "time"), "exact", 0)
+        goal = add_element(problem, "goalState")
+        _interval(add_element(goal, "time"), 0, self.steps)
         goal_pose = Pose(float(ego.route.xy[-1, 0]), float(ego.route.xy[-1, 1]), float(ego.route.yaw[-1]))
-        circle = node(node(goal, "position"), "circle")
-        node(circle, "radius", GOAL)
-        centre = node(circle, "center")
-        node(centre, "x", goal_pose.x)
-        node(centre, "y", goal_pose.y)
-        _interval(node(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
+        circle = add_element(add_element(goal, "position"), "circle")
+        add_element(circle, "radius", GOAL)
+        centre = add_element(circle, "center")
+        add_element(centre, "x", goal_pose.x)
+        add_element(centre, "y", goal_pose.y)
+        _interval(add_element(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
         self._check_way(ego, goal_pose)
 
     def _check_way(self, ego: EpisodeAgent, end: Pose) -> None:
@@ -197,7 +197,7 @@ class _Writer:
             self.lost.append("where the ego's route begins: a planning problem begins where the ego is")
 
 
-def _fitting(episode: Episode, dt: float) -> float:
+def _fitting_step(episode: Episode, dt: float) -> float:
     """Return the longest step (`dt`, or a fraction of it) that fits the times of all rows, else the shortest."""
     times = np.array([row[0] for agent in episode.agents for row in agent.trajectory])
     relevant_times = times[(times > 0.0) & (times < episode.limits.max_steps * dt)]
@@ -209,12 +209,12 @@ def _fitting(episode: Episode, dt: float) -> float:
 
 
 def _state(element: Element, step: int, pose: Pose, speed: float) -> None:
-    points(node(element, "position"), [[pose.x, pose.y]])
-    node(node(element, "orientation"), "exact", float(pose.yaw))
-    node(node(element, "time"), "exact", step)
-    node(node(element, "velocity"), "exact", float(speed))
+    points(add_element(element, "position"), [[pose.x, pose.y]])
+    add_element(add_element(element, "orientation"), "exact", float(pose.yaw))
+    add_element(add_element(element, "time"), "exact", step)
+    add_element(add_element(element, "velocity"), "exact", float(speed))
 
 
 def _interval(element: Element, low: float, high: float) -> None:
-    node(element, "intervalStart", low)
-    node(element, "intervalEnd", high)
+    add_element(element, "intervalStart", low)
+    add_element(element, "intervalEnd", high)

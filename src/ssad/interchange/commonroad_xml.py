@@ -78,15 +78,15 @@ KINDS_OF: Final[dict[str, tuple[AgentKind, ...]]] = {name: (kind,) for kind, nam
 """Obstacle type -> kinds that may play it."""
 
 
-def node(parent: Element, tag: str, text: Any = None, **attributes: Any) -> Element:
+def add_element(parent: Element, tag: str, text: Any = None, **attributes: Any) -> Element:
     """Add an element to a parent, with a text and attributes."""
-    element = SubElement(parent, tag, {name: told(value) for name, value in attributes.items()})
+    element = SubElement(parent, tag, {name: format_value(value) for name, value in attributes.items()})
     if text is not None:
-        element.text = told(text)
+        element.text = format_value(text)
     return element
 
 
-def told(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value as text."""
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -102,80 +102,80 @@ def decimal(value: float) -> str:
 def points(parent: Element, rows: npt.ArrayLike) -> None:
     """Add points [N, 2] or [N, 3] to an element."""
     for row in np.asarray(rows, np.float64).tolist():
-        point = node(parent, "point")
+        point = add_element(parent, "point")
         for name, value in zip("xyz", row, strict=False):
-            node(point, name, value)
+            add_element(point, name, value)
 
 
 class Texts:
     """Reader of the numbers in a document's elements; errors name the file and the element with its id."""
 
-    def __init__(self, where: str) -> None:
-        self.where = where
+    def __init__(self, location: str) -> None:
+        self.location = location
 
     def fail(self, element: Element | str, message: str) -> FormatError:
         """Return a FormatError that names the file and the element."""
         if isinstance(element, str):
-            return FormatError(f"{self.where}: {element}: {message}")
+            return FormatError(f"{self.location}: {element}: {message}")
         number = f" {element.get('id', '')[:20]}" if element.get("id") else ""
-        return FormatError(f"{self.where}: {element.tag}{number}: {message}")
+        return FormatError(f"{self.location}: {element.tag}{number}: {message}")
 
-    def number(self, text: str | None, element: Element, what: str) -> float:
+    def number(self, text: str | None, element: Element, description: str) -> float:
         """A finite number. FormatError if the text is none."""
         if text is None:
-            raise self.fail(element, f"{what} is missing")
+            raise self.fail(element, f"{description} is missing")
         try:
             value = float(text)
         except ValueError:
-            raise self.fail(element, f"{what} is '{text.strip()[:40]}', not a number") from None
+            raise self.fail(element, f"{description} is '{text.strip()[:40]}', not a number") from None
         if not math.isfinite(value) or abs(value) > 1e9:
-            raise self.fail(element, f"{what} is '{text.strip()[:40]}', not a number that can be used")
+            raise self.fail(element, f"{description} is '{text.strip()[:40]}', not a number that can be used")
         return value
 
-    def whole(self, text: str | None, element: Element, what: str) -> int:
+    def whole(self, text: str | None, element: Element, description: str) -> int:
         """A whole number. FormatError if the text is none."""
-        value = self.number(text, element, what)
+        value = self.number(text, element, description)
         if value != int(value):
-            raise self.fail(element, f"{what} is '{(text or '').strip()[:40]}', not a whole number")
+            raise self.fail(element, f"{description} is '{(text or '').strip()[:40]}', not a whole number")
         return int(value)
 
     def ids(self, element: Element, tag: str) -> list[int]:
         """Return the ids that the children with a tag refer to."""
         return [self.whole(child.get("ref"), element, f"{tag}: ref") for child in element.iterfind(tag)]
 
-    def points(self, element: Element | None, within: Element, what: str) -> F64:
+    def points(self, element: Element | None, within: Element, description: str) -> F64:
         """Points [N, 3] under an element; z is 0 where it is not given."""
         if element is None:
-            raise self.fail(within, f"{what} is missing")
+            raise self.fail(within, f"{description} is missing")
         rows = [
             [
-                self.number(point.findtext(axis, None if axis != "z" else "0"), within, f"{what}: {axis}")
+                self.number(point.findtext(axis, None if axis != "z" else "0"), within, f"{description}: {axis}")
                 for axis in "xyz"
             ]
             for point in element.iterfind("point")
         ]
         return np.array(rows, np.float64).reshape(-1, 3)
 
-    def value(self, element: Element | None, within: Element, what: str) -> tuple[float, float]:
+    def value(self, element: Element | None, within: Element, description: str) -> tuple[float, float]:
         """An exact value or an interval, as its ends."""
         if element is None:
-            raise self.fail(within, f"{what} is missing")
+            raise self.fail(within, f"{description} is missing")
         if (exact := element.findtext("exact")) is not None:
-            value = self.number(exact, within, what)
+            value = self.number(exact, within, description)
             return value, value
         low, high = (
-            self.number(element.findtext(bound_tag), within, f"{what}: {bound_tag}")
+            self.number(element.findtext(bound_tag), within, f"{description}: {bound_tag}")
             for bound_tag in ("intervalStart", "intervalEnd")
         )
         if low > high:
-            raise self.fail(within, f"{what}: an interval from {low:g} to {high:g}")
+            raise self.fail(within, f"{description}: an interval from {low:g} to {high:g}")
         return low, high
 
 
 def own_values(source: str) -> dict[str, str]:
-    """What a `source` of this program's says: `SSAD; name=...; ...`."""
-    first, *rest = (field.strip() for field in source.split(";"))
-    return dict(field.split("=", 1) for field in rest if "=" in field) if first == "SSAD" else {}
+    """Return the fields of a `source` that SSAD wrote: `SSAD; name=...; ...`."""
+    first, *fields = (field.strip() for field in source.split(";"))
+    return dict(field.split("=", 1) for field in fields if "=" in field) if first == "SSAD" else {}
 
 
 def own_source(values: Iterable[tuple[str, Any]]) -> str:

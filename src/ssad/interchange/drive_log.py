@@ -120,13 +120,15 @@ def scenario_of_drive(
     return LoggedDrive(scenario, graph, is_known, left_out)
 
 
-def _ours(scene: SceneData) -> bool:
+def _is_recorded_by_ssad(scene: SceneData) -> bool:
     return scene.log is not None and scene.log.vehicle == OURS
 
 
 def _ego(scene: SceneData, start: int) -> F64:
     """Return time s since `start` us, x, y and yaw [T, 4] of the middle of the ego, from the poses of all sensors."""
-    axle_offset = 0.0 if _ours(scene) else AXLE_TO_MIDDLE  # `ssad record` writes the pose of the body's middle
+    axle_offset = (
+        0.0 if _is_recorded_by_ssad(scene) else AXLE_TO_MIDDLE
+    )  # `ssad record` writes the pose of the body's middle
     rows: dict[int, tuple[float, float, float, float]] = {}
     for frame in scene.frames:
         pose = frame.ego_to_world
@@ -205,19 +207,19 @@ def _nearest(tracks: Sequence[_Track], ego: F64, left_out: Counter[str]) -> tupl
 
 
 def _town(
-    scene: SceneData, where: str, way: F64, tracks: Sequence[_Track], *, town: str, map_name: str | None
+    scene: SceneData, location: str, path: F64, tracks: Sequence[_Track], *, town: str, map_name: str | None
 ) -> tuple[LaneGraph, bool]:
     """The town of a drive, and whether it can be loaded by its name."""
     if map_name is not None:
         is_known = is_town(map_name)
         graph = load_town(map_name)
         return (graph if is_known else replace(graph, name=town)), is_known
-    if _ours(scene):
+    if _is_recorded_by_ssad(scene):
         assert scene.log is not None
         for town_name in (scene.log.location, scene.record.description.partition(",")[0]):
             if is_town(town_name):
                 return load_town(town_name), True
-    paths, speeds = [way[:, 1:3]], [_fastest(way)]
+    paths, speeds = [path[:, 1:3]], [_fastest(path)]
     for track in tracks:
         displacement = float(np.hypot(*(track.rows[-1, 1:3] - track.rows[0, 1:3])))
         if displacement >= MOVED and track.model in (*CARS, *LARGE, "motorcycle"):
@@ -236,15 +238,15 @@ def _fastest(rows: F64) -> float:
 
 
 def _scenario(  # noqa: PLR0917
-    scene: SceneData, graph: LaneGraph, way: F64, tracks: Sequence[_Track], name: str, version: str
+    scene: SceneData, graph: LaneGraph, path: F64, tracks: Sequence[_Track], name: str, version: str
 ) -> Scenario:
     """The ego's route and start, the actors, and limits with time to spare."""
-    points = _key_points(way)
+    points = _key_points(path)
     try:
         route = route_along(graph, points)
     except RouteError as error:
         raise RouteError(f"scene '{scene.record.name}': the way of the ego: {error}") from None
-    driven = way[way[:, 0] >= 0.0, 1:3]
+    driven = path[path[:, 0] >= 0.0, 1:3]
     route_distance = float(np.hypot(*np.moveaxis(driven[:, None] - route.xy[None], -1, 0)).min(1).max())
     if route_distance > OFF:
         raise RouteError(
@@ -253,7 +255,7 @@ def _scenario(  # noqa: PLR0917
             "give the map of that place"
         )
     start_pose = points[0]
-    early_row = way[np.searchsorted(way[:, 0], min(0.5, float(way[-1, 0])))]
+    early_row = path[np.searchsorted(path[:, 0], min(0.5, float(path[-1, 0])))]
     speed = math.hypot(early_row[1] - start_pose.x, early_row[2] - start_pose.y) / max(float(early_row[0]), STEP)
     parameters = start_parameters(route, start_pose, speed, digits=3)
     parameters.pop("ego_longitudinal", None)  # the route begins where the ego does
@@ -269,24 +271,24 @@ def _scenario(  # noqa: PLR0917
         actors=tuple(_actor(track) for track in tracks),
         signals=SignalPlan("green", "red", until=steps * STEP),  # a log does not record the states of signals
         limits=Limits(max_steps=steps, max_time=round(steps * STEP, 1)),
-        target_speed=round(float(np.clip(_fastest(way), 3.0, 60.0)), 2),
+        target_speed=round(float(np.clip(_fastest(path), 3.0, 60.0)), 2),
         group="log",
         source=f"nuScenes schema {version}, {scene.record.name}{location}",
     )
 
 
-def _key_points(way: F64) -> tuple[Pose, ...]:
+def _key_points(path: F64) -> tuple[Pose, ...]:
     """Places of the ego at the start, each `KEY_POINT` m, and at the end."""
-    unwrapped = np.unwrap(way[:, 3])
-    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, 1:3], axis=0).T))])
-    start_distance = float(np.interp(0.0, way[:, 0], driven))
+    unwrapped = np.unwrap(path[:, 3])
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, 1:3], axis=0).T))])
+    start_distance = float(np.interp(0.0, path[:, 0], driven))
     count = max(1, round((driven[-1] - start_distance) / KEY_POINT))
     distances = np.linspace(start_distance, driven[-1], count + 1)
     # Interpolation over distance needs increasing values, and a standing ego adds none.
     is_increasing = np.concatenate([[True], np.diff(driven) > 1e-9])
     x, y, yaw = (
         np.interp(distances, driven[is_increasing], values[is_increasing])
-        for values in (way[:, 1], way[:, 2], unwrapped)
+        for values in (path[:, 1], path[:, 2], unwrapped)
     )
     return tuple(
         Pose(round(key_x, 3), round(key_y, 3), round(float(wrap_angle(key_yaw)), 4))

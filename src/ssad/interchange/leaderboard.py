@@ -26,7 +26,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import Episode, Pose, Scenario
 from ssad.interchange.export import Written, episode
 from ssad.interchange.leaderboard_site import LIMITS, Site
-from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, nobody
+from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, no_actors
 from ssad.interchange.openscenario_places import Values
 from ssad.scenarios.dynamic import CUSTOM, build_episode
 from ssad.scenarios.dynamic.knowledge._placing import trigger_index
@@ -112,9 +112,9 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
                 continue
             try:
                 scenario = (
-                    _played(values, element, template, lost)
+                    _scenario_of_item(values, element, template, lost)
                     if stored is None
-                    else _kept(values, element, stored, template)
+                    else _restored_scenario(values, element, stored, template)
                 )
                 build_episode(scenario, load_town(town), seed=0)
             except FormatError:
@@ -154,12 +154,12 @@ def _place(values: Values, item: Node) -> tuple[float, float]:
     return values.number(item, "x"), 0.0 - values.number(item, "y")
 
 
-def _played(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> Scenario:
+def _scenario_of_item(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> Scenario:
     """The scenario of an item of a route, with the actors of its type. RouteError: its town does not allow it."""
     type_name = base.group
     add_actors = TYPES[type_name]
     trigger = item.find("trigger_point")
-    is_empty = getattr(add_actors, "func", add_actors) is nobody
+    is_empty = getattr(add_actors, "func", add_actors) is no_actors
     if trigger is not None:
         yaw = -math.radians(math.remainder(values.number(trigger, "yaw"), 360.0))
         base = replace(base, trigger=None if is_empty else Pose(*_place(values, trigger), yaw))
@@ -186,14 +186,14 @@ def _played(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> S
     return replace(base, actors=tuple(site.actors), signals=site.signals, target_speed=site.target_speed)
 
 
-def _kept(values: Values, item: Node, own: Node, base: Scenario) -> Scenario:
+def _restored_scenario(values: Values, item: Node, source: Node, base: Scenario) -> Scenario:
     """The scenario that SSAD wrote; its route and trigger are those of the file where somebody has moved them."""
     try:
-        content = json.loads(values.text(own, "scenario"))
+        content = json.loads(values.text(source, "scenario"))
     except (ValueError, RecursionError) as error:
-        raise values.fail(own, f"scenario is not JSON: {str(error)[:100]}") from None
+        raise values.fail(source, f"scenario is not JSON: {str(error)[:100]}") from None
     if not isinstance(content, dict):
-        raise values.fail(own, "scenario is not a mapping of keys")
+        raise values.fail(source, "scenario is not a mapping of keys")
     scenario = scenario_from(content | {"town": base.town})
     is_unmoved = len(scenario.route) == len(base.route) and all(
         math.dist((stored_point.x, stored_point.y), (file_point.x, file_point.y)) < MOVED
@@ -253,7 +253,7 @@ def export_leaderboard1(scenarios: Sequence[Scenario], out: Path, *, seed: int =
     """Write routes.xml and scenarios.json of leaderboard 1.0; see `export_leaderboard`."""
     root, omissions = Element("routes"), list[str]()
     towns: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for index, scenario in enumerate(_written(scenarios, TYPES_1, seed, omissions)):
+    for index, scenario in enumerate(_exportable(scenarios, TYPES_1, seed, omissions)):
         route = SubElement(root, "route", id=str(index), town=scenario.town)
         built_episode = episode(scenario, seed)
         for pose in _dense(built_episode):
@@ -277,7 +277,7 @@ def export_leaderboard1(scenarios: Sequence[Scenario], out: Path, *, seed: int =
     return [_write(root, folder / "routes.xml"), folder / "scenarios.json"], omissions
 
 
-def _written(scenarios: Sequence[Scenario], types: Mapping[str, str], seed: int, lost: list[str]) -> list[Scenario]:
+def _exportable(scenarios: Sequence[Scenario], types: Mapping[str, str], seed: int, lost: list[str]) -> list[Scenario]:
     """Those that have a type; what is lost of them."""
     supported = []
     for scenario in scenarios:

@@ -255,9 +255,9 @@ class Site:
         position = self.route.xy[min(max(index, 0), len(self.route.xy) - 1)].tolist()
         return Condition("ego_distance", math.dist(position, (actor.x, actor.y)), len(self.actors))
 
-    def seconds_before(self, index: int, seconds: float, least: float, actor: Pose) -> Condition:
-        """When the ego is so many seconds, or at least so many metres, before a route point; see `reaches`."""
-        return self.reaches(index - round(max(seconds * SPEED, least) / self.route.spacing), actor)
+    def seconds_before(self, index: int, seconds: float, min_distance: float, actor: Pose) -> Condition:
+        """Return the condition that the ego is so many seconds or metres before a route point; see `reaches`."""
+        return self.reaches(index - round(max(seconds * SPEED, min_distance) / self.route.spacing), actor)
 
     def arrival(self, index: int) -> float:
         """Seconds after which an ego that starts from rest and then keeps `SPEED` comes to a route point."""
@@ -312,15 +312,15 @@ class Site:
                 previous_start = start
             distance_back += float(self.random.uniform(*gap))
 
-    def flow(self, way: F64, gap: tuple[float, float], speed: float, *, models: Sequence[str] = CARS) -> None:
+    def flow(self, path: F64, gap: tuple[float, float], speed: float, *, models: Sequence[str] = CARS) -> None:
         """Vehicles that come one after another along a way [N, 2] at a steady speed, whatever is in their way.
 
         They appear where it begins and leave where it ends; at the start they are all along it.
         """
-        path_length = float(np.hypot(*np.diff(way, axis=0).T).sum())
+        path_length = float(np.hypot(*np.diff(path, axis=0).T).sum())
         if path_length > LONGEST:
             raise self.fail(f"the way of its flow has {path_length:.0f} m, more than {LONGEST:.0f} m")
-        template = _timed(way, speed)
+        template = _timed(path, speed)
         start_time = -float(template[-1, 0])
         while (start_time := start_time + float(self.random.uniform(*gap)) / speed) < FLOW:
             rows = template.copy()
@@ -339,11 +339,11 @@ class Site:
         except RouteError as error:
             raise self.fail(str(error)) from None
 
-    def offset(self, way: F64, right: float | F64) -> F64:
+    def offset(self, path: F64, right: float | F64) -> F64:
         """A way moved to the right, m: by one number or one for each point."""
-        heading = np.gradient(way, axis=0)
+        heading = np.gradient(path, axis=0)
         normal = np.stack([heading[:, 1], -heading[:, 0]], 1) / np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
-        moved: F64 = way + np.atleast_1d(right)[:, None] * normal
+        moved: F64 = path + np.atleast_1d(right)[:, None] * normal
         return moved
 
     def along(self, index: int, distance: float, right: float, *, into: float = 0.0) -> F64:
@@ -372,16 +372,16 @@ class Site:
         """Return the place `distance` m ahead along lanes, straight on."""
         return ahead(self.graph, start, distance)
 
-    def apart(self, one: LanePosition, other: LanePosition) -> float:
-        """Metres between two places."""
-        first_pose, second_pose = pose_at(self.graph, one), pose_at(self.graph, other)
+    def apart(self, first: LanePosition, second: LanePosition) -> float:
+        """Return the distance between two places, m."""
+        first_pose, second_pose = pose_at(self.graph, first), pose_at(self.graph, second)
         return math.dist((first_pose.x, first_pose.y), (second_pose.x, second_pose.y))
 
 
-def _timed(way: F64, speed: float) -> F64:
+def _timed(path: F64, speed: float) -> F64:
     """Rows [M, 4] of time, x, y and yaw of a drive along a way at a speed; few where it is straight."""
-    steps = np.diff(way, axis=0)
-    way, steps = way[np.concatenate([[True], np.hypot(*steps.T) > 1e-6])], steps[np.hypot(*steps.T) > 1e-6]
+    steps = np.diff(path, axis=0)
+    path, steps = path[np.concatenate([[True], np.hypot(*steps.T) > 1e-6])], steps[np.hypot(*steps.T) > 1e-6]
     if len(steps) < 1:
         raise RouteError("a flow needs a way of some metres")
     distances = np.concatenate([[0.0], np.cumsum(np.hypot(*steps.T))])
@@ -397,4 +397,4 @@ def _timed(way: F64, speed: float) -> F64:
             or distances[index] - distances[previous] > _LONG
         ):
             row_indices.append(index)
-    return np.column_stack([distances / speed, way, yaw])[row_indices]
+    return np.column_stack([distances / speed, path, yaw])[row_indices]

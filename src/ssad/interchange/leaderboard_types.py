@@ -135,19 +135,22 @@ def _crossing(
     way: float,
     speed: float,
     seconds: float,
-    least: float,
-    idle: float = 0.0,
+    min_distance: float,
+    delay: float = 0.0,
 ) -> None:
-    """Somebody who goes straight across `idle` s after the ego is near route point `index`; stops behind the road."""
-    trigger, final_stop = site.seconds_before(index, seconds, least, pose), Phase(0.0, Condition("travelled", way))
-    start_phases = (Phase(0.0, trigger), Phase(speed, Condition("after", idle))) if idle else (Phase(speed, trigger),)
+    """Somebody who goes straight across `delay` s after the ego is near route point `index`; stops behind the road."""
+    trigger, final_stop = (
+        site.seconds_before(index, seconds, min_distance, pose),
+        Phase(0.0, Condition("travelled", way)),
+    )
+    start_phases = (Phase(0.0, trigger), Phase(speed, Condition("after", delay))) if delay else (Phase(speed, trigger),)
     site.add(name, model, pose, (*start_phases, final_stop))
 
 
-def _from_side(site: Site, index: int, side: float, further: float, angle: float = 0.0) -> tuple[Pose, float]:
+def _from_side(site: Site, index: int, side: float, extra_distance: float, angle: float = 0.0) -> tuple[Pose, float]:
     """A pose beside the road that faces it, and how far the other edge is."""
-    lateral_offset = side * (site.edge(index, side) + further)
-    road_width = site.edge(index, 1.0) + site.edge(index, -1.0) + 2.0 * further
+    lateral_offset = side * (site.edge(index, side) + extra_distance)
+    road_width = site.edge(index, 1.0) + site.edge(index, -1.0) + 2.0 * extra_distance
     return site.pose(index, lateral_offset, side * (0.5 * math.pi + angle)), road_width / max(math.cos(angle), 0.2)
 
 
@@ -166,7 +169,15 @@ def walker(site: Site, *, vehicle: bool) -> None:
     pose, crossing_distance = _from_side(site, walker_point, side, 0.6, math.radians(angle))
     seconds = (2.15 if vehicle else 2.1) + 0.1 * math.floor(angle / 5.0)
     _crossing(
-        site, "walker", "walker", pose, walker_point, way=crossing_distance, speed=2.0, seconds=seconds, least=6.0
+        site,
+        "walker",
+        "walker",
+        pose,
+        walker_point,
+        way=crossing_distance,
+        speed=2.0,
+        seconds=seconds,
+        min_distance=6.0,
     )
     blocker_turn = 0.0 if blocker == "compact" else 0.5 * math.pi
     site.add("car" if blocker == "compact" else "thing", blocker, site.pose(index, side * lateral_offset, blocker_turn))
@@ -192,8 +203,8 @@ def pedestrians(site: Site) -> None:
             way=1.15 * crossing_distance,
             speed=round(speed, 3),
             seconds=3.5,
-            least=12.0,
-            idle=round(idle, 3),
+            min_distance=12.0,
+            delay=round(idle, 3),
         )
 
 
@@ -207,7 +218,7 @@ def turning(site: Site, *, model: str) -> None:
     pose, crossing_distance = _from_side(site, index, side, 1.0)
     seconds = 1.8 if model == "bicycle" else 2.2
     name = "cyclist" if model == "bicycle" else "walker"
-    _crossing(site, name, model, pose, index, way=crossing_distance, speed=1.8, seconds=seconds, least=6.0)
+    _crossing(site, name, model, pose, index, way=crossing_distance, speed=1.8, seconds=seconds, min_distance=6.0)
 
 
 # ---------------------------------------------------------------- cars that cut in
@@ -388,7 +399,7 @@ def emergency(site: Site) -> None:
     site.driver("emergency car", start, start_distance + site.route.length + 50.0, SPEED + 25.0 * KMH)
 
 
-def nobody(site: Site, *, signals: SignalPlan = SignalPlan()) -> None:  # noqa: B008  frozen
+def no_actors(site: Site, *, signals: SignalPlan = SignalPlan()) -> None:  # noqa: B008  frozen
     """Add no actors: the ego is alone."""
     site.signals = signals
 
@@ -426,16 +437,16 @@ TYPES: Final[Mapping[str, Play]] = {
     "ParkingCrossingPedestrian": partial(walker, vehicle=True),
     "ParkingCutIn": parking_cut_in,
     "PedestrianCrossing": pedestrians,
-    "SequentialLaneChange": nobody,
+    "SequentialLaneChange": no_actors,
     "SignalizedJunctionLeftTurn": partial(_left_turn, signals=_GREEN),
     "SignalizedJunctionLeftTurnEnterFlow": partial(_left_turn, signals=_GREEN),
     "SignalizedJunctionRightTurn": partial(_right_turn, signals=_GREEN),
     "StaticCutIn": static_cut_in,
-    "T_Junction": nobody,
-    "VanillaNonSignalizedTurn": nobody,
-    "VanillaNonSignalizedTurnEncounterStopsign": nobody,
-    "VanillaSignalizedTurnEncounterGreenLight": partial(nobody, signals=SignalPlan("green", "red")),
-    "VanillaSignalizedTurnEncounterRedLight": partial(nobody, signals=SignalPlan("red", "green", until=15.0)),
+    "T_Junction": no_actors,
+    "VanillaNonSignalizedTurn": no_actors,
+    "VanillaNonSignalizedTurnEncounterStopsign": no_actors,
+    "VanillaSignalizedTurnEncounterGreenLight": partial(no_actors, signals=SignalPlan("green", "red")),
+    "VanillaSignalizedTurnEncounterRedLight": partial(no_actors, signals=SignalPlan("red", "green", until=15.0)),
     "VehicleTurningRoute": partial(turning, model="bicycle"),
     "VehicleTurningRoutePedestrian": partial(turning, model="walker"),
     "YieldToEmergencyVehicle": emergency,

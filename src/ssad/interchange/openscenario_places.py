@@ -29,8 +29,8 @@ _PARAMETER = re.compile(r"^\$\{?\s*(\w+)\s*\}?$")
 class Values:
     """Attributes of elements with the document's parameters substituted; errors name file and element."""
 
-    def __init__(self, where: str, root: Element) -> None:
-        self.where = where
+    def __init__(self, location: str, root: Element) -> None:
+        self.location = location
         self.parameters: dict[str, str] = {
             item.get("name", ""): item.get("value", "") for item in root.iter("ParameterDeclaration")
         }
@@ -38,7 +38,7 @@ class Values:
     def fail(self, element: Element | str, message: str) -> FormatError:
         """Return a FormatError that names the file and the element."""
         tag = element if isinstance(element, str) else element.tag
-        return FormatError(f"{self.where}: {tag}: {message}")
+        return FormatError(f"{self.location}: {tag}: {message}")
 
     def text(self, element: Element, name: str, default: str | None = None) -> str:
         """An attribute as text. FormatError if it is missing and there is no default, or its parameter is unknown."""
@@ -73,7 +73,7 @@ class Values:
         return int(value)
 
 
-class Places:
+class PositionReader:
     """Positions as poses in the world frame; inexact conversions are counted in `lost`."""
 
     def __init__(

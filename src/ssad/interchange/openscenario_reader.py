@@ -24,7 +24,7 @@ from ssad.core.safeio import MIB, read_xml
 from ssad.core.types import Actor, Condition, Limits, Phase, Pose, Route, Scenario, SignalPlan, SignalState
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_entities import Entity, read_entities
-from ssad.interchange.openscenario_places import Places, Values
+from ssad.interchange.openscenario_places import PositionReader, Values
 from ssad.interchange.openscenario_triggers import Triggers
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
@@ -86,9 +86,9 @@ def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
 
 
 class _Reader:
-    def __init__(self, where: str, root: Element, graph: LaneGraph, town: str) -> None:
+    def __init__(self, location: str, root: Element, graph: LaneGraph, town: str) -> None:
         self.root, self.graph, self.town = root, graph, town
-        self.values = Values(where, root)
+        self.values = Values(location, root)
         self.lost: Counter[str] = Counter()
         header = root.find("FileHeader")
         if header is None:
@@ -110,7 +110,7 @@ class _Reader:
             position = action.find("AddEntityAction/Position")
             if position is not None:
                 starts.setdefault(action.get("entityRef", ""), position)
-        self.places = Places(self.values, graph, mirrored=is_carla, lost=self.lost, starts=starts)
+        self.places = PositionReader(self.values, graph, mirrored=is_carla, lost=self.lost, starts=starts)
         self.entities = read_entities(root, self.values, self.lost, centred=is_carla)
         for entity in self.entities.values():
             entity.placed = entity.name in starts
@@ -146,7 +146,7 @@ class _Reader:
             limits=limits,
             target_speed=min(speed, MAX_SPEED),
             group=self.own.get("group", ""),
-            source=f"OpenSCENARIO {Path(self.values.where).name}",
+            source=f"OpenSCENARIO {Path(self.values.location).name}",
         )
         scenario = replace(scenario, actors=tuple(self._actors(limits)), signals=self._plan(ego_route, forced_signals))
         build_episode(scenario, self.graph, seed=0)  # reports any remaining error of the scenario
@@ -171,7 +171,7 @@ class _Reader:
             else:
                 self._lose("at the start", action)
         for agent_actions in self.root.iterfind("Storyboard/Init/Actions/Private"):
-            entity = self.triggers.who(agent_actions)
+            entity = self.triggers.referenced_entity(agent_actions)
             for action in agent_actions:
                 element = action[0] if len(action) else action
                 if element.tag == "ControllerAction":
@@ -200,10 +200,10 @@ class _Reader:
         if action.find(".//CatalogReference") is not None:
             self.lost[f"controller of '{entity.name}' in a catalogue"] += 1
 
-    def _lose(self, when: str, action: Element) -> None:
+    def _lose(self, context: str, action: Element) -> None:
         """Name an action that has no counterpart: the innermost element whose name says what it does."""
         action_tags = [element.tag for element in action.iter() if element.tag.endswith("Action")]
-        self.lost[f"{(action_tags or [action.tag])[-1]} {when}"] += 1
+        self.lost[f"{(action_tags or [action.tag])[-1]} {context}"] += 1
 
     def _speed(self, entity: Entity, action: Element) -> float:
         target = action.find("SpeedAction/SpeedActionTarget/AbsoluteTargetSpeed")
@@ -213,7 +213,7 @@ class _Reader:
             relative = action.find("SpeedAction/SpeedActionTarget/RelativeTargetSpeed")
             if relative is None:
                 raise self.values.fail("SpeedAction", "SpeedActionTarget is missing")
-            other, value = self.triggers.who(relative), self.values.number(relative, "value")
+            other, value = self.triggers.referenced_entity(relative), self.values.number(relative, "value")
             is_delta = self.values.text(relative, "speedTargetValueType") == "delta"
             speed = other.speed + value if is_delta else other.speed * value
             self.lost[f"a speed of '{entity.name}' that depends on '{other.name}' is fixed at {speed:g} m/s"] += 1
@@ -240,7 +240,7 @@ class _Reader:
         elif inner.tag == "AssignRouteAction" and inner.find("Route") is not None:
             points = [waypoint.find("Position") for waypoint in inner.iterfind("Route/Waypoint")]
             if all(self.places.reads(point) for point in points):
-                entity.route = _headed(points, tuple(self.places.pose(point, within=inner) for point in points))
+                entity.route = _with_headings(points, tuple(self.places.pose(point, within=inner) for point in points))
                 return
         elif inner.tag == "FollowTrajectoryAction" and not entity.ego:
             self._trajectory(entity, inner, begins)
@@ -254,7 +254,7 @@ class _Reader:
             self.lost[f"a trajectory of '{entity.name}' that is no polyline of places that are read"] += 1
             return
         read_poses = tuple(self.places.pose(point, within=action) for point in points)
-        poses = tuple(self._centre(entity, pose) for pose in _headed(points, read_poses))
+        poses = tuple(self._centre(entity, pose) for pose in _with_headings(points, read_poses))
         timing = action.find("TimeReference/Timing")
         if timing is None:
             entity.path = poses
@@ -273,7 +273,7 @@ class _Reader:
 
     def _group(self, group: Element) -> None:
         references = group.findall("Actors/EntityRef")
-        actors = [self.triggers.who(reference) for reference in references]
+        actors = [self.triggers.referenced_entity(reference) for reference in references]
         events = group.findall("Maneuver/Event")
         if group.find("CatalogReference") is not None:
             self.lost["a maneuver in a catalogue"] += 1
@@ -292,7 +292,7 @@ class _Reader:
         if entity_action is None:
             self._lose(f"in event '{label}'", action)
             return
-        entity = self.triggers.who(entity_action)
+        entity = self.triggers.referenced_entity(entity_action)
         condition = self._when(event, entity, label)
         if entity_action.find("AddEntityAction") is not None:
             if not entity.rows and (condition is None or condition.kind != "always"):
@@ -337,12 +337,16 @@ class _Reader:
         conditions = self.triggers.conditions(event, entity, label)
         return conditions[0] if conditions is not None and len(conditions) == 1 else None
 
-    def _lane_change(self, entity: Entity, action: Element, when: Condition | None, label: str) -> None:
+    def _lane_change(self, entity: Entity, action: Element, start_condition: Condition | None, label: str) -> None:
         """A lane change whose place is known becomes part of the path; else it is lost."""
         target = action.find("LaneChangeAction/LaneChangeTarget/RelativeTargetLane")
         speed = entity.phases[-1].speed if entity.phases else entity.speed
         start_distance = (
-            {"always": 0.0, "travelled": when.value, "time": when.value * speed}.get(when.kind) if when else None
+            {"always": 0.0, "travelled": start_condition.value, "time": start_condition.value * speed}.get(
+                start_condition.kind
+            )
+            if start_condition
+            else None
         )
         if target is None or start_distance is None or entity.change is not None:
             self.lost[f"LaneChangeAction in event '{label}': it is not known where it begins"] += 1
@@ -358,7 +362,7 @@ class _Reader:
         """Convert the trigger of an act: its actors wait for it in a phase before all others."""
         for group in act.iterfind("ManeuverGroup"):
             for reference in group.iterfind("Actors/EntityRef"):
-                entity = self.triggers.who(reference)
+                entity = self.triggers.referenced_entity(reference)
                 conditions = self.triggers.conditions(act, entity, self.values.text(act, "name", "act")) or ()
                 waiting_phases = (
                     Phase(min(entity.speed, 60.0), condition)
@@ -403,14 +407,14 @@ class _Reader:
         start_lane = self.places.lane_under(start)
         if start_lane is None:
             raise RouteError(
-                f"{self.values.where}: the ego '{self.ego.name}' does not stand on a road of '{self.town}'"
+                f"{self.values.location}: the ego '{self.ego.name}' does not stand on a road of '{self.town}'"
             )
         if points:
             return (start, *points)
         self.lost[f"the ego has no route: {WAY:g} m along its lane"] += 1
         path = lane_path(self.graph, start_lane, WAY)
         if len(path) < 3:
-            raise RouteError(f"{self.values.where}: the road ends before the ego '{self.ego.name}'")
+            raise RouteError(f"{self.values.location}: the road ends before the ego '{self.ego.name}'")
         key_points = path[np.unique(np.linspace(0, len(path) - 2, 9).astype(int))]
         next_points = path[np.unique(np.linspace(0, len(path) - 2, 9).astype(int)) + 1]
         headings = np.arctan2(*(next_points - key_points).T[::-1])
@@ -451,7 +455,7 @@ class _Reader:
     def _path(self, entity: Entity, pose: Pose) -> tuple[tuple[float, float], ...]:
         """Return the path of an actor: from the file, else its lane; () is straight on."""
         if entity.path:
-            return () if _straight(entity.path) else tuple((point.x, point.y) for point in entity.path)
+            return () if _is_straight(entity.path) else tuple((point.x, point.y) for point in entity.path)
         if entity.model == "walker":
             points = (pose, *entity.route) if len(entity.route) == 1 else entity.route
             return tuple((point.x, point.y) for point in points)
@@ -511,7 +515,7 @@ class _Reader:
         return plan or SignalPlan()
 
 
-def _headed(positions: list[Element | None], poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
+def _with_headings(positions: list[Element | None], poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
     """Return the poses; world positions without a heading face the next position."""
     result = list(poses)
     for index, position in enumerate(positions):
@@ -523,7 +527,7 @@ def _headed(positions: list[Element | None], poses: tuple[Pose, ...]) -> tuple[P
     return tuple(result)
 
 
-def _straight(points: tuple[Pose, ...]) -> bool:
+def _is_straight(points: tuple[Pose, ...]) -> bool:
     """Return whether a path is two points, the second straight ahead of the first, which needs no path."""
     if len(points) != 2:
         return False

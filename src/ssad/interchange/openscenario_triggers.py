@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from ssad.core.types import Condition
 from ssad.interchange.openscenario_entities import Entity
-from ssad.interchange.openscenario_places import Places
+from ssad.interchange.openscenario_places import PositionReader
 from ssad.world.models import MODELS
 
 if TYPE_CHECKING:
@@ -22,14 +22,14 @@ _OUTER: Final = ("Condition", "ByEntityCondition", "ByValueCondition", "EntityCo
 class Triggers:
     """The triggers of a document; triggers without a counterpart are counted in `lost`."""
 
-    def __init__(self, places: Places, entities: Mapping[str, Entity], lost: Counter[str]) -> None:
+    def __init__(self, places: PositionReader, entities: Mapping[str, Entity], lost: Counter[str]) -> None:
         self.values, self.places, self.entities, self.lost = places.values, places, entities, lost
         self.ego = next(entity for entity in entities.values() if entity.ego)
         self._order = [
             name for name, candidate in entities.items() if not candidate.ego and candidate.placed
         ]  # as conditions count
 
-    def who(self, element: Element) -> Entity:
+    def referenced_entity(self, element: Element) -> Entity:
         """Return the entity that an element refers to. FormatError if there is none of that name."""
         name = self.values.text(element, "entityRef")
         if name not in self.entities:
@@ -67,7 +67,7 @@ class Triggers:
                     delays.append(Condition("after", delay))
                     completed += state == "completeState"
                 continue  # phases follow each other in any case
-            converted = self._one(condition, condition_type, entity)
+            converted = self._convert_condition(condition, condition_type, entity)
             if converted is None:
                 unread.append(condition_type.tag)
                 continue
@@ -90,38 +90,45 @@ class Triggers:
             return (*delays[:1], *(required[0] if required else ()))
         return None if unread else (Condition("always"),)
 
-    def _one(self, told: Element, inner: Element, entity: Entity) -> Condition | None:
-        rule = self.values.text(inner, "rule", "")
-        triggering = [self.who(reference) for reference in told.iterfind(".//TriggeringEntities/EntityRef")]
-        value = self.values.number(inner, "value", 0.0)
-        if inner.tag == "SimulationTimeCondition" and rule in _GREATER:
+    def _convert_condition(self, condition: Element, condition_type: Element, entity: Entity) -> Condition | None:
+        rule = self.values.text(condition_type, "rule", "")
+        triggering = [
+            self.referenced_entity(reference) for reference in condition.iterfind(".//TriggeringEntities/EntityRef")
+        ]
+        value = self.values.number(condition_type, "value", 0.0)
+        if condition_type.tag == "SimulationTimeCondition" and rule in _GREATER:
             return Condition("time", value) if value > 0.0 else Condition("always")
-        if inner.tag == "TraveledDistanceCondition" and triggering == [entity]:
+        if condition_type.tag == "TraveledDistanceCondition" and triggering == [entity]:
             return Condition("travelled", value)
-        if inner.tag == "SpeedCondition" and triggering == [self.ego] and rule in _GREATER:
+        if condition_type.tag == "SpeedCondition" and triggering == [self.ego] and rule in _GREATER:
             return Condition("ego_speed", value)
-        if inner.tag == "RelativeDistanceCondition" and rule in _LESS and len(triggering) == 1:
-            entities = [triggering[0], self.who(inner)]
-            others = [entity_of_pair for entity_of_pair in entities if entity_of_pair is not self.ego]
-            distance_type = self.values.text(inner, "relativeDistanceType", "")
-            if len(others) != 1 or distance_type == "lateral":
+        if condition_type.tag == "RelativeDistanceCondition" and rule in _LESS and len(triggering) == 1:
+            entities = [triggering[0], self.referenced_entity(condition_type)]
+            other_entities = [entity_of_pair for entity_of_pair in entities if entity_of_pair is not self.ego]
+            distance_type = self.values.text(condition_type, "relativeDistanceType", "")
+            if len(other_entities) != 1 or distance_type == "lateral":
                 return None
-            if self.values.text(inner, "freespace", "false") == "true":
-                value += 0.5 * (MODELS[self.ego.model].length + MODELS[others[0].model].length)
+            if self.values.text(condition_type, "freespace", "false") == "true":
+                value += 0.5 * (MODELS[self.ego.model].length + MODELS[other_entities[0].model].length)
                 self.lost[
                     "distances between bodies are taken as those between their centres, half the lengths added"
                 ] += 1
             if distance_type == "longitudinal":
                 self.lost["distances along the road are taken as straight ones"] += 1
-            if others[0].name not in self._order:
+            if other_entities[0].name not in self._order:
                 return None
-            return Condition("ego_distance", value, self._order.index(others[0].name))
-        is_reach = inner.tag == "ReachPositionCondition" or (inner.tag == "DistanceCondition" and rule in _LESS)
-        position = inner.find("Position")
+            return Condition("ego_distance", value, self._order.index(other_entities[0].name))
+        is_reach = condition_type.tag == "ReachPositionCondition" or (
+            condition_type.tag == "DistanceCondition" and rule in _LESS
+        )
+        position = condition_type.find("Position")
         if is_reach and triggering == [self.ego] and entity.placed and not entity.ego and self.places.reads(position):
             # a waiting actor stands still, so the place is a distance from it
-            target, start = self.places.pose(position, within=inner), self.places.start(entity.name, within=inner)
-            tolerance = self.values.number(inner, "tolerance", value)
+            target, start = (
+                self.places.pose(position, within=condition_type),
+                self.places.start(entity.name, within=condition_type),
+            )
+            tolerance = self.values.number(condition_type, "tolerance", value)
             self.lost[f"a place that the ego reaches is taken as its distance from '{entity.name}'"] += 1
             gap = math.dist((target.x, target.y), (start.x, start.y))
             return Condition("ego_distance", gap + tolerance, self._order.index(entity.name))

@@ -326,23 +326,23 @@ class _Writer:
             _position(vertex, pose)
         return follow_action
 
-    def _condition(self, group: Element, label: str, name: str, when: Condition) -> None:
-        if when.kind in ("always", "time"):
-            _by_time(group, label, when.value if when.kind == "time" else 0.0)
+    def _condition(self, group: Element, label: str, name: str, condition: Condition) -> None:
+        if condition.kind in ("always", "time"):
+            _by_time(group, label, condition.value if condition.kind == "time" else 0.0)
             return
         ego = self.names[0]
-        subject = name if when.kind == "travelled" else ego
+        subject = name if condition.kind == "travelled" else ego
         entity_condition = _by_entity(group, label, subject)
-        if when.kind == "travelled":
-            _node(entity_condition, "TraveledDistanceCondition", value=float(when.value))
-        elif when.kind == "ego_speed":
-            _node(entity_condition, "SpeedCondition", value=float(when.value), rule="greaterThan")
+        if condition.kind == "travelled":
+            _node(entity_condition, "TraveledDistanceCondition", value=float(condition.value))
+        elif condition.kind == "ego_speed":
+            _node(entity_condition, "SpeedCondition", value=float(condition.value), rule="greaterThan")
         else:
             _node(
                 entity_condition,
                 "RelativeDistanceCondition",
-                entityRef=self.names[1 + when.actor],
-                value=float(when.value),
+                entityRef=self.names[1 + condition.actor],
+                value=float(condition.value),
                 relativeDistanceType="euclidianDistance",
                 freespace=False,
                 rule="lessThan",
@@ -421,7 +421,9 @@ def _by_time(group: Element, name: str, time: float) -> None:
     _node(value_condition, "SimulationTimeCondition", value=float(time), rule="greaterOrEqual")
 
 
-def _by_entity(group: Element, name: str, who: str) -> Element:
+def _by_entity(group: Element, name: str, entity_name: str) -> Element:
     entity_condition = _node(_condition(group, name), "ByEntityCondition")
-    _node(_node(entity_condition, "TriggeringEntities", triggeringEntitiesRule="any"), "EntityRef", entityRef=who)
+    _node(
+        _node(entity_condition, "TriggeringEntities", triggeringEntitiesRule="any"), "EntityRef", entityRef=entity_name
+    )
     return _node(entity_condition, "EntityCondition")

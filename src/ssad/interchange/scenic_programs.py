@@ -97,7 +97,7 @@ def load_program(path: Path, town: str | None = None, parameters: Mapping[str, A
     if path.suffix != ".scenic" or not path.is_file():
         raise ConfigError(f"{path}: no such Scenic program (a file that ends in .scenic)")
     read_text(path, limit=1 << 20)
-    with _quiet():
+    with _suppress_output():
         try:
             import scenic
         except ModuleNotFoundError:
@@ -106,10 +106,10 @@ def load_program(path: Path, town: str | None = None, parameters: Mapping[str, A
         if town is not None:
             global_parameters["map"] = str(_map_file(town))
         try:
-            with _seeded(0):
+            with _global_seeds(0):
                 compiled = scenic.scenarioFromFile(str(path), params=global_parameters, model=MODEL, mode2D=True)
         except (Exception, SystemExit) as error:  # a program can raise anything
-            raise _broken(path, error) from None
+            raise _error_line(path, error) from None
         if compiled.egoObject is None:
             raise ConfigError(f"{path}: it has no ego")
     town_name = town or Path(str(compiled.params.get("map", ""))).stem
@@ -132,7 +132,7 @@ def sample(program: Program, seed: int, *, steps: int = STEPS, name: str | None 
     from scenic.core.distributions import RejectionException
 
     location = f"{program.path}, seed {seed}"
-    with _quiet(), _seeded(seed):
+    with _suppress_output(), _global_seeds(seed):
         try:
             scene, _ = program.compiled.generate(maxIterations=SCENES)
             simulator = program.compiled.getSimulator()
@@ -140,7 +140,7 @@ def sample(program: Program, seed: int, *, steps: int = STEPS, name: str | None 
         except RejectionException:
             raise ConfigError(f"{location}: none of {SCENES} scenes meets its requirements") from None
         except (Exception, SystemExit) as error:
-            raise _broken(program.path, error, f", seed {seed}") from None
+            raise _error_line(program.path, error, f", seed {seed}") from None
     if simulation is None:
         raise ConfigError(f"{location}: none of {TRIES} simulations meets its requirements")
     label = name or f"{scenario_name(program.path.stem) or 'scenic'}/{seed:02d}"
@@ -178,7 +178,7 @@ class ScenicSearch:
         towns = {base.graph.name for base in bases}
         self._programs = {town: load_program(Path(path), town) for town in sorted(towns)}
         self._bases, self._seeds = tuple(bases), tuple(seeds)
-        self._drawn = [0] * len(self._bases)
+        self._sample_counts = [0] * len(self._bases)
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Return the next samples of each base; samples that meet no requirements are left out."""
@@ -187,8 +187,8 @@ class ScenicSearch:
     def _of(self, b: int, count: int) -> list[Proposal]:
         base, proposals = self._bases[b], []
         for _ in range(count):
-            seed = int(digest("scenic", self._seeds[b], self._drawn[b])[:8], 16)
-            self._drawn[b] += 1
+            seed = int(digest("scenic", self._seeds[b], self._sample_counts[b])[:8], 16)
+            self._sample_counts[b] += 1
             with contextlib.suppress(SSADError):
                 proposals.append(Proposal(sample(self._programs[base.graph.name], seed).scenario))
         return proposals
@@ -209,8 +209,8 @@ def _map_file(town: str) -> Path:
     return path
 
 
-def _broken(path: Path, error: BaseException, more: str = "") -> ConfigError:
-    """What is wrong with a program, in one line: its file and the line of it where something was raised."""
+def _error_line(path: Path, error: BaseException, suffix: str = "") -> ConfigError:
+    """Return a ConfigError of one line for an error in a program: its file and the line that raised it."""
     line = getattr(error, "lineno", None)
     trace = error.__traceback__
     while trace is not None and not isinstance(line, int):
@@ -224,11 +224,11 @@ def _broken(path: Path, error: BaseException, more: str = "") -> ConfigError:
         trace = trace.tb_next
     message = " ".join(str(error).split())[:300] or describe(error)
     location = f"{path}:{line}" if isinstance(line, int) else f"{path}"
-    return ConfigError(f"{location}{more}: {type(error).__name__}: {message}")
+    return ConfigError(f"{location}{suffix}: {type(error).__name__}: {message}")
 
 
 @contextlib.contextmanager
-def _seeded(seed: int) -> Iterator[None]:
+def _global_seeds(seed: int) -> Iterator[None]:
     """Seed the global generators of Python and numpy, which Scenic draws from, and restore them afterwards."""
     previous_states = random.getstate(), np.random.get_state()  # noqa: NPY002
     random.seed(seed)
@@ -241,7 +241,7 @@ def _seeded(seed: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _suppress_output() -> Iterator[None]:
     """Suppress the output and warnings of Scenic and of the libraries that it loads."""
     import warnings
 
@@ -288,14 +288,14 @@ def _size(model: str) -> tuple[float, float]:
     return MODELS[model].length, MODELS[model].width
 
 
-def _actor(drive: Any, rows: F64, k: int, until: float) -> Actor:
-    """What one of the others did."""
+def _actor(drive: Any, rows: F64, index: int, until: float) -> Actor:
+    """Return the actor that replays the motion of an agent other than the ego."""
     time = STEP * np.arange(len(rows))
-    trajectory = np.column_stack([time, rows[:, k, :3]])
+    trajectory = np.column_stack([time, rows[:, index, :3]])
     if np.hypot(*np.ptp(trajectory[:, 1:3], axis=0)) < STILL:
-        return Actor(drive.names[k], drive.models[k], agent_pose(trajectory[0]))
+        return Actor(drive.names[index], drive.models[index], agent_pose(trajectory[0]))
     kept_rows = rounded_rows(stopping(trajectory, until))
-    return Actor(drive.names[k], drive.models[k], Pose(*kept_rows[0][1:]), trajectory=kept_rows)
+    return Actor(drive.names[index], drive.models[index], Pose(*kept_rows[0][1:]), trajectory=kept_rows)
 
 
 def _route(program: Program, ego: F64, lost: list[str]) -> tuple[tuple[Pose, ...], float]:

@@ -21,7 +21,7 @@ from ssad.world.actions import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import adversary as adversary_reward
 from ssad.world.rewards import colliding, cost_of, distance_to_goal, feasible, hit_ego
 from ssad.world.rollout import Loop
-from ssad.world.sb3 import Alike
+from ssad.world.sb3 import SharedAttributes
 from ssad.world.selection import FreaSelection, Note
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World
@@ -29,7 +29,7 @@ from ssad.world.world import World
 _ADVERSARY = 1_000  # index of the adversaries' driver, beyond those of the loop
 
 
-class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
+class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
     """`num_envs` scenes with one adversary at a time, selected and released by FREA's rules.
 
     The time from selection to release of an adversary is an episode of the learner. A contact or the goal terminates

@@ -163,9 +163,9 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
     if learning.algorithm == "dqn":
         if ACTIONS[learning.action] != CHOICES.shape[1]:
             raise ConfigError(f"dqn chooses between actions of two numbers; '{learning.action}' has another number")
-        from ssad.world.sb3 import Choosing
+        from ssad.world.sb3 import DiscreteActions
 
-        env = Choosing(env)
+        env = DiscreteActions(env)
         off_policy_options |= {
             "exploration_fraction": 1 / 3,
             "exploration_final_eps": learning.noise,

@@ -97,14 +97,14 @@ def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, 
     }
     forecast, junction_info, signal = belief.forecast, belief.way, belief.line_signal
     if forecast is None or junction_info is None or signal is None:
-        inferred = _made_up(pose, speed, kind, arrays["half"][..., 0], gives_way, occupied, lanes, forecast)
+        inferred = _infer_forecasts(pose, speed, kind, arrays["half"][..., 0], gives_way, occupied, lanes, forecast)
         forecast = inferred[0] if forecast is None else forecast
         junction_info = inferred[1] if junction_info is None else junction_info
         signal = inferred[2] if signal is None else signal
     arrays["forecast"] = np.asarray(forecast, np.float32)
     arrays["way"] = np.asarray(junction_info, np.float32)
     arrays["signal"] = np.asarray(signal, np.int32)
-    height = _heights(pose, occupied, lanes) if belief.height is None else belief.height
+    height = _lane_heights(pose, occupied, lanes) if belief.height is None else belief.height
     arrays["height"] = np.asarray(height, np.float32)
     arrays["waited"] = (
         np.zeros(kind.shape, np.float32) if belief.stood is None else np.asarray(belief.stood, np.float32)
@@ -117,28 +117,28 @@ def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, 
     return arrays
 
 
-def rested(
-    now: Mapping[str, npt.NDArray[Any]], before: Mapping[str, npt.NDArray[Any]], seconds: npt.NDArray[Any]
+def rest_times(
+    now: Mapping[str, npt.NDArray[Any]], previous: Mapping[str, npt.NDArray[Any]], seconds: npt.NDArray[Any]
 ) -> F32:
-    """How long objects have been at rest: as long as somebody has stood where they stand.
+    """Return how long objects have been at rest: as long as their place has been occupied.
 
     Args:
         now: `pose` [B, K, 3], `speed` and `kind` [B, K] of a belief.
-        before: The same of the belief before, [B, L], and `waited` [B, L] s there.
+        previous: The same of the belief before, [B, L], and `waited` [B, L] s there.
         seconds: [B] s from that one to this.
 
     Returns:
-        [B, K] s; 0 for who moves.
+        [B, K] s; 0 for moving objects.
     """
-    at_rest = [(belief["kind"] != AgentKind.NONE) & (np.abs(belief["speed"]) < RESTS) for belief in (now, before)]
-    distance = np.hypot(*np.moveaxis(now["pose"][:, :, None, :2] - before["pose"][:, None, :, :2], -1, 0))
+    at_rest = [(belief["kind"] != AgentKind.NONE) & (np.abs(belief["speed"]) < RESTS) for belief in (now, previous)]
+    distance = np.hypot(*np.moveaxis(now["pose"][:, :, None, :2] - previous["pose"][:, None, :, :2], -1, 0))
     is_same = at_rest[0][:, :, None] & at_rest[1][:, None] & (distance < SAME)
-    accumulated = before["waited"] + np.asarray(seconds)[:, None]
+    accumulated = previous["waited"] + np.asarray(seconds)[:, None]
     durations: F32 = np.where(is_same, accumulated[:, None], 0.0).max(-1, initial=0.0).astype(np.float32)
     return durations
 
 
-def _heights(pose: F32, used: Bool, lanes: Sequence[Lanes]) -> F32:
+def _lane_heights(pose: F32, used: Bool, lanes: Sequence[Lanes]) -> F32:
     """[B, K] height of the lane under each object, NaN where it is on none that goes its way; 0 without bridges."""
     heights = np.zeros(used.shape, np.float32)
     for current_town in dict.fromkeys(town_lanes for town_lanes in lanes if town_lanes.hilly):
@@ -148,7 +148,7 @@ def _heights(pose: F32, used: Bool, lanes: Sequence[Lanes]) -> F32:
     return heights
 
 
-def _made_up(  # noqa: PLR0917
+def _infer_forecasts(  # noqa: PLR0917
     pose: F32,
     speed: F32,
     kind: I32,
@@ -156,7 +156,7 @@ def _made_up(  # noqa: PLR0917
     gives_way: Bool,
     used: Bool,
     lanes: Sequence[Lanes],
-    given: F32 | None,
+    forecasts: F32 | None,
 ) -> tuple[F32, F32, I32]:
     """Forecast [B, K, 8, 3], way [B, K, 4] and signal of the stop line [B, K], from what can be seen."""
     forecast = np.zeros((*kind.shape, int(HORIZON), 3), np.float32)
@@ -175,8 +175,8 @@ def _made_up(  # noqa: PLR0917
         paths = current_town.follow(poses, expected_speed, lane, s, lateral)
         forecast[scene, row] = paths
         junction_info[scene, row, :3] = approach
-        if given is not None:
-            paths = np.asarray(given, np.float64)[scene, row]
+        if forecasts is not None:
+            paths = np.asarray(forecasts, np.float64)[scene, row]
         deviation = np.abs(to_local(poses[:, None], paths[..., :2])[..., 1]).max(-1, initial=0.0)
         junction_info[scene, row, 3] = np.where(deviation > 0.05, deviation + 0.5, 0.0)
     return forecast, junction_info, signal
@@ -334,9 +334,9 @@ class Lanes:
         return forecasts
 
 
-def lanes_of(graphs: Mapping[str, LaneGraph], towns: Sequence[str], known: dict[str, Lanes]) -> list[Lanes]:
-    """`Lanes` of each town; those that are not `known` yet are made and kept there."""
+def lanes_of(graphs: Mapping[str, LaneGraph], towns: Sequence[str], cache: dict[str, Lanes]) -> list[Lanes]:
+    """Return the `Lanes` of each town; missing ones are built and stored in `cache`."""
     for town in dict.fromkeys(towns):
-        if town not in known:
-            known[town] = Lanes(graphs[town])
-    return [known[town] for town in towns]
+        if town not in cache:
+            cache[town] = Lanes(graphs[town])
+    return [cache[town] for town in towns]

@@ -24,9 +24,9 @@ class WorldCheckError(AssertionError):
     """Violation of a guarantee by a simulator or driver; the message names the guarantee."""
 
 
-def _need(ok: bool, promise: str) -> None:
-    if not ok:
-        raise WorldCheckError(promise)
+def _require(is_met: bool, guarantee: str) -> None:
+    if not is_met:
+        raise WorldCheckError(guarantee)
 
 
 def _controls(world: Simulator, seeds: Sequence[int], step: int) -> npt.NDArray[np.float32]:
@@ -43,7 +43,7 @@ def _egos(world: Simulator) -> npt.NDArray[np.bool_]:
     return np.tile(np.arange(world.agents) == 0, (world.batch, 1))
 
 
-def _ready(world: Simulator) -> Simulator:
+def _take_egos(world: Simulator) -> Simulator:
     """Reset a simulator and let its egos be driven externally."""
     world.reset()
     world.take(_egos(world), Controller.EXTERNAL, policy=0)
@@ -63,16 +63,16 @@ def check_simulator(make: MakeSimulator, *, episodes: int, steps: int = 60) -> N
     """
     assignment = list(range(min(episodes, 6)))
     world = make(assignment)
-    _need(isinstance(world, Simulator), "it has the methods and attributes of ssad.core.driving.Simulator")
-    _need(world.batch == len(assignment), "its batch is as long as the assignment")
-    _need(list(world.assigned) == assignment, "it says which episodes its scenes run")
-    _need(all(episode.town in world.graphs for episode in world.episodes), "it has the lane graph of every town")
+    _require(isinstance(world, Simulator), "it has the methods and attributes of ssad.core.driving.Simulator")
+    _require(world.batch == len(assignment), "its batch is as long as the assignment")
+    _require(list(world.assigned) == assignment, "it says which episodes its scenes run")
+    _require(all(episode.town in world.graphs for episode in world.episodes), "it has the lane graph of every town")
     _check_state(world)
     if isinstance(world, Reproducible):
         _check_bits(make, assignment, steps)
-    _check_physics(_ready(make(assignment)), assignment, steps)
+    _check_physics(_take_egos(make(assignment)), assignment, steps)
     _check_takeover(make(assignment))
-    _check_bad_controls(_ready(make(assignment)))
+    _check_bad_controls(_take_egos(make(assignment)))
 
 
 def _check_state(world: Simulator) -> None:
@@ -91,16 +91,16 @@ def _check_state(world: Simulator) -> None:
         "lane",
         "progress",
     ):
-        _need(getattr(state, name).shape == shape, f"state().{name} is [B, A]")
+        _require(getattr(state, name).shape == shape, f"state().{name} is [B, A]")
     for name, width in (("pose", 3), ("size", 2), ("control", 4), ("route", 2)):
-        _need(getattr(state, name).shape == (*shape, width), f"state().{name} is [B, A, {width}]")
-    _need(bool((state.time == 0).all()), "time is 0 at the start")
-    _need(bool((world.ended() == End.RUNNING).all()), "nobody has ended at the start")
-    _need(bool(state.active[:, 0].all()), "the ego is there at the start")
-    _need(bool((state.route[:, 0, 1] > 1).all()), "the ego has a route")
+        _require(getattr(state, name).shape == (*shape, width), f"state().{name} is [B, A, {width}]")
+    _require(bool((state.time == 0).all()), "time is 0 at the start")
+    _require(bool((world.ended() == End.RUNNING).all()), "nobody has ended at the start")
+    _require(bool(state.active[:, 0].all()), "the ego is there at the start")
+    _require(bool((state.route[:, 0, 1] > 1).all()), "the ego has a route")
     last_points = state.route.sum(-1)
-    _need(bool((last_points <= len(state.roads.path)).all()), "routes lie in state().roads")
-    _need(not bool((state.active & (state.kind == AgentKind.NONE)).any()), "nobody is where the slot is empty")
+    _require(bool((last_points <= len(state.roads.path)).all()), "routes lie in state().roads")
+    _require(not bool((state.active & (state.kind == AgentKind.NONE)).any()), "nobody is where the slot is empty")
 
 
 def _run(world: Simulator, seeds: Sequence[int], steps: int, first: int = 0) -> list[list[str]]:
@@ -116,43 +116,43 @@ def _check_bits(make: MakeSimulator, order: list[int], steps: int) -> None:
     def hashes(world: Simulator) -> list[str]:
         return cast(Reproducible, world).hashes()
 
-    world = _ready(make(order))
+    world = _take_egos(make(order))
     start_hashes = hashes(world)
     reference = _run(world, order, steps)
-    _need(hashes(_ready(world)) == start_hashes, "reset brings back the start, bit for bit")
-    _need(_run(world, order, steps) == reference, "the same controls give the same bits after a reset")
-    _need(_run(_ready(make(order)), order, steps) == reference, "two worlds give the same bits")
+    _require(hashes(_take_egos(world)) == start_hashes, "reset brings back the start, bit for bit")
+    _require(_run(world, order, steps) == reference, "the same controls give the same bits after a reset")
+    _require(_run(_take_egos(make(order)), order, steps) == reference, "two worlds give the same bits")
 
     reversed_order = order[::-1]
-    reversed_run = _run(_ready(make(reversed_order)), reversed_order, steps)
-    _need([row[::-1] for row in reversed_run] == reference, "the order of scenes does not matter")
+    reversed_run = _run(_take_egos(make(reversed_order)), reversed_order, steps)
+    _require([row[::-1] for row in reversed_run] == reference, "the order of scenes does not matter")
     for scene in order[:2]:
-        single_run = _run(_ready(make([scene])), [scene], steps)
-        _need(
+        single_run = _run(_take_egos(make([scene])), [scene], steps)
+        _require(
             [row[0] for row in single_run] == [row[scene] for row in reference],
             "a scene alone gives the bits it gives in a batch",
         )
 
-    world = _ready(make(order))
+    world = _take_egos(make(order))
     half_steps = steps // 2
     _run(world, order, half_steps)
     saved = cast(Reproducible, world).snapshot()
     # Drive away from the snapshot, so that restoring it has something to undo.
     _run(world, order, 5, first=1000)
     cast(Reproducible, world).restore(saved)
-    _need(
+    _require(
         _run(world, order, steps - half_steps, first=half_steps) == reference[half_steps:],
         "a restored snapshot continues as before",
     )
 
-    world = _ready(make(order))
+    world = _take_egos(make(order))
     _run(world, order, half_steps)
     before = hashes(world)
     world.reset([0])
     world.take(_egos(world) & (np.arange(world.batch) == 0)[:, None], Controller.EXTERNAL, policy=0)
     after = hashes(world)
-    _need(after[0] == start_hashes[0], "resetting one scene brings back its start")
-    _need(after[1:] == before[1:], "resetting one scene leaves the others alone")
+    _require(after[0] == start_hashes[0], "resetting one scene brings back its start")
+    _require(after[1:] == before[1:], "resetting one scene leaves the others alone")
 
 
 def _check_physics(world: Simulator, order: Sequence[int], steps: int) -> None:
@@ -163,14 +163,14 @@ def _check_physics(world: Simulator, order: Sequence[int], steps: int) -> None:
         world.step(_controls(world, order, step))
         state = world.state()
         pose = state.pose
-        _need(bool(np.isfinite(pose).all() and np.isfinite(state.speed).all()), "poses and speeds stay finite")
+        _require(bool(np.isfinite(pose).all() and np.isfinite(state.speed).all()), "poses and speeds stay finite")
         distance = np.hypot(*np.moveaxis(pose[..., :2] - previous_pose[..., :2], -1, 0))
-        _need(bool((distance[was_active & state.active] <= 60.0 * world.dt).all()), "nobody jumps")
-        _need(bool((pose[ended] == previous_pose[ended]).all()), "an ended scene stands still")
-        _need(bool((np.abs(pose[..., 2]) <= np.pi + 1e-5).all()), "yaw stays in [-pi, pi]")
-        _need(bool((world.ended() < len(ENDS)).all()), "ended() is an index into ENDS")
+        _require(bool((distance[was_active & state.active] <= 60.0 * world.dt).all()), "nobody jumps")
+        _require(bool((pose[ended] == previous_pose[ended]).all()), "an ended scene stands still")
+        _require(bool((np.abs(pose[..., 2]) <= np.pi + 1e-5).all()), "yaw stays in [-pi, pi]")
+        _require(bool((world.ended() < len(ENDS)).all()), "ended() is an index into ENDS")
         running = world.ended() == End.RUNNING
-        _need(bool(np.allclose(state.time[running], (step + 1) * world.dt)), "time goes by dt a step")
+        _require(bool(np.allclose(state.time[running], (step + 1) * world.dt)), "time goes by dt a step")
         previous_pose, was_active = pose.copy(), state.active.copy()
 
 
@@ -182,15 +182,17 @@ def _check_takeover(world: Simulator) -> None:
     agent_mask[0] = state.active[0]
     world.take(agent_mask, Controller.EXTERNAL, policy=3)
     state = world.state()
-    _need(bool((state.controller[agent_mask] == Controller.EXTERNAL).all()), "who is taken over is driven from outside")
-    _need(bool((state.policy[agent_mask] == 3).all()), "the state says by which driver")
-    _need(
+    _require(
+        bool((state.controller[agent_mask] == Controller.EXTERNAL).all()), "who is taken over is driven from outside"
+    )
+    _require(bool((state.policy[agent_mask] == 3).all()), "the state says by which driver")
+    _require(
         bool((state.controller[~agent_mask] == original[~agent_mask]).all()), "a takeover leaves everybody else alone"
     )
     world.take(agent_mask, None)
     state = world.state()
-    _need(bool((state.controller == original).all()), "who is given back is driven as the episode says")
-    _need(bool((state.policy[agent_mask] == -1).all()), "who is given back has no driver")
+    _require(bool((state.controller == original).all()), "who is given back is driven as the episode says")
+    _require(bool((state.policy[agent_mask] == -1).all()), "who is given back has no driver")
 
 
 def _check_bad_controls(world: Simulator) -> None:
@@ -229,22 +231,24 @@ def check_driver(
     """
     available = SENSORS | dict(sensors or {})
     driver = make()
-    _need(isinstance(driver, Driver), "it has the methods and attributes of ssad.core.driving.Driver")
-    _need(isinstance(driver.controller, Controller), "its controller is a ssad.core.types.Controller")
+    _require(isinstance(driver, Driver), "it has the methods and attributes of ssad.core.driving.Driver")
+    _require(isinstance(driver.controller, Controller), "its controller is a ssad.core.types.Controller")
     assignment = list(range(min(episodes, 4)))
-    run_driver = partial(_driven, steps=steps, sensors=available)
+    run_driver = partial(_ego_poses, steps=steps, sensors=available)
     reference = run_driver(driver, simulator(assignment))
-    _need(
+    _require(
         run_driver(driver, simulator(assignment)) == reference,
         "reset makes it forget: the same again is driven the same",
     )
-    _need(run_driver(make(), simulator(assignment[::-1]))[::-1] == reference, "the order of scenes does not matter")
-    _need(run_driver(make(), simulator(assignment[:1])) == reference[:1], "a scene alone is driven as it is in a batch")
+    _require(run_driver(make(), simulator(assignment[::-1]))[::-1] == reference, "the order of scenes does not matter")
+    _require(
+        run_driver(make(), simulator(assignment[:1])) == reference[:1], "a scene alone is driven as it is in a batch"
+    )
     if driver.controller == Controller.EXTERNAL:
         _check_controls(make(), simulator(assignment), steps, available)
 
 
-def _driven(driver: Driver, world: Simulator, *, steps: int, sensors: Mapping[str, Sensor]) -> list[bytes]:
+def _ego_poses(driver: Driver, world: Simulator, *, steps: int, sensors: Mapping[str, Sensor]) -> list[bytes]:
     """Return the poses of each scene's ego, as bytes."""
     loop = Loop(world, {0: driver}, sensors=sensors)
     loop.reset()
@@ -256,21 +260,23 @@ def _driven(driver: Driver, world: Simulator, *, steps: int, sensors: Mapping[st
 
 
 def _check_controls(driver: Driver, world: Simulator, steps: int, known: Mapping[str, Sensor]) -> None:
-    """What it returns is in range, for agents of any number, and it changes nothing."""
+    """Check that the controls are in range for any number of agents, and that the driver changes no input."""
     sensors = {name: known[name] for name in getattr(driver, "sensors", ())}
-    all_agents = np.argwhere(_ready(world).state().active).astype(np.int32)
+    all_agents = np.argwhere(_take_egos(world).state().active).astype(np.int32)
     driver.reset([world.episodes[index] for index in world.assigned])
     for step in range(min(steps, 5)):
         ended = world.ended() != End.RUNNING
         readings = {name: sensor(world, all_agents) for name, sensor in sensors.items()}
         pose_before = world.state().pose.copy()
         controls = np.asarray(driver.act(observe(world.state(), all_agents, ended, readings)), np.float32)
-        _need(
+        _require(
             controls.shape in [(len(all_agents), width) for width in (3, 4)],
             "act returns [N, 3] for the N agents that it sees",
         )
-        _need(bool(np.isfinite(controls).all()), "its controls are finite")
+        _require(bool(np.isfinite(controls).all()), "its controls are finite")
         lower_bounds = np.array([0.0, 0.0, -1.0], np.float32)
-        _need(bool(((controls[:, :3] >= lower_bounds) & (controls[:, :3] <= 1.0)).all()), "its controls are in range")
-        _need(bool((world.state().pose == pose_before).all()), "it moves nobody itself")
+        _require(
+            bool(((controls[:, :3] >= lower_bounds) & (controls[:, :3] <= 1.0)).all()), "its controls are in range"
+        )
+        _require(bool((world.state().pose == pose_before).all()), "it moves nobody itself")
         world.step(_controls(world, range(world.batch), step))

@@ -117,7 +117,7 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
 
 
 def _next_line(
-    route: Route, graph: LaneGraph, lanes: I32, along: F32, what: I32
+    route: Route, graph: LaneGraph, lanes: I32, along: F32, values: I32
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
     """M from every route point to the next line (FAR: none) and what stands there (-1: nothing).
 
@@ -135,7 +135,7 @@ def _next_line(
             nearest = int(visit[np.argmin(np.hypot(*(route.xy[visit] - line_point).T))])
             cos, sin = np.cos(route.yaw[nearest]), np.sin(route.yaw[nearest])
             ahead = (line_point[0] - route.xy[nearest, 0]) * cos + (line_point[1] - route.xy[nearest, 1]) * sin
-            crossings.append((nearest * route.spacing + float(ahead), int(what[row])))
+            crossings.append((nearest * route.spacing + float(ahead), int(values[row])))
     positions = np.arange(len(route.xy)) * route.spacing
     # From the last line backwards, so that the nearest line ahead is written last.
     for position, index in sorted(crossings, reverse=True):
@@ -192,7 +192,7 @@ def _height(route: Route, graph: LaneGraph) -> F32:
 def _lane_left(
     route: Route, part: npt.NDArray[np.intp], graph: LaneGraph, lane: int
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """How far the centre of a lane is to the left of some points of a route (negative: right), and its width there."""
+    """Return the offset of a lane's centre to the left of some route points (negative: right), and its width."""
     lane_points = graph.points(lane)
     x, y = graph.xy[lane_points].astype(np.float64).T
     step_x, step_y = np.diff(x), np.diff(y)
@@ -281,17 +281,17 @@ class _Pool:
 
     tables: list[PathTable] = field(default_factory=list)
     size: int = 0
-    where: dict[tuple[str, bytes], tuple[int, int]] = field(default_factory=dict)
+    route_rows: dict[tuple[str, bytes], tuple[int, int]] = field(default_factory=dict)
     tracks: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def add(self, route: Route, graph: LaneGraph) -> tuple[int, int]:
         key = (graph.name, route.xy.tobytes() + route.speed_limit.tobytes())
-        if key not in self.where:
+        if key not in self.route_rows:
             table = path_table(route, graph)
             self.tables.append(table)
-            self.where[key] = (self.size, len(table.path))
+            self.route_rows[key] = (self.size, len(table.path))
             self.size += len(table.path)
-        return self.where[key]
+        return self.route_rows[key]
 
     def follow(self, agent: EpisodeAgent) -> tuple[int, int]:
         """Add an agent's trajectory; return its first row and number of rows."""

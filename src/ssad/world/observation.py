@@ -23,7 +23,7 @@ def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, 
     pose = state.pose[scene, agent]
     speed = state.speed[scene, agent]
     route, lane_offset, heading_error, route_point = _route(state, scene, agent, pose)
-    neighbours, relation = _others(state, scene, agent, pose)
+    neighbours, relation = _neighbours(state, scene, agent, pose)
     return Observation(
         scene=scene.copy(),
         agent=agent.copy(),
@@ -43,26 +43,26 @@ def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, 
     )
 
 
-def _route(state: WorldState, scene: I32, agent: I32, here: F32) -> tuple[Any, Any, Any, I32]:
+def _route(state: WorldState, scene: I32, agent: I32, own_pose: F32) -> tuple[Any, Any, Any, I32]:
     """`route`, `lane_offset`, `heading_error`, and [N] the nearest point in `state.roads`, -1 without a route."""
     first_point, point_count = np.moveaxis(state.route[scene, agent], -1, 0)
     indices = np.minimum(state.progress[scene, agent][:, None] + 1 + np.arange(AHEAD), point_count[:, None] - 1)
-    route = to_local(here[:, None], state.roads.path[np.maximum(indices + first_point[:, None], 0), :2])
+    route = to_local(own_pose[:, None], state.roads.path[np.maximum(indices + first_point[:, None], 0), :2])
     straight = np.stack([np.arange(1.0, AHEAD + 1), np.zeros(AHEAD)], 1)
     has_route = point_count > 1
     route = np.where(has_route[:, None, None], route, straight)
     nearest_point = np.where(has_route, first_point + state.progress[scene, agent], -1)
     point = state.roads.path[np.maximum(nearest_point, 0)]
-    offset = np.where(has_route, to_local(point[:, :3], here[:, :2])[:, 1], 0.0)
-    heading_error = np.where(has_route, np.angle(np.exp(1j * (here[:, 2] - point[:, 2]))), 0.0)
+    offset = np.where(has_route, to_local(point[:, :3], own_pose[:, :2])[:, 1], 0.0)
+    heading_error = np.where(has_route, np.angle(np.exp(1j * (own_pose[:, 2] - point[:, 2]))), 0.0)
     return route, offset, heading_error, nearest_point
 
 
-def _others(state: WorldState, scene: I32, agent: I32, here: F32) -> tuple[F32, U8]:
-    """`others` and `others_lane`."""
+def _neighbours(state: WorldState, scene: I32, agent: I32, own_pose: F32) -> tuple[F32, U8]:
+    """`features_by_agent` and `others_lane`."""
     pose, kind = state.pose[scene], state.kind[scene]
-    positions = to_local(here[:, None], pose[..., :2])
-    distance = np.hypot(*np.moveaxis(pose[..., :2] - here[:, None, :2], -1, 0))
+    positions = to_local(own_pose[:, None], pose[..., :2])
+    distance = np.hypot(*np.moveaxis(pose[..., :2] - own_pose[:, None, :2], -1, 0))
     visible = state.active[scene] & (kind != AgentKind.NONE) & (distance <= SIGHT)
     row_index = np.arange(len(scene))
     visible[row_index, agent] = False
@@ -70,16 +70,16 @@ def _others(state: WorldState, scene: I32, agent: I32, here: F32) -> tuple[F32, 
     nearest_order = np.argsort(np.where(visible, distance, np.inf), axis=1, kind="stable")[:, :NEAREST]
     row_index = row_index[:, None]
     size = state.size[scene]
-    relative_yaw = np.angle(np.exp(1j * (pose[..., 2] - here[:, None, 2])))
+    relative_yaw = np.angle(np.exp(1j * (pose[..., 2] - own_pose[:, None, 2])))
     columns = (positions[..., 0], positions[..., 1], relative_yaw, state.speed[scene], size[..., 0], size[..., 1], kind)
     features = np.stack([column.astype(np.float32) for column in columns], -1)
     features = np.where(visible[..., None], features, 0.0)[row_index, nearest_order]
-    others = np.zeros((len(scene), NEAREST, 7), np.float32)
-    others[:, : features.shape[1]] = features
+    features_by_agent = np.zeros((len(scene), NEAREST, 7), np.float32)
+    features_by_agent[:, : features.shape[1]] = features
     relation = np.zeros((len(scene), NEAREST), np.uint8)
     relations = lane_relations(state, scene, agent)[row_index, nearest_order]
     relation[:, : features.shape[1]] = np.where(visible[row_index, nearest_order], relations, LaneRelation.ELSEWHERE)
-    return others, relation
+    return features_by_agent, relation
 
 
 def lane_relations(state: WorldState, scene: I32, agent: I32) -> U8:

@@ -118,8 +118,8 @@ def load_policy(path: str | Path) -> Policy:
     return policy_of(card, state, str(path))
 
 
-def policy_of(card: Card, state: Mapping[str, Tensor], where: str) -> Policy:
-    """Build a policy from its card and tensors; `where` names them in error messages.
+def policy_of(card: Card, state: Mapping[str, Tensor], location: str) -> Policy:
+    """Build a policy from its card and tensors; `location` names them in error messages.
 
     Raises:
         FormatError: As `load_policy`.
@@ -132,14 +132,14 @@ def policy_of(card: Card, state: Mapping[str, Tensor], where: str) -> Policy:
     ):
         if value not in allowed:
             raise FormatError(
-                f"{where}: the card of a policy names its {field_name} ({', '.join(allowed)}), not '{value}'"
+                f"{location}: the card of a policy names its {field_name} ({', '.join(allowed)}), not '{value}'"
             )
     layer_count = len(state) // 2
     expected_keys = {
         f"{layer_index}.{tensor_name}" for layer_index in range(layer_count) for tensor_name in ("weight", "bias")
     }
     if not layer_count or set(state) != expected_keys:
-        raise FormatError(f"{where}: not the weights of a policy: expected 0.weight, 0.bias, 1.weight, ...")
+        raise FormatError(f"{location}: not the weights of a policy: expected 0.weight, 0.bias, 1.weight, ...")
     layers = tuple(
         (state[f"{layer_index}.weight"].float(), state[f"{layer_index}.bias"].float())
         for layer_index in range(layer_count)
@@ -149,13 +149,15 @@ def policy_of(card: Card, state: Mapping[str, Tensor], where: str) -> Policy:
         if weight.ndim != 2 or bias.shape != weight.shape[:1] or weight.shape[1] != width:
             shape = list(weight.shape)
             source = f"the observation '{observation}'" if position == 0 else "the layer before it"
-            raise FormatError(f"{where}: layer {position} has the shape {shape}, but {source} has {width} numbers")
+            raise FormatError(f"{location}: layer {position} has the shape {shape}, but {source} has {width} numbers")
         width = weight.shape[0]
     if squash == "best" and ACTIONS[action] != CHOICES.shape[1]:
-        raise FormatError(f"{where}: a policy that chooses has an action of two numbers; '{action}' has another number")
+        raise FormatError(
+            f"{location}: a policy that chooses has an action of two numbers; '{action}' has another number"
+        )
     output_width = len(CHOICES) if squash == "best" else ACTIONS[action]
     if width != output_width:
-        raise FormatError(f"{where}: the last layer gives {width} numbers, the action '{action}' has {output_width}")
+        raise FormatError(f"{location}: the last layer gives {width} numbers, the action '{action}' has {output_width}")
     return Policy(observation, action, layers, squash, card)
 
 

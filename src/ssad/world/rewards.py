@@ -49,7 +49,7 @@ def frea(state: WorldState) -> F64:
 
 
 def driver(state: WorldState) -> F64:
-    """What the shipped drivers learned from, [B]: SafeBench's with -100 for a contact, -5 off the road, -0.1 a step.
+    """Return the reward of the shipped drivers, [B]: SafeBench's with -100 for a contact, -5 off the road, -0.1 a step.
 
     With SafeBench's -1 or FREA's -10 a contact costs what at most one or two steps bring at 8 m/s.
     """

@@ -73,7 +73,7 @@ class Loop:
                 raise ConfigError(
                     f"an actor follows the policy '{name}': say who makes drivers, policies=ssad.make_system"
                 )
-            self.drivers.append((_told_to(simulator, name, len(self.drivers)), policies(name)))
+            self.drivers.append((_policy_selector(simulator, name, len(self.drivers)), policies(name)))
         self.sensors = SENSORS | dict(sensors or {})
         self._image_change = None if isinstance(perturbation, LoopChanges | Mapping | None) else perturbation
         if isinstance(perturbation, LoopChanges):
@@ -204,12 +204,12 @@ class Loop:
             simulator.set_controls(self._controls)
         simulator.advance()
 
-    def _choose(self, who: Selector, state: WorldState) -> tuple[Bool, WorldState]:
+    def _choose(self, selector: Selector, state: WorldState) -> tuple[Bool, WorldState]:
         """Whom a selector chooses [B, A], and the state after it has noted what it remembers and removed whom it does.
 
         Raises ConfigError if it remembers something and the simulator keeps no notes.
         """
-        choice = who(state)
+        choice = selector(state)
         if not isinstance(choice, Choice):
             return np.asarray(choice, bool), state
         if not isinstance(self.simulator, NoteKeeper):
@@ -288,17 +288,17 @@ class _Readings(Mapping[str, Any]):
     """Lazily read sensors: an unused camera renders nothing."""
 
     def __init__(self, names: tuple[str, ...], read: Callable[[str], Any]) -> None:
-        self._names, self._read, self._found = names, read, dict[str, Any]()
+        self._names, self._read, self._cached_readings = names, read, dict[str, Any]()
         self._open = True
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._names:
             raise KeyError(name)
-        if name not in self._found:
+        if name not in self._cached_readings:
             if not self._open:
                 raise ConfigError(f"sensor '{name}' was not read in its step: ask for it while the driver is called")
-            self._found[name] = self._read(name)
-        return self._found[name]
+            self._cached_readings[name] = self._read(name)
+        return self._cached_readings[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -311,7 +311,7 @@ class _Readings(Mapping[str, Any]):
         self._open = False
 
 
-def _told_to(simulator: Simulator, policy: str, number: int) -> Selector:
+def _policy_selector(simulator: Simulator, policy: str, number: int) -> Selector:
     """Return a selector of the agents that follow a policy by their episode and that no other driver controls."""
     follows_policy = np.zeros((len(simulator.episodes), simulator.agents), bool)
     for row, episode in zip(follows_policy, simulator.episodes, strict=True):
@@ -324,12 +324,12 @@ def _told_to(simulator: Simulator, policy: str, number: int) -> Selector:
     return choose
 
 
-def _check_believer(simulator: Simulator, who: int | Selector, driver: Driver) -> None:
+def _check_believer(simulator: Simulator, selector: int | Selector, driver: Driver) -> None:
     if driver.controller != Controller.AUTOPILOT:
         raise ConfigError(
             f"driver {driver.name} has a belief, so its controller must be AUTOPILOT, which plans over it"
         )
-    if not isinstance(who, int) or who != 0:
+    if not isinstance(selector, int) or selector != 0:
         raise ConfigError(f"driver {driver.name} plans over a belief: it can drive egos alone, agent 0")
     if not isinstance(simulator, BeliefSimulator):
         raise ConfigError(f"driver {driver.name} plans over a belief, which this simulator takes from nobody")

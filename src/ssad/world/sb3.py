@@ -15,7 +15,7 @@ from ssad.world.actions import CHOICES
 from ssad.world.env import VectorEnv
 
 
-class Alike:
+class SharedAttributes:
     """Attribute access of a stable-baselines3 vector environment whose scenes have no attributes of their own."""
 
     num_envs: int
@@ -44,7 +44,7 @@ class Alike:
         return scene_indices
 
 
-class SB3VecEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
+class SB3VecEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
     """All scenes of a `VectorEnv` in stable-baselines3's interface, without a process or a wrapper per scene.
 
     An ended scene starts another episode in the same step. `infos` of its row then hold `terminal_observation`,
@@ -100,7 +100,7 @@ class SB3VecEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may n
         return observation, reward.astype(np.float32), ended, infos
 
 
-class Choosing(VecEnvWrapper):  # type: ignore[misc]  # stable-baselines3 may not be installed
+class DiscreteActions(VecEnvWrapper):  # type: ignore[misc]  # stable-baselines3 may not be installed
     """Wrapper for algorithms with discrete actions: actions are row numbers of `ssad.world.actions.CHOICES`."""
 
     def __init__(self, venv: VecEnv) -> None:

@@ -61,15 +61,15 @@ class Window:
         self._surface: Any = None
         self._rate = rate
 
-    def show(self, picture: U8) -> None:
+    def show(self, image: U8) -> None:
         """Show a picture, RGB [H, W, 3], no sooner than the rate allows."""
         if self._surface is None:
             self._pygame.init()
-            self._surface = self._pygame.display.set_mode(picture.shape[1::-1])
+            self._surface = self._pygame.display.set_mode(image.shape[1::-1])
             self._pygame.display.set_caption("SSAD")
             self._clock = self._pygame.time.Clock()
         self._pygame.event.pump()
-        self._surface.blit(self._pygame.surfarray.make_surface(picture.swapaxes(0, 1)), (0, 0))
+        self._surface.blit(self._pygame.surfarray.make_surface(image.swapaxes(0, 1)), (0, 0))
         self._pygame.display.flip()
         self._clock.tick(self._rate)
 

@@ -72,7 +72,7 @@ class FreaSelection:
         goal_distance = np.hypot(*np.moveaxis(state.pose[..., :2] - goal_points[:, None], -1, 0))
         arrived = arrived | (selected & (goal_distance < GOAL_RADIUS)) | collided
         remaining = selected & state.active & ~arrived
-        remaining &= ~_passed(state, 100.0, 100.0) & ~self._blocked(state, arrived & ~collided, 8.0, 10.0)
+        remaining &= ~_behind_ego(state, 100.0, 100.0) & ~self._blocked(state, arrived & ~collided, 8.0, 10.0)
         eligible = self._candidates(state) & ~arrived & ~remaining
         eligible &= ~self._blocked(state, arrived & ~collided, 12.0, 15.0)
         distance = np.where(eligible, _to_ego(state), np.inf)
@@ -93,11 +93,11 @@ class FreaSelection:
         first_point, point_count = np.moveaxis(state.route[:, 0], -1, 0)
         goal_point = np.minimum(state.progress[:, 0] + round(GOAL_AHEAD), point_count - 1)
         goal_lane, ego_lane = roads.lane[first_point + goal_point], state.lane[:, 0]
-        in_junction = _of_lane(roads.junction, goal_lane) & _of_lane(roads.junction, ego_lane)
+        in_junction = _lane_values(roads.junction, goal_lane) & _lane_values(roads.junction, ego_lane)
         goal_side = np.where(goal_lane >= 0, roads.side[goal_lane], 0)[:, None]
         agent_sides = np.where(state.lane >= 0, roads.side[state.lane], 0)
         return np.asarray(
-            eligible & (in_junction[:, None] | (goal_side * agent_sides >= 0)) & ~_passed(state, 90.0, 90.0)
+            eligible & (in_junction[:, None] | (goal_side * agent_sides >= 0)) & ~_behind_ego(state, 90.0, 90.0)
         )
 
     def _blocked(self, state: WorldState, arrived: Bool, reach: float, angle: float) -> Bool:
@@ -115,7 +115,7 @@ class FreaSelection:
         return blocked_agents
 
 
-def _of_lane(table: Bool, lane: I32) -> Bool:
+def _lane_values(table: Bool, lane: I32) -> Bool:
     return np.asarray((lane >= 0) & table[lane])
 
 
@@ -125,10 +125,10 @@ def _to_ego(state: WorldState) -> F64:
     return np.asarray(np.hypot(offset[..., 0], offset[..., 1]), np.float64)
 
 
-def _passed(state: WorldState, bearing: float, turn: float) -> Bool:
-    """[B, A] who lies behind the ego, at `bearing` degrees or more from its heading, and heads away from it.
+def _behind_ego(state: WorldState, bearing: float, turn: float) -> Bool:
+    """Return the agents [B, A] behind the ego, at `bearing` degrees or more from its heading, that head away from it.
 
-    Who is nearer than the ego's length, or heads the ego's way within `turn` degrees, can always interact.
+    An agent that is nearer than the ego's length, or heads as the ego within `turn` degrees, can always interact.
     """
     distance = _to_ego(state)
     x = to_local(state.pose[:, :1], state.pose[..., :2])[..., 0]

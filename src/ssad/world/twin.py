@@ -164,7 +164,7 @@ def box_gap(first: Tensor, second: Tensor) -> Tensor:
     Returns:
         [...], with a gradient almost everywhere.
     """
-    first, second = _alike(first, second)
+    first, second = _broadcast(first, second)
     first_corners, second_corners = _corners(first), _corners(second)
     outside_one, depth_one = _beside(_to_local(first, second_corners), 0.5 * first[..., None, 3:5])
     outside_two, depth_two = _beside(_to_local(second, first_corners), 0.5 * second[..., None, 3:5])
@@ -221,7 +221,7 @@ class RoadField:
         return nearest
 
 
-def _drive(state: MotionState, controls: Tensor, bodies: Bodies, h: float, substeps: int) -> MotionState:
+def _drive(state: MotionState, controls: Tensor, bodies: Bodies, substep: float, substeps: int) -> MotionState:
     """The kinematic bicycle; see `ssad.world.kernels.motion.bicycle`.
 
     Only speeds and wheels go step by step: places and headings are sums over time of what follows from these.
@@ -229,25 +229,25 @@ def _drive(state: MotionState, controls: Tensor, bodies: Bodies, h: float, subst
     controls = controls.repeat_interleave(substeps, 0) if substeps > 1 else controls
     throttle, brake = controls[..., 0].clamp(0.0, 1.0), controls[..., 1].clamp(0.0, 1.0)
     movable = bodies.max_speed > 0.0
-    speed_gain = torch.where(controls[..., 3] > 0.5, -throttle, throttle) * bodies.max_accel * h
-    speed = _speeds(state.speed, torch.where(movable, speed_gain, 0.0), brake * bodies.max_brake * h, bodies)
+    speed_gain = torch.where(controls[..., 3] > 0.5, -throttle, throttle) * bodies.max_accel * substep
+    speed = _speeds(state.speed, torch.where(movable, speed_gain, 0.0), brake * bodies.max_brake * substep, bodies)
     # a vehicle that stands without throttle keeps its wheels where they are; what cannot move stays
     turning = movable & ((controls[..., 0] > 0.0) | (speed[:-1:substeps] != 0.0).repeat_interleave(substeps, 0))
     target_wheel = controls[..., 2].clamp(-1.0, 1.0) * bodies.max_steer
-    wheel = _wheels(state.wheel, target_wheel, bodies.max_steer * (h / STEER_TIME), turning)
+    wheel = _wheels(state.wheel, target_wheel, bodies.max_steer * (substep / STEER_TIME), turning)
     mean_speed = torch.where(movable, 0.5 * (speed[:-1] + speed[1:]), 0.0)
     slip = torch.atan(0.5 * torch.tan(wheel[1:]))
     max_rate = GRIP / mean_speed.abs().clamp_min(1e-3)
     yaw_rate = mean_speed * torch.sin(slip) * 2.0 / bodies.wheelbase
     yaw_rate = torch.minimum(torch.maximum(yaw_rate, -max_rate), max_rate)
     x, y, yaw = state.pose.unbind(-1)
-    yaws = _summed(yaw, yaw_rate * h)
-    heading = yaws[:-1] + slip + 0.5 * yaw_rate * h
+    yaws = _cumulative(yaw, yaw_rate * substep)
+    heading = yaws[:-1] + slip + 0.5 * yaw_rate * substep
     x_values, y_values = (
-        _summed(x, mean_speed * torch.cos(heading) * h),
-        _summed(y, mean_speed * torch.sin(heading) * h),
+        _cumulative(x, mean_speed * torch.cos(heading) * substep),
+        _cumulative(y, mean_speed * torch.sin(heading) * substep),
     )
-    poses = torch.stack([x_values, y_values, _wrapped(yaws)], -1)
+    poses = torch.stack([x_values, y_values, _wrap_angles(yaws)], -1)
     return MotionState(poses[::substeps], speed[::substeps], wheel[::substeps])
 
 
@@ -267,7 +267,7 @@ def _speeds(start: Tensor, push: Tensor, drag: Tensor, bodies: Bodies) -> Tensor
         direction = pushed.sign()
     local_change = torch.where(unclipped & movable, push - direction * drag, 0.0)
     coasting = (pushed == 0.0) & (drag == 0.0)  # from a standstill: any speed would last
-    return _recursive(speed, unclipped | coasting | ~movable, start, local_change)
+    return _run_recursion(speed, unclipped | coasting | ~movable, start, local_change)
 
 
 def _wheels(start: Tensor, aim: Tensor, turn: Tensor, drives: Tensor) -> Tensor:
@@ -279,7 +279,7 @@ def _wheels(start: Tensor, aim: Tensor, turn: Tensor, drives: Tensor) -> Tensor:
         wheel = torch.stack(values)
         remaining = aim - wheel[:-1]
         reaches_target = drives & (remaining.abs() <= turn)
-    return _recursive(
+    return _run_recursion(
         wheel,
         ~reaches_target,
         start,
@@ -291,13 +291,13 @@ class _Recursion(torch.autograd.Function):
     """Recursion v[t + 1] = v[t] + local[t] where `keeps`, else local[t], as one graph node for all steps."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, keeps: Tensor, start: Tensor, own: Tensor) -> Tensor:
-        ctx.save_for_backward(keeps)
+    def forward(context: Any, values: Tensor, keeps: Tensor, start: Tensor, offsets: Tensor) -> Tensor:
+        context.save_for_backward(keeps)
         return values.clone()
 
     @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[None, None, Tensor, Tensor]:
-        keeps = ctx.saved_tensors[0].to(slopes[0].dtype)
+    def backward(context: Any, *slopes: Tensor) -> tuple[None, None, Tensor, Tensor]:
+        keeps = context.saved_tensors[0].to(slopes[0].dtype)
         # The reverse recursion: a step that keeps its value passes its gradient on to the step before.
         accumulated = [slopes[0][-1]]
         for slope, keep in zip(slopes[0][:-1].flip(0), keeps.flip(0), strict=True):
@@ -306,8 +306,8 @@ class _Recursion(torch.autograd.Function):
         return None, None, gradients[0], gradients[1:]
 
 
-def _recursive(values: Tensor, keeps: Tensor, start: Tensor, own: Tensor) -> Tensor:
-    return _Recursion.apply(values, keeps, start, own)  # type: ignore[no-any-return]
+def _run_recursion(values: Tensor, keeps: Tensor, start: Tensor, offsets: Tensor) -> Tensor:
+    return _Recursion.apply(values, keeps, start, offsets)  # type: ignore[no-any-return]
 
 
 def _walk(state: MotionState, controls: Tensor, bodies: Bodies, dt: float) -> MotionState:
@@ -319,23 +319,26 @@ def _walk(state: MotionState, controls: Tensor, bodies: Bodies, dt: float) -> Mo
         speeds.append(speeds[-1] + (desired_speed - speeds[-1]).clamp(-max_change, max_change))
     speed = torch.stack(speeds)
     x, y, yaw = state.pose.unbind(-1)
-    yaws = _summed(yaw, controls[..., 2].clamp(-1.0, 1.0) * (WALKER_RATE * dt))
+    yaws = _cumulative(yaw, controls[..., 2].clamp(-1.0, 1.0) * (WALKER_RATE * dt))
     distances = 0.5 * (speed[:-1] + speed[1:]) * dt
-    x_values, y_values = _summed(x, distances * torch.cos(yaws[1:])), _summed(y, distances * torch.sin(yaws[1:]))
-    return MotionState(torch.stack([x_values, y_values, _wrapped(yaws)], -1), speed, state.wheel.expand_as(speed))
+    x_values, y_values = (
+        _cumulative(x, distances * torch.cos(yaws[1:])),
+        _cumulative(y, distances * torch.sin(yaws[1:])),
+    )
+    return MotionState(torch.stack([x_values, y_values, _wrap_angles(yaws)], -1), speed, state.wheel.expand_as(speed))
 
 
-def _summed(start: Tensor, changes: Tensor) -> Tensor:
+def _cumulative(start: Tensor, changes: Tensor) -> Tensor:
     """Return values [T + 1, ...] with a given start and changes [T, ...]."""
     return torch.cat([start[None], changes]).cumsum(0)
 
 
-def _alike(*tensors: Tensor) -> list[Tensor]:
+def _broadcast(*tensors: Tensor) -> list[Tensor]:
     """Broadcast tensors to one shape."""
     return list(torch.broadcast_tensors(*tensors))  # type: ignore[no-untyped-call]
 
 
-def _wrapped(angle: Tensor) -> Tensor:
+def _wrap_angles(angle: Tensor) -> Tensor:
     """Wrap angles to [-pi, pi), with the gradient of the angle itself."""
     return angle - 2 * math.pi * torch.floor((angle.detach() + math.pi) / (2 * math.pi))
 

@@ -17,7 +17,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import quiet_warp
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
-from ssad.world.belief import Lanes, check, complete, lanes_of, rested
+from ssad.world.belief import Lanes, check, complete, lanes_of, rest_times
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import see
 from ssad.world.kernels.data import BLOCK, HORIZON, Ego, Presence, Seen, State, Work, array_types
@@ -480,7 +480,9 @@ class World:
                     name: self.array(f"seen.{name}")[:, self.agents :] for name in ("pose", "speed", "kind", "waited")
                 }
                 previous["kind"] = np.where(self.array("seen.believes")[:, None], previous["kind"], AgentKind.NONE)
-                belief_arrays["waited"] = rested(belief_arrays, previous, self.dt * (step - self.array("seen.told")))
+                belief_arrays["waited"] = rest_times(
+                    belief_arrays, previous, self.dt * (step - self.array("seen.told"))
+                )
             object_count = belief_arrays["kind"].shape[1]
             if object_count > self.believed:
                 # Round up, so that a slowly growing belief does not record the launches again each time.
@@ -534,7 +536,7 @@ class World:
         )
 
     def state(self) -> WorldState:
-        """Where everybody is; see `WorldState`. On CPU most arrays are views that hold until the next step."""
+        """State of all agents; see `WorldState`. On CPU most arrays are views that hold until the next step."""
         constants = self._fixed
         time = self.array("step") * self.dt
         return WorldState(

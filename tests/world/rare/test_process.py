@@ -13,7 +13,7 @@ from ssad.core.types import F64, Controller, End
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
-from ssad.world.rare.importance import LATER, Proposal, sample
+from ssad.world.rare.importance import LATER, MixtureProposal, sample
 from ssad.world.rare.process import WorldProcess, closeness
 from ssad.world.rare.splitting import keys_of, splitting
 from ssad.world.roads import load_town
@@ -63,7 +63,7 @@ def test_weights_of_a_proposal_average_1_and_sums_are_those_of_what_was_drawn() 
     rows = process(400)
     assert rows.width == 9  # the ego's lapses and the acceleration of two others, in three stretches
     means = generator("means").normal(0.0, 0.15, (2, rows.width))
-    drawn = sample(rows, Proposal(np.array([0.2, 0.4, 0.4]), means), generator("w"), episodes=1200)
+    drawn = sample(rows, MixtureProposal(np.array([0.2, 0.4, 0.4]), means), generator("w"), episodes=1200)
     assert drawn.weight.mean() == pytest.approx(1.0, abs=4.0 * drawn.weight.std() / np.sqrt(len(drawn.weight)))
     rest = drawn.total - drawn.count * np.vstack([np.zeros(rows.width), means])[drawn.component]
     spread = (rest**2 / drawn.count).mean(axis=0)
@@ -109,7 +109,7 @@ def test_what_is_moved_later_moves_the_processes_as_much_then() -> None:
 def test_copies_that_begin_later_leave_weights_exact(defence: float) -> None:
     rows = process(400)
     share = np.array([defence, 0.6 * (1.0 - defence), 0.4 * (1.0 - defence)])
-    plain = Proposal(share, generator("late").normal(0.0, 0.15, (2, rows.width)))
+    plain = MixtureProposal(share, generator("late").normal(0.0, 0.15, (2, rows.width)))
     found = plain.with_later(rows).spread()
     assert found.share.sum() == pytest.approx(1.0)
     assert (found.share >= 0.0).all()
@@ -118,7 +118,7 @@ def test_copies_that_begin_later_leave_weights_exact(defence: float) -> None:
     drawn = sample(rows, found, generator("wl"), episodes=1200)
     assert drawn.weight.mean() == pytest.approx(1.0, abs=4.0 * drawn.weight.std() / np.sqrt(len(drawn.weight)))
     assert drawn.weight.max() <= 1.0 / defence + 1e-9
-    nothing = Proposal(np.ones(1), np.zeros((0, rows.width)))
+    nothing = MixtureProposal(np.ones(1), np.zeros((0, rows.width)))
     assert nothing.with_later(rows) is nothing
 
 

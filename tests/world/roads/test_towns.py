@@ -18,7 +18,7 @@ from ssad.core.types import LaneType
 from ssad.world.roads import LaneGraph, bake, load_town, town_names
 from ssad.world.roads.designs import DESIGNS as TOWNS
 from ssad.world.roads.designs import generate_town
-from ssad.world.roads.router import _across
+from ssad.world.roads.router import _level_position
 from tests.world.roads.towns import BUILT_IN, built_in
 
 INTERCHANGES = {2000, 12000}  # of Longreach
@@ -93,7 +93,7 @@ def test_neighbours_agree(name: str) -> None:
             assert back == i
             middle = float(graph.length[i]) / 2
             x, y, yaw, width = graph.at(i, middle)
-            u, v, _, wide = graph.at(other, _across(graph, i, middle, other))
+            u, v, _, wide = graph.at(other, _level_position(graph, i, middle, other))
             lateral = -(u - x) * np.sin(yaw) + (v - y) * np.cos(yaw)
             assert lateral == pytest.approx(side * (width + wide) / 2, abs=0.05)
 

@@ -41,13 +41,13 @@ class ChanceEpisode:
     def world(self, rows: int, keys: Mapping[int, int] | None = None, means: Sequence[float] = ()) -> Any:
         """A world of so many copies; with keys by step, one whose future is that."""
         from ssad.world.noise import Noise
-        from ssad.world.rare.process import Told
+        from ssad.world.rare.process import ReplayedWorld
         from ssad.world.world import World
 
         noise = Noise(**self.noise, stretches=9)
         graphs = {self.episode.town: self.graph}
         if keys:
-            return Told([self.episode], graphs, keys=keys, means=means, device=self.device, noise=noise)
+            return ReplayedWorld([self.episode], graphs, keys=keys, means=means, device=self.device, noise=noise)
         assignment = np.zeros(rows, np.int64)
         return World([self.episode], graphs, assign=assignment, device=self.device, noise=noise)
 

@@ -35,11 +35,11 @@ LARGEST_TURN = wp.constant(1.57)  # rad that one who has left its route is expec
 
 @wp.func
 def light(
-    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, index: int, dt: float
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, e: int, index: int, dt: float
 ) -> int:
     """Return the state of a signal as agent i perceives it."""
-    if i == 0 and seen.believes[b] == 1 and seen.light[b, index] != AS_IT_IS:
-        return seen.light[b, index]
+    if i == 0 and perceived.believes[b] == 1 and perceived.light[b, index] != AS_IT_IS:
+        return perceived.light[b, index]
     return signal_state(bank, roads, e, index, float(state.step[b]) * dt)
 
 
@@ -56,7 +56,7 @@ def keeps_route(roads: Roads, route: wp.vec2i, shift: wp.vec4, at: int, pose: wp
 
 
 @wp.func
-def shown(roads: Roads, route: wp.vec2i, at: int) -> float:
+def announced_distance(roads: Roads, route: wp.vec2i, at: int) -> float:
     """Return the distance along a route (m) up to which an agent that follows it shows its direction.
 
     That is the second junction ahead: the turn signal announces the next one, and its exit lane leads to the one
@@ -74,16 +74,16 @@ def turned(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
     """Return the pose after `distance` metres at a constant curvature, which ends after a quarter of a turn."""
     angle = wp.clamp(curvature * distance, -LARGEST_TURN, LARGEST_TURN)
     arc = distance
-    rest = float(0.0)
+    remaining = float(0.0)
     if wp.abs(curvature * distance) > LARGEST_TURN:
         arc = angle / curvature
-        rest = distance - arc
+        remaining = distance - arc
     chord = arc
     if wp.abs(angle) > STRAIGHT_TURN:
         chord = 2.0 * arc / angle * wp.sin(0.5 * angle)
     yaw = pose[2] + angle
-    x = pose[0] + chord * wp.cos(pose[2] + 0.5 * angle) + rest * wp.cos(yaw)
-    y = pose[1] + chord * wp.sin(pose[2] + 0.5 * angle) + rest * wp.sin(yaw)
+    x = pose[0] + chord * wp.cos(pose[2] + 0.5 * angle) + remaining * wp.cos(yaw)
+    y = pose[1] + chord * wp.sin(pose[2] + 0.5 * angle) + remaining * wp.sin(yaw)
     return wp.vec3(x, y, yaw)
 
 
@@ -112,7 +112,7 @@ def ahead_at(
     at: int,
     pose: wp.vec3,
     follows: bool,
-    known: float,
+    shown_distance: float,
     curvature: float,
     ahead: float,
 ) -> wp.vec3:
@@ -121,8 +121,8 @@ def ahead_at(
     if not follows:
         predicted = turned(pose, ahead, curvature)
     else:
-        predicted = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, known))
-        excess = float(at) + ahead - known
+        predicted = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, shown_distance))
+        excess = float(at) + ahead - shown_distance
         if excess > 0.0:
             predicted = wp.vec3(
                 predicted[0] + excess * wp.cos(predicted[2]), predicted[1] + excess * wp.sin(predicted[2]), predicted[2]
@@ -137,26 +137,26 @@ def around(box: wp.vec4, q: wp.vec3) -> wp.vec4:
 
 
 @wp.func
-def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, dt: float):
+def look_at(bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, dt: float):
     """Fill the row of an agent."""
     if state.active[b, i] == Presence.ABSENT:
-        seen.kind[b, i] = AgentKind.NONE
+        perceived.kind[b, i] = AgentKind.NONE
         return
     e = state.episode[b]
     model = bank.model[e, i]
     body = bank.body[model]
-    seen.kind[b, i] = bank.kind[model]
+    perceived.kind[b, i] = bank.kind[model]
     pose = state.pose[b, i]
     speed = state.speed[b, i]
-    seen.pose[b, i] = pose
-    seen.speed[b, i] = speed
-    seen.half[b, i] = wp.vec2(body[0], body[1])
+    perceived.pose[b, i] = pose
+    perceived.speed[b, i] = speed
+    perceived.half[b, i] = wp.vec2(body[0], body[1])
     # traffic does not know who is under test: the ego is relied on like anybody, whoever drives it
     reliable = int(0)
     if i == 0 or (state.controller[b, i] == Controller.AUTOPILOT and state.active[b, i] == Presence.AWAKE):
         reliable = 1
-    seen.gives_way[b, i] = reliable
-    seen.waited[b, i] = state.waited[b, i]
+    perceived.gives_way[b, i] = reliable
+    perceived.waited[b, i] = state.waited[b, i]
     way = wp.vec4(FAR, FAR, float(TurnRank.STRAIGHT), 0.0)
     signal = int(-1)
     route = bank.route[e, i]
@@ -167,7 +167,7 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     if route[1] > 1:
         height = roads.height[route[0] + at]
     # NaN without a route: an unknown height never counts as another level.
-    seen.height[b, i] = height
+    perceived.height[b, i] = height
     follows = route[1] > 1 and bank.kind[model] != AgentKind.WALKER
     if follows:
         follows = keeps_route(roads, route, shift, at, pose)
@@ -185,12 +185,12 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     if follows and reliable == 1 and way[1] < body[0] - 1.0:
         expected_speed = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
     box = wp.vec4(pose[0], pose[1], pose[0], pose[1])
-    flat_index = (b * seen.forecast.shape[1] + i) * HORIZON
+    flat_index = (b * perceived.forecast.shape[1] + i) * HORIZON
     if wp.abs(expected_speed) > 0.1:
         shown_until = float(0.0)
         curvature = float(0.0)
         if follows:
-            shown_until = shown(roads, route, at)
+            shown_until = announced_distance(roads, route, at)
         elif wp.abs(speed) > 1.0:
             curvature = wrap(pose[2] - state.previous[b, i][2]) / (speed * dt)
             if wp.abs(curvature) > STRAIGHT_TURN:
@@ -201,21 +201,21 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
             second = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 2))
             third = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 3))
             fourth = ahead_at(roads, route, shift, at, pose, follows, shown_until, curvature, stride * float(k + 4))
-            put_four(seen.forecast, flat_index + k, first, second, third, fourth)
+            put_four(perceived.forecast, flat_index + k, first, second, third, fourth)
             box = around(around(around(around(box, first), second), third), fourth)
     else:
         for k in range(0, HORIZON, 4):
-            put_four(seen.forecast, flat_index + k, pose, pose, pose, pose)
-    seen.span[b, i] = box
-    seen.way[b, i] = way
-    seen.signal[b, i] = signal
-    seen.change[b, i] = change
+            put_four(perceived.forecast, flat_index + k, pose, pose, pose, pose)
+    perceived.span[b, i] = box
+    perceived.way[b, i] = way
+    perceived.signal[b, i] = signal
+    perceived.change[b, i] = change
 
 
 @wp.kernel(enable_backward=False)
-def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, threads: int, dt: float):
+def see(bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, agents: int, threads: int, dt: float):
     """Fill the row of every agent."""
     b, first_agent = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first_agent, agents, threads):
-            look_at(bank, roads, state, seen, b, i, dt)
+            look_at(bank, roads, state, perceived, b, i, dt)

@@ -21,22 +21,22 @@ def idm_free(v: float, target: float) -> float:
 
 
 @wp.func
-def condition_holds(state: State, b: int, i: int, when: wp.vec3, dt: float) -> bool:
+def condition_holds(state: State, b: int, i: int, condition: wp.vec3, dt: float) -> bool:
     """Return whether a phase may begin; when: `When`, value, agent."""
-    kind = int(when[0])
+    kind = int(condition[0])
     holds = kind == When.ALWAYS
     if kind == When.EGO_DISTANCE:
         ego_pose = state.pose[b, 0]
-        other_pose = state.pose[b, int(when[2])]
-        holds = wp.length(wp.vec2(ego_pose[0] - other_pose[0], ego_pose[1] - other_pose[1])) < when[1]
+        other_pose = state.pose[b, int(condition[2])]
+        holds = wp.length(wp.vec2(ego_pose[0] - other_pose[0], ego_pose[1] - other_pose[1])) < condition[1]
     elif kind == When.EGO_SPEED:
-        holds = state.speed[b, 0] > when[1]
+        holds = state.speed[b, 0] > condition[1]
     elif kind == When.TRAVELLED:
-        holds = state.travelled[b, i] > when[1]
+        holds = state.travelled[b, i] > condition[1]
     elif kind == When.TIME:
-        holds = float(state.step[b]) * dt >= when[1] - 1.0e-4
+        holds = float(state.step[b]) * dt >= condition[1] - 1.0e-4
     elif kind == When.AFTER:
-        holds = float(state.step[b] - state.since[b, i]) * dt >= when[1] - 1.0e-4
+        holds = float(state.step[b] - state.since[b, i]) * dt >= condition[1] - 1.0e-4
     return holds
 
 
@@ -82,16 +82,16 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
 
 
 @wp.func
-def room_behind(seen: Seen, b: int, i: int, from_row: int, to_row: int) -> bool:
-    """Return whether no agent in these rows of `seen` is within a metre and a half behind a vehicle."""
-    pose = seen.pose[b, i]
-    own_half = seen.half[b, i]
+def room_behind(perceived: Seen, b: int, i: int, from_row: int, to_row: int) -> bool:
+    """Return whether no agent in these rows of `perceived` is within a metre and a half behind a vehicle."""
+    pose = perceived.pose[b, i]
+    own_half = perceived.half[b, i]
     pose_behind = wp.vec3(pose[0] - 1.5 * wp.cos(pose[2]), pose[1] - 1.5 * wp.sin(pose[2]), pose[2])
     free = int(1)
     for j in range(from_row, to_row):
-        if j != i and seen.kind[b, j] != AgentKind.NONE:
-            other_pose = seen.pose[b, j]
-            other_half = seen.half[b, j]
+        if j != i and perceived.kind[b, j] != AgentKind.NONE:
+            other_pose = perceived.pose[b, j]
+            other_half = perceived.half[b, j]
             near = (
                 wp.length(wp.vec2(other_pose[0] - pose_behind[0], other_pose[1] - pose_behind[1]))
                 < own_half[0] + other_half[0] + 3.0
@@ -110,7 +110,7 @@ def room_behind(seen: Seen, b: int, i: int, from_row: int, to_row: int) -> bool:
 
 @wp.func
 def drive_one(
-    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, agents: int, rows: int, dt: float
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, agents: int, rows: int, dt: float
 ):
     """Compute the controls of an agent that is not external."""
     if state.active[b, i] == Presence.ABSENT:
@@ -180,10 +180,10 @@ def drive_one(
         if controller == Controller.AUTOPILOT and state.stalled[b, i] == 1 and speed < 0.3:
             from_row = int(0)
             to_row = agents
-            if i == 0 and seen.believes[b] == 1:
+            if i == 0 and perceived.believes[b] == 1:
                 from_row = agents
                 to_row = rows
-            if room_behind(seen, b, i, from_row, to_row):
+            if room_behind(perceived, b, i, from_row, to_row):
                 throttle = 0.0
                 if speed > -1.0:
                     throttle = 0.4
@@ -200,9 +200,11 @@ def drive_one(
 
 
 @wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
-def drive(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, rows: int, threads: int, dt: float):
+def drive(
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, agents: int, rows: int, threads: int, dt: float
+):
     """Compute the controls of every agent that is not external, from the state of all at the start of the step."""
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
-            drive_one(bank, roads, state, seen, b, i, agents, rows, dt)
+            drive_one(bank, roads, state, perceived, b, i, agents, rows, dt)

@@ -108,21 +108,21 @@ def on_oncoming_lane(roads: Roads, first: int, shift: wp.vec4) -> bool:
 
 
 @wp.func
-def change_priority(seen: Seen, b: int, i: int, j: int, otherwise: bool) -> bool:
+def change_priority(perceived: Seen, b: int, i: int, j: int, otherwise: bool) -> bool:
     """Return whether i goes before j where one of them changes lanes; else `otherwise`.
 
     Of each two exactly one goes first.
     An agent on the oncoming lane yields to that lane's traffic; of two in the same direction, the one in front goes.
     Agents that cannot be relied on are never required to give way.
     """
-    own_change = seen.change[b, i]
-    other_change = seen.change[b, j]
+    own_change = perceived.change[b, i]
+    other_change = perceived.change[b, j]
     goes_first = otherwise
-    if seen.gives_way[b, j] == 1 and (
+    if perceived.gives_way[b, j] == 1 and (
         own_change[0] != 0 or own_change[1] != 0 or other_change[0] != 0 or other_change[1] != 0
     ):
-        own_pose = seen.pose[b, i]
-        other_pose = seen.pose[b, j]
+        own_pose = perceived.pose[b, i]
+        other_pose = perceived.pose[b, j]
         facing = wp.cos(other_pose[2] - own_pose[2])
         if facing < -0.5 and own_change[1] != other_change[1]:
             goes_first = other_change[1] == 1

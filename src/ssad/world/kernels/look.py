@@ -49,13 +49,13 @@ def put_agent(
     if j < 0:
         put(out, n, at, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         return
-    other = state.pose[b, j]
+    other_pose = state.pose[b, j]
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
-    dx = other[0] - pose[0]
-    dy = other[1] - pose[1]
+    dx = other_pose[0] - pose[0]
+    dy = other_pose[1] - pose[1]
     body = bank.body[bank.model[e, j]]
-    turn = wrap(other[2] - pose[2])
+    turn = wrap(other_pose[2] - pose[2])
     put(out, n, at, c * dx + s * dy, -s * dx + c * dy, 2.0 * body[0], 2.0 * body[1], turn, state.speed[b, j])
 
 
@@ -65,10 +65,10 @@ def look(
     roads: Roads,
     state: State,
     agents: int,
-    who: wp.array(dtype=wp.vec2i),
+    observers: wp.array(dtype=wp.vec2i),
     out: wp.array2d(dtype=wp.float32),
 ):
-    """Write observation rows [N, 28] of the agents `who` (scene, agent).
+    """Write observation rows [N, 28] of the agents `observers` (scene, agent).
 
     4 numbers of SafeBench, then FREA's rows: the agent itself, the two nearest vehicles within 25 m, and the route.
 
@@ -77,8 +77,8 @@ def look(
     distance of the longest chord over the next 11 m that no route point between leaves by more than 0.5 m.
     """
     n = wp.tid()
-    b = who[n][0]
-    i = who[n][1]
+    b = observers[n][0]
+    i = observers[n][1]
     e = state.episode[b]
     pose = state.pose[b, i]
     c = wp.cos(pose[2])
@@ -92,9 +92,9 @@ def look(
     lane = state.lane[b, i]
     for j in range(agents):
         if j != i and state.active[b, j] != Presence.ABSENT:
-            other = state.pose[b, j]
-            dx = other[0] - pose[0]
-            dy = other[1] - pose[1]
+            other_pose = state.pose[b, j]
+            dx = other_pose[0] - pose[0]
+            dy = other_pose[1] - pose[1]
             distance2 = dx * dx + dy * dy
             kind = bank.kind[bank.model[e, j]]
             # 25 m squared; the kinds below WALKER are the vehicles.
@@ -173,7 +173,7 @@ def look_as_adversary(
     roads: Roads,
     state: State,
     agents: int,
-    who: wp.array(dtype=wp.vec2i),
+    observers: wp.array(dtype=wp.vec2i),
     out: wp.array2d(dtype=wp.float32),
 ):
     """Write FREA's rows for an adversary [N, 24]: itself, the ego, the nearest other vehicle within 25 m, and its goal.
@@ -181,8 +181,8 @@ def look_as_adversary(
     Goal: the point of the ego's route that the ego reaches next, as x, y, radius, radius, relative yaw, distance.
     """
     n = wp.tid()
-    b = who[n][0]
-    i = who[n][1]
+    b = observers[n][0]
+    i = observers[n][1]
     e = state.episode[b]
     pose = state.pose[b, i]
     nearest = int(-1)
@@ -190,8 +190,10 @@ def look_as_adversary(
     min_distance2 = float(625.0)
     for j in range(1, agents):
         if j != i and state.active[b, j] != Presence.ABSENT and bank.kind[bank.model[e, j]] < AgentKind.WALKER:
-            other = state.pose[b, j]
-            distance2 = (other[0] - pose[0]) * (other[0] - pose[0]) + (other[1] - pose[1]) * (other[1] - pose[1])
+            other_pose = state.pose[b, j]
+            distance2 = (other_pose[0] - pose[0]) * (other_pose[0] - pose[0]) + (other_pose[1] - pose[1]) * (
+                other_pose[1] - pose[1]
+            )
             if distance2 < min_distance2:
                 min_distance2 = distance2
                 nearest = j
@@ -217,7 +219,7 @@ def look_from_above(
     roads: Roads,
     state: State,
     agents: int,
-    who: wp.array(dtype=wp.vec2i),
+    observers: wp.array(dtype=wp.vec2i),
     side: int,
     metre: float,
     behind: float,
@@ -228,8 +230,8 @@ def look_from_above(
     metre: pixels a metre; behind: metres that are seen behind the agent's centre. Where it itself is, agents is 0.5.
     """
     n, row, column = wp.tid()
-    b = who[n][0]
-    i = who[n][1]
+    b = observers[n][0]
+    i = observers[n][1]
     e = state.episode[b]
     pose = state.pose[b, i]
     ahead = (float(side) - 0.5 - float(row)) / metre - behind
@@ -256,12 +258,12 @@ def look_from_above(
     speed = float(0.0)
     for j in range(agents):
         if state.active[b, j] != Presence.ABSENT:
-            other = state.pose[b, j]
+            other_pose = state.pose[b, j]
             body = bank.body[bank.model[e, j]]
-            dx = x - other[0]
-            dy = y - other[1]
-            other_cos = wp.cos(other[2])
-            other_sin = wp.sin(other[2])
+            dx = x - other_pose[0]
+            dy = y - other_pose[1]
+            other_cos = wp.cos(other_pose[2])
+            other_sin = wp.sin(other_pose[2])
             if (
                 wp.abs(dx * other_cos + dy * other_sin) <= body[0]
                 and wp.abs(dy * other_cos - dx * other_sin) <= body[1]

@@ -54,21 +54,21 @@ def look_at_traffic(
     roads: Roads,
     state: State,
     agents: int,
-    who: wp.array(dtype=wp.vec2i),
+    observers: wp.array(dtype=wp.vec2i),
     dt: float,
     out: wp.array2d(dtype=wp.float32),
 ):
-    """Write rows [N, 69] of the agents `who` (scene, agent); see `ssad.world.sensors.SENSORS`."""
+    """Write rows [N, 69] of the agents `observers` (scene, agent); see `ssad.world.sensors.SENSORS`."""
     n = wp.tid()
-    b = who[n][0]
-    i = who[n][1]
+    b = observers[n][0]
+    i = observers[n][1]
     e = state.episode[b]
     pose = state.pose[b, i]
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
     route = bank.route[e, i]
     at = float(state.progress[b, i])
-    rest = float(SIGHT)
+    remaining = float(SIGHT)
     offset = float(0.0)
     error = float(0.0)
     if route[1] > 1:
@@ -76,14 +76,14 @@ def look_at_traffic(
         at = at + (pose[0] - point[0]) * wp.cos(point[2]) + (pose[1] - point[1]) * wp.sin(point[2])
         offset = -wp.sin(point[2]) * (pose[0] - point[0]) + wp.cos(point[2]) * (pose[1] - point[1])
         error = wrap(pose[2] - point[2])
-        rest = wp.clamp(float(route[1] - 1) - at, 0.0, SIGHT)
+        remaining = wp.clamp(float(route[1] - 1) - at, 0.0, SIGHT)
     out[n, 0] = state.speed[b, i] / 10.0
     out[n, 1] = state.accel[b, i] / 5.0
     out[n, 2] = state.wheel[b, i] / 0.5
     out[n, 3] = state.cruise[b, i] / 10.0
     out[n, 4] = wp.clamp(offset / 2.0, -5.0, 5.0)
     out[n, 5] = error
-    out[n, 6] = rest / SIGHT
+    out[n, 6] = remaining / SIGHT
     for index in range(6):
         ahead = float(4 * (index + 1))
         if index > 2:
@@ -91,9 +91,9 @@ def look_at_traffic(
         x = ahead
         y = float(0.0)
         if route[1] > 1:
-            other = route_at(roads, route[0], route[1], at + ahead)
-            x = c * (other[0] - pose[0]) + s * (other[1] - pose[1])
-            y = -s * (other[0] - pose[0]) + c * (other[1] - pose[1])
+            other_pose = route_at(roads, route[0], route[1], at + ahead)
+            x = c * (other_pose[0] - pose[0]) + s * (other_pose[1] - pose[1])
+            y = -s * (other_pose[0] - pose[0]) + c * (other_pose[1] - pose[1])
         out[n, 7 + 2 * index] = x / 20.0
         out[n, 8 + 2 * index] = y / 20.0
     gap = vec5()
@@ -102,25 +102,25 @@ def look_at_traffic(
         gap[horizon] = SIGHT
     for j in range(agents):
         if j != i and state.active[b, j] != Presence.ABSENT:
-            other = state.pose[b, j]
-            x = c * (other[0] - pose[0]) + s * (other[1] - pose[1])
-            y = -s * (other[0] - pose[0]) + c * (other[1] - pose[1])
+            other_pose = state.pose[b, j]
+            x = c * (other_pose[0] - pose[0]) + s * (other_pose[1] - pose[1])
+            y = -s * (other_pose[0] - pose[0]) + c * (other_pose[1] - pose[1])
             distance = wp.sqrt(x * x + y * y)
-            turn = wrap(other[2] - pose[2])
+            turn = wrap(other_pose[2] - pose[2])
             # An agent that follows on the same path will not be ahead.
             follows = x < 0.0 and wp.abs(y) < 2.0 and wp.cos(turn) > 0.5
             if route[1] > 1 and distance < 2.0 * SIGHT and not follows:
                 body = bank.body[bank.model[e, j]]
                 speed = state.speed[b, j]
-                rate = wp.clamp(wrap(other[2] - state.previous[b, j][2]) / dt, -TURN, TURN)
+                rate = wp.clamp(wrap(other_pose[2] - state.previous[b, j][2]) / dt, -TURN, TURN)
                 if wp.abs(speed) < 0.1 or state.step[b] == 0:
                     rate = 0.0
                 reach = wp.sqrt(body[0] * body[0] + body[1] * body[1]) + BESIDE
                 for horizon in range(5):
-                    predicted = expected(other, speed, rate, float(horizon))
+                    predicted = expected(other_pose, speed, rate, float(horizon))
                     for index in range(STATIONS):
                         station = 2.0 * float(index)
-                        if station < gap[horizon] and station <= rest:
+                        if station < gap[horizon] and station <= remaining:
                             road_point = route_at(roads, route[0], route[1], at + station)
                             dx = predicted[0] - road_point[0]
                             dy = predicted[1] - road_point[1]
@@ -148,12 +148,12 @@ def look_at_traffic(
         for column in range(8):
             out[n, start_column + column] = 0.0
         if nearest >= 0:
-            other = state.pose[b, nearest]
+            other_pose = state.pose[b, nearest]
             column = bank.model[e, nearest]
             body = bank.body[column]
-            turn = wrap(other[2] - pose[2])
-            out[n, start_column] = (c * (other[0] - pose[0]) + s * (other[1] - pose[1])) / 25.0
-            out[n, start_column + 1] = (-s * (other[0] - pose[0]) + c * (other[1] - pose[1])) / 25.0
+            turn = wrap(other_pose[2] - pose[2])
+            out[n, start_column] = (c * (other_pose[0] - pose[0]) + s * (other_pose[1] - pose[1])) / 25.0
+            out[n, start_column + 1] = (-s * (other_pose[0] - pose[0]) + c * (other_pose[1] - pose[1])) / 25.0
             out[n, start_column + 2] = wp.cos(turn)
             out[n, start_column + 3] = wp.sin(turn)
             out[n, start_column + 4] = state.speed[b, nearest] / 10.0

@@ -43,7 +43,7 @@ vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 @wp.func
 def place_beside(roads: Roads, route: wp.vec2i, u0: float, guess: float, q: wp.vec3) -> wp.vec4:
-    """Where a pose is along a route from `u0` metres on: (m ahead, m left, cosine of the headings' difference, rest).
+    """Locate a pose along a route from `u0` metres on: (m ahead, m left, cosine of the headings' difference, rest).
 
     rest: what is left of the search, m; where it is large the place is not known.
     """
@@ -70,7 +70,7 @@ def gaps(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     b: int,
     i: int,
     e: int,
@@ -98,23 +98,23 @@ def gaps(
     oncoming = float(0.0)
     lane_shift = wp.vec4(0.0, 1.0, share, share)
     for j in range(rows[0], rows[1]):
-        if j != i and seen.kind[b, j] != AgentKind.NONE:
-            other_pose = seen.pose[b, j]
+        if j != i and perceived.kind[b, j] != AgentKind.NONE:
+            other_pose = perceived.pose[b, j]
             dx = other_pose[0] - pose[0]
             dy = other_pose[1] - pose[1]
             if dx * dx + dy * dy < VIEW * VIEW:
                 position = place_beside(roads, route, u0, dx * frame[2] + dy * frame[3], other_pose)
-                other_half = seen.half[b, j]
+                other_half = perceived.half[b, j]
                 cosine = position[2]
                 sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
                 half_along = other_half[0] * wp.abs(cosine) + other_half[1] * sine
                 half_across = other_half[0] * sine + other_half[1] * wp.abs(cosine)
-                other_speed = seen.speed[b, j] * cosine
+                other_speed = perceived.speed[b, j] * cosine
                 lateral_offset = position[1] - metres_left(roads, route[0], route[1], lane_shift, u0 + position[0])
                 # An agent that is moving onto that lane counts, too.
                 intended_offset = lateral_offset
-                if seen.change[b, j][0] != 0 and position[3] < 1.0:
-                    later_pose = seen.forecast[b, j, 3]
+                if perceived.change[b, j][0] != 0 and position[3] < 1.0:
+                    later_pose = perceived.forecast[b, j, 3]
                     later_position = place_beside(roads, route, u0, position[0] + 2.0 * other_speed, later_pose)
                     intended_offset = later_position[1] - metres_left(
                         roads, route[0], route[1], lane_shift, u0 + later_position[0]
@@ -155,7 +155,7 @@ def end_of_block(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     b: int,
     i: int,
     e: int,
@@ -178,13 +178,13 @@ def end_of_block(
         grows = bool(False)
         reach = beyond + 2.0 * own_body[0] + APART
         for j in range(rows[0], rows[1]):
-            if j != i and seen.kind[b, j] != AgentKind.NONE and beyond >= 0.0:
-                other_pose = seen.pose[b, j]
+            if j != i and perceived.kind[b, j] != AgentKind.NONE and beyond >= 0.0:
+                other_pose = perceived.pose[b, j]
                 dx = other_pose[0] - pose[0]
                 dy = other_pose[1] - pose[1]
                 if dx * dx + dy * dy < 1.3 * reach * reach:
                     position = place_beside(roads, route, u0, dx * frame[2] + dy * frame[3], other_pose)
-                    other_half = seen.half[b, j]
+                    other_half = perceived.half[b, j]
                     cosine = wp.abs(position[2])
                     sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
                     half_along = other_half[0] * cosine + other_half[1] * sine
@@ -194,7 +194,7 @@ def end_of_block(
                         and wp.abs(position[1]) < own_body[1] + other_half[0] * sine + other_half[1] * cosine
                         and within
                     ):
-                        if wp.abs(seen.speed[b, j]) < 0.5:
+                        if wp.abs(perceived.speed[b, j]) < 0.5:
                             beyond = position[0] + half_along
                             grows = bool(True)
                         elif position[0] - half_along < beyond + 12.0:
@@ -220,7 +220,7 @@ def way_is_clear(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     b: int,
     i: int,
     j: int,
@@ -232,8 +232,8 @@ def way_is_clear(
     route = bank.route[e, i]
     u0 = state.aim[b, i][0]
     own_body = bank.body[bank.model[e, i]]
-    other_half = seen.half[b, j]
-    other_pose = seen.pose[b, j]
+    other_half = perceived.half[b, j]
+    other_pose = perceived.pose[b, j]
     clear = bool(True)
     for step in range(int(length) + 1):
         frame = way_frame(roads, route[0], route[1], shift, u0 + float(step))
@@ -246,7 +246,7 @@ def way_is_clear(
 
 @wp.func
 def break_off(
-    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, rows: wp.vec2i
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, e: int, rows: wp.vec2i
 ) -> bool:
     """Abort passing on the oncoming lane if traffic comes and there is room to stop behind the obstacle."""
     route = bank.route[e, i]
@@ -256,18 +256,20 @@ def break_off(
     speed = wp.max(state.speed[b, i], 0.0)
     top = state.aim[b, i][1]
     shortest = 2.0 * RAMP_LEAST * own_body[0]
-    own_lane = gaps(bank, roads, state, seen, b, i, e, rows, 0.0, speed, 0.0, 0.0)
+    own_lane = gaps(bank, roads, state, perceived, b, i, e, rows, 0.0, speed, 0.0, 0.0)
     stopping_room = own_lane[0] - wp.max(0.5 * speed * speed / -FIRM, shortest * lanes_left(shift, u0))
     if own_lane[3] != 0.0 or own_lane[0] >= FAR or own_lane[1] > 0.5 or stopping_room < 1.0:
         return False
     line = line_ahead(roads, route[0] + state.progress[b, i], u0 - float(state.progress[b, i]), 0.0)
-    beyond = end_of_block(bank, roads, state, seen, b, i, e, rows, own_body[0] + own_lane[0], line)
+    beyond = end_of_block(bank, roads, state, perceived, b, i, e, rows, own_body[0] + own_lane[0], line)
     if beyond < 0.0:
         return False
     goal = beyond + own_body[0] + wp.max(shortest, RAMP_TIME * top)
     duration = passing_time(speed, top, goal)
     # Less cautious than before the manoeuvre begins, or it would abort what has just been allowed.
-    oncoming_lane = gaps(bank, roads, state, seen, b, i, e, rows, 1.0, speed, wp.max(duration - 1.0, 0.0), goal - 5.0)
+    oncoming_lane = gaps(
+        bank, roads, state, perceived, b, i, e, rows, 1.0, speed, wp.max(duration - 1.0, 0.0), goal - 5.0
+    )
     if oncoming_lane[4] == 0.0:
         return False
     return_length = wp.max(own_lane[0] - PULL_OUT, shortest * lanes_left(shift, u0))
@@ -282,7 +284,7 @@ def choose_lane(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     work: Work,
     b: int,
     i: int,
@@ -303,10 +305,10 @@ def choose_lane(
         return
     u0 = state.aim[b, i][0]
     rows = wp.vec2i(0, agents)
-    if i == 0 and seen.believes[b] == 1:
+    if i == 0 and perceived.believes[b] == 1:
         rows = wp.vec2i(agents, all_rows)
     if shift[3] > 0.0 and on_oncoming_lane(roads, route[0] + state.progress[b, i], shift):
-        if break_off(bank, roads, state, seen, b, i, e, rows):
+        if break_off(bank, roads, state, perceived, b, i, e, rows):
             return
     if u0 < shift[1]:
         return  # changes lane already
@@ -325,7 +327,7 @@ def choose_lane(
         if shift[3] < 0.0:
             leads_on = adjacent_lanes[3] - offset
         oncoming = shift[3] > 0.0 and adjacent_lanes[1] < 0.0
-        lane_gaps = gaps(bank, roads, state, seen, b, i, e, rows, 0.0, speed, 0.0, 0.0)
+        lane_gaps = gaps(bank, roads, state, perceived, b, i, e, rows, 0.0, speed, 0.0, 0.0)
         must_return = oncoming or leads_on < change_length + 4.0 * speed + 30.0
         free = lane_gaps[0] > 15.0 + 3.0 * speed or lane_gaps[1] > top - 1.0
         safe = (
@@ -344,28 +346,28 @@ def choose_lane(
 
     j = leader % LEADERS
     gap = 0.01 * float(leader // LEADERS)
-    other_pose = seen.pose[b, j]
+    other_pose = perceived.pose[b, j]
     pose = state.pose[b, i]
     facing = wp.cos(other_pose[2] - pose[2])
-    other_speed = seen.speed[b, j] * facing
-    stands = wp.abs(seen.speed[b, j]) < 0.5
-    if seen.kind[b, j] == AgentKind.WALKER or (facing < 0.7 and not stands):
+    other_speed = perceived.speed[b, j] * facing
+    stands = wp.abs(perceived.speed[b, j]) < 0.5
+    if perceived.kind[b, j] == AgentKind.WALKER or (facing < 0.7 and not stands):
         return  # crosses
     if (
         gap > 12.0 + 2.5 * speed
         or top - other_speed < wp.max(1.5, 0.08 * top)
         or other_speed < -0.5
-        or seen.change[b, j][0] != 0
+        or perceived.change[b, j][0] != 0
     ):
         return
     if adjacent_lanes[0] == 0.0 and adjacent_lanes[2] == 0.0:
         return
     line = line_ahead(roads, route_point, offset, 0.0)
-    beyond = own_body[0] + gap + 2.0 * seen.half[b, j][0]
+    beyond = own_body[0] + gap + 2.0 * perceived.half[b, j][0]
     if stands:
-        if seen.waited[b, j] < PATIENCE or beyond > line - QUEUE:
+        if perceived.waited[b, j] < PATIENCE or beyond > line - QUEUE:
             return
-        beyond = end_of_block(bank, roads, state, seen, b, i, e, rows, beyond, line)
+        beyond = end_of_block(bank, roads, state, perceived, b, i, e, rows, beyond, line)
         if beyond < 0.0:
             return
     elif shift[1] > 0.0 and u0 < shift[1] + 20.0:
@@ -393,7 +395,7 @@ def choose_lane(
             exists = adjacent_lanes[0] > 0.0 and adjacent_lanes[1] < 0.0 and stands
         if not decided and exists and leads_on > goal + 10.0:
             wants = bool(True)
-            lane_gaps = gaps(bank, roads, state, seen, b, i, e, rows, share, speed, time, goal)
+            lane_gaps = gaps(bank, roads, state, perceived, b, i, e, rows, share, speed, time, goal)
             safe = lane_gaps[3] == 0.0 and lane_gaps[2] > FIRM
             if option == 2:
                 safe = safe and lane_gaps[4] == 0.0
@@ -403,9 +405,9 @@ def choose_lane(
                 worth = worth and idm_gap(speed, wp.max(lane_gaps[1], 0.0), lane_gaps[0]) > FIRM
             if safe and worth:
                 shift_option = wp.vec4(u0, u0 + change_length, 0.0, share)
-                if not way_is_clear(bank, roads, state, seen, b, i, j, e, shift_option, beyond):
+                if not way_is_clear(bank, roads, state, perceived, b, i, j, e, shift_option, beyond):
                     shift_option = wp.vec4(u0, u0 + wp.max(shortest, 2.0 * speed), 0.0, share)
-                if way_is_clear(bank, roads, state, seen, b, i, j, e, shift_option, beyond):
+                if way_is_clear(bank, roads, state, perceived, b, i, j, e, shift_option, beyond):
                     state.shift[b, i] = shift_option
                     decided = bool(True)
                 elif stands and speed < 0.3:
@@ -419,7 +421,7 @@ def change_lanes(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     work: Work,
     agents: int,
     all_rows: int,
@@ -429,4 +431,4 @@ def change_lanes(
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
-            choose_lane(bank, roads, state, seen, work, b, i, agents, all_rows)
+            choose_lane(bank, roads, state, perceived, work, b, i, agents, all_rows)

@@ -109,15 +109,15 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     new_contacts = touching & (~ego.touching[b])
     ego.touching[b] = touching
     kinds = int(Contact.NONE)
-    other = int(-1)
+    hit_agent = int(-1)
     if new_contacts != wp.int64(0):
         for j in range(1, agents):
             if ((new_contacts >> wp.int64(j)) & wp.int64(1)) == wp.int64(1):
                 kinds = kinds | contact_kind(bank.kind[bank.model[e, j]])
-                if other < 0:
-                    other = j
+                if hit_agent < 0:
+                    hit_agent = j
     ego.contact[b] = kinds
-    ego.contact_agent[b] = other
+    ego.contact_agent[b] = hit_agent
     policy = bank.contact[e]
     if policy == ContactPolicy.REMOVE:
         for j in range(1, agents):
@@ -298,7 +298,7 @@ def restart_record(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     ego: Ego,
     mask: wp.array(dtype=wp.int32),
     ended_too: int,
@@ -313,7 +313,7 @@ def restart_record(
     mask[b] = 0
     state.step[b] = 0
     state.end[b] = End.RUNNING
-    seen.believes[b] = 0
+    perceived.believes[b] = 0
     ego.contact[b] = 0
     ego.contact_agent[b] = -1
     ego.touching[b] = wp.int64(0)

@@ -147,7 +147,7 @@ def frames_touch(
     ql: float,
     qw: float,
 ) -> bool:
-    """Whether two boxes (unit heading, half length, half width) overlap, q's centre being at (dx, dy) from p's."""
+    """Return whether two boxes (unit heading, half length, half width) overlap; q is centred at (dx, dy) from p."""
     cosine = wp.abs(pc * qc + ps * qs)
     sine = wp.abs(pc * qs - ps * qc)
     if axis_gap(dx, dy, pc, ps, pl + ql * cosine + qw * sine) > 0.0:

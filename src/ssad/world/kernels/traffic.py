@@ -1,4 +1,4 @@
-"""What the Autopilot does about others: following, stopping for, and giving way. Its interaction terms.
+"""Reactions of the Autopilot to other agents: following, stopping for, and giving way. Its interaction terms.
 
 Its acceleration is IDM's (Treiber et al. 2000): the free-road term under the route's speed profile (`drive`), and the
 hardest interaction term of: whoever is in its corridor, the stop line of a red signal, and the near edge of a
@@ -63,15 +63,15 @@ def idm_gap(v: float, lead: float, gap: float) -> float:
 @wp.func
 def lead_gap(
     roads: Roads,
-    seen: Seen,
+    perceived: Seen,
     b: int,
     j: int,
     route: wp.vec2i,
     shift: wp.vec4,
     u0: float,
     lon: float,
-    own: wp.vec4,
-    other: wp.vec2,
+    own_body: wp.vec4,
+    other_body: wp.vec2,
     heading: wp.vec2,
     margin: float,
     bend: float,
@@ -81,7 +81,7 @@ def lead_gap(
     lon: metres j is ahead in the follower's frame, the first guess of its place; heading: j's unit heading; bend:
     metres that the route ahead leaves its straight line.
     """
-    other_pose = seen.pose[b, j]
+    other_pose = perceived.pose[b, j]
     along = wp.clamp(lon, 0.0, SIGHT)
     lateral = float(0.0)
     residual = float(0.0)
@@ -97,20 +97,20 @@ def lead_gap(
         along = wp.clamp(along + residual, 0.0, SIGHT)
     cosine = heading[0] * frame[2] + heading[1] * frame[3]
     sine = wp.abs(heading[0] * frame[3] - heading[1] * frame[2])
-    half_along = other[0] * wp.abs(cosine) + other[1] * sine
-    half_across = other[0] * sine + other[1] * wp.abs(cosine)
+    half_along = other_body[0] * wp.abs(cosine) + other_body[1] * sine
+    half_across = other_body[0] * sine + other_body[1] * wp.abs(cosine)
     result = wp.vec2(FAR, 0.0)
     # in a bend the corners sweep wider than the body
     route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
-    sweep = wp.min(0.5 * wp.abs(roads.path[route_point][3]) * own[0] * own[0], 1.0)
+    sweep = wp.min(0.5 * wp.abs(roads.path[route_point][3]) * own_body[0] * own_body[0], 1.0)
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
     if (
         along > 0.0
         and along < SIGHT
         and wp.abs(residual) < 1.0
-        and wp.abs(lateral) < own[1] + half_across + margin + sweep
+        and wp.abs(lateral) < own_body[1] + half_across + margin + sweep
     ):
-        result = wp.vec2(along - own[0] - half_along, seen.speed[b, j] * cosine)
+        result = wp.vec2(along - own_body[0] - half_along, perceived.speed[b, j] * cosine)
     if result[0] >= FAR and bend > 1.5 and lon < 20.0:
         # in a tight bend a projection need not converge, and a long body leaves its corridor: drive it along and see
         # 0.2 m of room to either side, checked every metre
@@ -121,11 +121,22 @@ def lead_gap(
             dy = other_pose[1] - frame[1]
             # a centimetre more than is asked, so that it never misses what the exact test finds
             if frames_touch(
-                dx, dy, frame[2], frame[3], own[0] + 0.01, own[1] + 0.21, heading[0], heading[1], other[0], other[1]
+                dx,
+                dy,
+                frame[2],
+                frame[3],
+                own_body[0] + 0.01,
+                own_body[1] + 0.21,
+                heading[0],
+                heading[1],
+                other_body[0],
+                other_body[1],
             ):
                 body = wp.vec3(frame[0], frame[1], wp.atan2(frame[3], frame[2]))
-                if boxes_touch(body, own[0], own[1] + 0.2, other_pose, other[0], other[1]):
-                    result = wp.vec2(along - 1.0, seen.speed[b, j] * (heading[0] * frame[2] + heading[1] * frame[3]))
+                if boxes_touch(body, own_body[0], own_body[1] + 0.2, other_pose, other_body[0], other_body[1]):
+                    result = wp.vec2(
+                        along - 1.0, perceived.speed[b, j] * (heading[0] * frame[2] + heading[1] * frame[3])
+                    )
                     break
     return result
 
@@ -141,43 +152,43 @@ def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
 
 
 @wp.func
-def inside(seen: Seen, b: int, j: int) -> bool:
+def inside(perceived: Seen, b: int, j: int) -> bool:
     """Return whether an agent's front has entered the junction."""
-    return seen.way[b, j][1] < seen.half[b, j][0] - 1.0
+    return perceived.way[b, j][1] < perceived.half[b, j][0] - 1.0
 
 
 @wp.func
 def waits(
-    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, me: int, i: int, j: int, e: int, dt: float
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, me: int, i: int, j: int, e: int, dt: float
 ) -> bool:
     """Return whether i, still before the junction, lets j go first, which is inside.
 
     Not if it can no longer stop with 4 m/s^2, nor on green (as `me` perceives it) for an oncoming agent that turns
     left.
     """
-    way = seen.way[b, i]
-    speed = seen.speed[b, i]
-    line = way[0] - seen.half[b, i][0]
+    way = perceived.way[b, i]
+    speed = perceived.speed[b, i]
+    line = way[0] - perceived.half[b, i][0]
     yields = speed * speed < 8.0 * (wp.max(line, 0.0) + 1.5)
-    index = seen.signal[b, i]
-    turns = seen.way[b, j][2] > way[2]
-    if turns and index >= 0 and wp.cos(seen.pose[b, i][2] - seen.pose[b, j][2]) < -0.5:
-        if light(bank, roads, state, seen, b, me, e, index, dt) == SignalState.GREEN:
+    index = perceived.signal[b, i]
+    turns = perceived.way[b, j][2] > way[2]
+    if turns and index >= 0 and wp.cos(perceived.pose[b, i][2] - perceived.pose[b, j][2]) < -0.5:
+        if light(bank, roads, state, perceived, b, me, e, index, dt) == SignalState.GREEN:
             yields = False
     return yields
 
 
 @wp.func
 def clears(
-    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, me: int, j: int, e: int, dt: float
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, me: int, j: int, e: int, dt: float
 ) -> bool:
     """Return whether j can no longer stop before the junction although its signal is not green for `me` any more."""
-    index = seen.signal[b, j]
-    line = seen.way[b, j][0] - seen.half[b, j][0]
-    speed = seen.speed[b, j]
+    index = perceived.signal[b, j]
+    line = perceived.way[b, j][0] - perceived.half[b, j][0]
+    speed = perceived.speed[b, j]
     too_late = bool(False)
     if index >= 0 and speed * speed >= 8.0 * (wp.max(line, 0.0) + 1.5):
-        signal_now = light(bank, roads, state, seen, b, me, e, index, dt)
+        signal_now = light(bank, roads, state, perceived, b, me, e, index, dt)
         too_late = signal_now == SignalState.YELLOW or signal_now == SignalState.RED
     return too_late
 
@@ -192,28 +203,28 @@ def first_there(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j: i
 
 @wp.func
 def has_priority(
-    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, j: int, e: int, dt: float
+    bank: EpisodeArrays, roads: Roads, state: State, perceived: Seen, b: int, i: int, j: int, e: int, dt: float
 ) -> bool:
-    """Return whether i goes before j (rows of `seen`) where their paths cross; of each two exactly one goes first.
+    """Return whether i goes before j (rows of `perceived`) where their paths cross; of each two exactly one goes first.
 
     Another Autopilot is relied on to give way, and so is the ego under any driver: traffic does not know which agent
     is under test. Scripted actors and walkers are not. Priority goes to the agent inside the junction (see `waits`),
     then to the one that is too late to stop at a signal (see `clears`), then to the one without a stop or yield sign,
     straight before right before left, then to the one nearer to it, then to the lower number.
     """
-    if seen.gives_way[b, j] == 0:
+    if perceived.gives_way[b, j] == 0:
         return False
-    own_way = seen.way[b, i]
-    other_way = seen.way[b, j]
-    inside_i = inside(seen, b, i)
-    inside_j = inside(seen, b, j)
-    if inside_i and not inside_j and waits(bank, roads, state, seen, b, i, j, i, e, dt):
+    own_way = perceived.way[b, i]
+    other_way = perceived.way[b, j]
+    inside_i = inside(perceived, b, i)
+    inside_j = inside(perceived, b, j)
+    if inside_i and not inside_j and waits(bank, roads, state, perceived, b, i, j, i, e, dt):
         return True
-    if inside_j and not inside_i and waits(bank, roads, state, seen, b, i, i, j, e, dt):
+    if inside_j and not inside_i and waits(bank, roads, state, perceived, b, i, i, j, e, dt):
         return False
     if not inside_i and not inside_j:
-        late_i = clears(bank, roads, state, seen, b, i, i, e, dt)
-        late_j = clears(bank, roads, state, seen, b, i, j, e, dt)
+        late_i = clears(bank, roads, state, perceived, b, i, i, e, dt)
+        late_j = clears(bank, roads, state, perceived, b, i, j, e, dt)
         if late_i != late_j:
             return late_i
     if own_way[2] != other_way[2]:
@@ -221,8 +232,8 @@ def has_priority(
     if wp.abs(own_way[1] - other_way[1]) > 1.0:
         return own_way[1] < other_way[1]
     if inside_i and inside_j:
-        own_pose = seen.pose[b, i]
-        other_pose = seen.pose[b, j]
+        own_pose = perceived.pose[b, i]
+        other_pose = perceived.pose[b, j]
         sine = wp.sin(other_pose[2] - own_pose[2])
         if wp.abs(sine) > 0.5:
             # First at the crossing of their straight paths; an agent that brakes for the other stays second.
@@ -230,14 +241,14 @@ def has_priority(
             dy = other_pose[1] - own_pose[1]
             far_i = (dx * wp.sin(other_pose[2]) - dy * wp.cos(other_pose[2])) / sine
             far_j = (dx * wp.sin(own_pose[2]) - dy * wp.cos(own_pose[2])) / sine
-            return first_there(far_i, seen.speed[b, i], i, far_j, seen.speed[b, j], j)
+            return first_there(far_i, perceived.speed[b, i], i, far_j, perceived.speed[b, j], j)
     return i < j
 
 
 @wp.func
 def conflict_gap(
     roads: Roads,
-    seen: Seen,
+    perceived: Seen,
     b: int,
     j: int,
     route: wp.vec2i,
@@ -245,8 +256,8 @@ def conflict_gap(
     u0: float,
     v: float,
     target: float,
-    own: wp.vec4,
-    other: wp.vec2,
+    own_body: wp.vec4,
+    other_body: wp.vec2,
     lat_margin: float,
 ) -> float:
     """Return the distance from i's front bumper to its predicted conflict with j within 4 s, or FAR.
@@ -259,11 +270,11 @@ def conflict_gap(
     along = float(0.0)
     speed = v
     # Long enough that a fast, short agent does not skip from before the path to behind it.
-    half_length = wp.max(other[0], 0.5 * STRIDE * wp.abs(seen.speed[b, j]) - own[1])
-    reach = own[0] + half_length + 2.0
+    half_length = wp.max(other_body[0], 0.5 * STRIDE * wp.abs(perceived.speed[b, j]) - own_body[1])
+    reach = own_body[0] + half_length + 2.0
     squared_reach = reach * reach
-    before = seen.pose[b, j]
-    now = seen.forecast[b, j, 0]
+    before = perceived.pose[b, j]
+    now = perceived.forecast[b, j, 0]
     for step in range(HORIZON):
         # it slows down for bends as the route's speed profile says
         route_point = route[0] + wp.clamp(int(u0 + along + 0.5), 0, route[1] - 1)
@@ -276,7 +287,7 @@ def conflict_gap(
         frame = way_frame(roads, route[0], route[1], shift, u0 + along)
         later = now
         if step + 1 < HORIZON:
-            later = seen.forecast[b, j, step + 1]
+            later = perceived.forecast[b, j, step + 1]
         for moment in range(3):
             other_pose = now
             if moment == 0:
@@ -292,13 +303,13 @@ def conflict_gap(
                 other_sin = wp.sin(other_pose[2])
                 abs_cos = wp.abs(other_cos * frame[2] + other_sin * frame[3])
                 abs_sin = wp.abs(other_sin * frame[2] - other_cos * frame[3])
-                half_along = half_length * abs_cos + other[1] * abs_sin
-                half_across = half_length * abs_sin + other[1] * abs_cos
+                half_along = half_length * abs_cos + other_body[1] * abs_sin
+                half_across = half_length * abs_sin + other_body[1] * abs_cos
                 if (
-                    wp.abs(lateral) < own[1] + half_across + lat_margin
-                    and wp.abs(longitudinal) < own[0] + half_along + 1.0
+                    wp.abs(lateral) < own_body[1] + half_across + lat_margin
+                    and wp.abs(longitudinal) < own_body[0] + half_along + 1.0
                 ):
-                    edge = along + longitudinal - half_along - own[0]
+                    edge = along + longitudinal - half_along - own_body[0]
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or longitudinal > 0.0:
                         gap = wp.min(gap, wp.max(edge, 0.0))
@@ -309,7 +320,7 @@ def conflict_gap(
 
 @wp.func
 def apart(
-    seen: Seen,
+    perceived: Seen,
     b: int,
     j: int,
     pose: wp.vec3,
@@ -324,7 +335,7 @@ def apart(
 
     lon, lat: place of j now; ahead: metres that i can travel; off: margin for bent paths and the bodies' reach.
     """
-    last_pose = seen.forecast[b, j, HORIZON - 1]
+    last_pose = perceived.forecast[b, j, HORIZON - 1]
     dx = last_pose[0] - pose[0]
     dy = last_pose[1] - pose[1]
     last_lon = dx * c + dy * s
@@ -338,7 +349,7 @@ def look_around(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     work: Work,
     b: int,
     i: int,
@@ -370,8 +381,8 @@ def look_around(
     signal_index = roads.path_signal[first]
     signal_now = int(SignalState.OFF)
     if signal_index >= 0 and road_rule[1] - offset < SIGHT + 40.0:
-        signal_now = light(bank, roads, state, seen, b, i, e, signal_index, dt)
-    obeys = i > 0 or seen.believes[b] == 0 or seen.sign[b] == 1  # who does not know of a sign does not stop
+        signal_now = light(bank, roads, state, perceived, b, i, e, signal_index, dt)
+    obeys = i > 0 or perceived.believes[b] == 0 or perceived.sign[b] == 1  # who does not know of a sign does not stop
     if obeys and signal_now == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         line_gap = roads.ahead[first][0] - offset - own_body[0]
         if line_gap > -0.5 and line_gap < SIGHT + 20.0:
@@ -417,15 +428,15 @@ def look_around(
     box_high = wp.vec2(box_high[0] + padding, box_high[1] + padding)
     from_row = int(0)
     to_row = agents
-    if i == 0 and seen.believes[b] == 1:
+    if i == 0 and perceived.believes[b] == 1:
         from_row = agents
         to_row = rows
     for j in range(from_row, to_row):
-        if j != i and seen.kind[b, j] != AgentKind.NONE:
-            box = seen.span[b, j]
+        if j != i and perceived.kind[b, j] != AgentKind.NONE:
+            box = perceived.span[b, j]
             if box[0] < box_high[0] and box[2] > box_low[0] and box[1] < box_high[1] and box[3] > box_low[1]:
-                other_half = seen.half[b, j]
-                other_pose = seen.pose[b, j]
+                other_half = perceived.half[b, j]
+                other_pose = perceived.pose[b, j]
                 dx = other_pose[0] - pose[0]
                 dy = other_pose[1] - pose[1]
                 longitudinal = dx * c + dy * s
@@ -443,19 +454,19 @@ def look_around(
                 )
                 if in_box and longitudinal > -bend - own_body[0] and wp.abs(lateral) < bend + half_width:
                     flags = 1
-                if wp.abs(seen.speed[b, j]) > 0.2 and (
+                if wp.abs(perceived.speed[b, j]) > 0.2 and (
                     longitudinal >= 0.0 or facing <= 0.5 or wp.abs(lateral) > half_width
                 ):
                     # An agent behind in the same lane and direction keeps its distance itself.
-                    bend_j = seen.way[b, j][3]
+                    bend_j = perceived.way[b, j][3]
                     reach = half_width
                     if bend_j > 1.0 or bend > 2.0:
                         reach = own_body[0] + other_half[0] + 2.0
                     if not apart(
-                        seen, b, j, pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach
+                        perceived, b, j, pose, c, s, longitudinal, lateral, travel + own_body[0], bend + bend_j + reach
                     ):
                         flags = flags + 2
-                if flags > 0 and wp.abs(seen.height[b, j] - seen.height[b, i]) > BRIDGE:
+                if flags > 0 and wp.abs(perceived.height[b, j] - perceived.height[b, i]) > BRIDGE:
                     flags = 0  # one of us is on a bridge
                 if flags > 0:
                     slot = wp.atomic_add(work.count, 0, 1)
@@ -467,7 +478,7 @@ def sight(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     work: Work,
     agents: int,
     rows: int,
@@ -482,7 +493,7 @@ def sight(
     b, first = wp.tid()
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
-            look_around(bank, roads, state, seen, work, b, i, agents, rows, dt)
+            look_around(bank, roads, state, perceived, work, b, i, agents, rows, dt)
 
 
 @wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
@@ -490,7 +501,7 @@ def meet(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
-    seen: Seen,
+    perceived: Seen,
     work: Work,
     agents: int,
     rows: int,
@@ -513,11 +524,11 @@ def meet(
         route = bank.route[e, i]
         shift = state.shift[b, i]
         pose = state.pose[b, i]
-        other_pose = seen.pose[b, j]
+        other_pose = perceived.pose[b, j]
         speed = wp.max(state.speed[b, i], 0.0)
         own_body = bank.body[bank.model[e, i]]
-        other_half = seen.half[b, j]
-        walks = seen.kind[b, j] == AgentKind.WALKER
+        other_half = perceived.half[b, j]
+        walks = perceived.kind[b, j] == AgentKind.WALKER
         aim = state.aim[b, i]
         react = float(0.0)
         leads = int(0)
@@ -533,7 +544,7 @@ def meet(
             s = wp.sin(pose[2])
             heading = wp.vec2(wp.cos(other_pose[2]), wp.sin(other_pose[2]))
             longitudinal = (other_pose[0] - pose[0]) * c + (other_pose[1] - pose[1]) * s
-            stands = wp.abs(seen.speed[b, j]) < STANDS and heading[0] * c + heading[1] * s < 0.7
+            stands = wp.abs(perceived.speed[b, j]) < STANDS and heading[0] * c + heading[1] * s < 0.7
             margin = 0.3
             if walks:
                 margin = 0.6
@@ -541,7 +552,7 @@ def meet(
             if aim[0] < shift[1]:
                 bend = bend + ASIDE
             leader = lead_gap(
-                roads, seen, b, j, route, shift, aim[0], longitudinal, own_body, other_half, heading, margin, bend
+                roads, perceived, b, j, route, shift, aim[0], longitudinal, own_body, other_half, heading, margin, bend
             )
             if leader[0] < FAR:
                 react = idm_gap(speed, wp.max(leader[1], 0.0), leader[0])
@@ -551,16 +562,20 @@ def meet(
                 contact_range = NOSE_TO_NOSE
                 if state.control[b, i][3] > 0.5:
                     contact_range = MAKES_ROOM  # backs out already
-                if stands and leader[0] < contact_range and wp.min(state.waited[b, i], seen.waited[b, j]) > BACK_OUT:
+                if (
+                    stands
+                    and leader[0] < contact_range
+                    and wp.min(state.waited[b, i], perceived.waited[b, j]) > BACK_OUT
+                ):
                     # The agent without priority makes room, or the other one if it has no room behind.
                     from_row = int(0)
                     to_row = agents
-                    if i == 0 and seen.believes[b] == 1:
+                    if i == 0 and perceived.believes[b] == 1:
                         from_row = agents
                         to_row = rows
-                    if not has_priority(bank, roads, state, seen, b, i, j, e, dt):
+                    if not has_priority(bank, roads, state, perceived, b, i, j, e, dt):
                         state.stalled[b, i] = 1
-                    elif not room_behind(seen, b, j, from_row, to_row):
+                    elif not room_behind(perceived, b, j, from_row, to_row):
                         state.stalled[b, i] = 1
                 # a junction is entered only where there is room behind it
                 required_room = roads.ahead[first][2] - offset - own_body[0] + 2.0 * own_body[0] + 2.0
@@ -570,22 +585,24 @@ def meet(
             margin = 0.4
             if walks:
                 margin = 1.0
-            gap = conflict_gap(roads, seen, b, j, route, shift, aim[0], speed, aim[1], own_body, other_half, margin)
+            gap = conflict_gap(
+                roads, perceived, b, j, route, shift, aim[0], speed, aim[1], own_body, other_half, margin
+            )
             if gap < FAR:
-                goes_first = has_priority(bank, roads, state, seen, b, i, j, e, dt)
-                goes_first = change_priority(seen, b, i, j, goes_first)
+                goes_first = has_priority(bank, roads, state, perceived, b, i, j, e, dt)
+                goes_first = change_priority(perceived, b, i, j, goes_first)
                 if not goes_first and line > -1.0 and not walks and speed * speed < 8.0 * (line + 1.5):
                     # it is waited before the junction, not in it, but to turn left on green
                     index = roads.path_signal[first]
                     signal_now = int(SignalState.OFF)
                     if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
-                        signal_now = light(bank, roads, state, seen, b, i, e, index, dt)
-                    entered = inside(seen, b, j)
+                        signal_now = light(bank, roads, state, perceived, b, i, e, index, dt)
+                    entered = inside(perceived, b, j)
                     crosses = wp.abs(wp.cos(other_pose[2] - pose[2])) < 0.7
                     if signal_now == SignalState.OFF or signal_now == SignalState.RED or entered or crosses:
                         gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
                 # whoever stands and has to wait is not expected to go after all
-                if not goes_first or (gap < 0.5 * speed and wp.abs(seen.speed[b, j]) > STANDS):
+                if not goes_first or (gap < 0.5 * speed and wp.abs(perceived.speed[b, j]) > STANDS):
                     react = wp.min(react, idm_gap(speed, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)

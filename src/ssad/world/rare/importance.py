@@ -32,7 +32,7 @@ LATER = 0.2  # share of the copies that begin later
 
 
 @dataclass(frozen=True)
-class Proposal:
+class MixtureProposal:
     """Mixture of the unchanged process and K shifted ones.
 
     Attributes:
@@ -43,12 +43,12 @@ class Proposal:
     share: F64
     means: F64
 
-    def spread(self) -> Proposal:
+    def spread(self) -> MixtureProposal:
         """Add a copy of each shifted component with half the shift; the two split its share."""
         share = np.concatenate([self.share[:1], 0.5 * self.share[1:], 0.5 * self.share[1:]])
-        return Proposal(share, np.vstack([0.5 * self.means, self.means]))
+        return MixtureProposal(share, np.vstack([0.5 * self.means, self.means]))
 
-    def with_later(self, process: Process) -> Proposal:
+    def with_later(self, process: Process) -> MixtureProposal:
         """The same with copies that begin later (`Process.later`) of its two moved components of the largest shares.
 
         The copies get the share `LATER`, or half of what is moved if that is less. Where nothing is moved, or the
@@ -63,7 +63,7 @@ class Proposal:
         delayed_share = min(LATER, 0.5 * shifted_share)
         remaining_share = (1.0 - delayed_share / shifted_share) * self.share[1:]
         share = np.concatenate([self.share[:1], remaining_share, delayed_share * copy_weights / copy_weights.sum()])
-        return Proposal(share, np.vstack([self.means, *copies]))
+        return MixtureProposal(share, np.vstack([self.means, *copies]))
 
     def log_ratios(self, total: F64, count: F64) -> F64:
         """Return the log likelihood ratio [n, K] of each shifted component over the unchanged process."""
@@ -77,7 +77,7 @@ class Proposal:
 
 
 @dataclass(frozen=True)
-class Sample:
+class WeightedEpisodes:
     """Episodes drawn from a proposal, [n].
 
     Attributes:
@@ -97,9 +97,11 @@ class Sample:
     component: npt.NDArray[np.int64]
 
 
-def sample(process: Process, proposal: Proposal, random: np.random.Generator, *, episodes: int) -> Sample:
+def sample(
+    process: Process, proposal: MixtureProposal, random: np.random.Generator, *, episodes: int
+) -> WeightedEpisodes:
     """Run at least `episodes` episodes of a proposal, in whole batches."""
-    parts: list[Sample] = []
+    parts: list[WeightedEpisodes] = []
     means = np.vstack([np.zeros(process.width), proposal.means])
     while sum(len(part.keys) for part in parts) < episodes:
         keys = draw_keys(random, process.batch)
@@ -109,7 +111,7 @@ def sample(process: Process, proposal: Proposal, random: np.random.Generator, *,
         failed = run(process)
         total, count = process.totals()
         weight = proposal.weights(total, count)
-        parts.append(Sample(failed, weight, total, count, keys, component))
+        parts.append(WeightedEpisodes(failed, weight, total, count, keys, component))
     return concatenate(parts)
 
 
@@ -122,7 +124,7 @@ def learn(
     episodes: int = 1000,
     defence: float = 0.1,
     shrink: float = 20.0,
-) -> Proposal:
+) -> MixtureProposal:
     """Learn a proposal: from the failures that splitting finds, then by the cross-entropy method from weighted ones.
 
     Splitting begins because chance alone finds no failure to learn from, and a level of the score that many episodes
@@ -132,7 +134,7 @@ def learn(
         process: The process; its batch is the number of splitting's particles.
         random: Source of chance.
         components: Moved components that are learned, so that several ways to fail can be; more are made of them, see
-            `Proposal.with_later` and `Proposal.spread`.
+            `MixtureProposal.with_later` and `MixtureProposal.spread`.
         rounds: Of the cross-entropy method.
         episodes: Of each round.
         defence: Share of the process as it is.
@@ -143,7 +145,7 @@ def learn(
     informative = initial.failed if initial.failed.any() else final_scores >= np.quantile(final_scores, 0.9)
     total, count = (statistic[informative] for statistic in process.totals())
     weight = np.ones(len(total))
-    history: list[tuple[Proposal, Sample]] = []
+    history: list[tuple[MixtureProposal, WeightedEpisodes]] = []
     for round_index in range(rounds + 1):
         mixture = _fit(total, count, weight, random, components=components, defence=defence, shrink=shrink)
         proposal = mixture.with_later(process)
@@ -174,7 +176,7 @@ def _fit(
     components: int,
     defence: float,
     shrink: float,
-) -> Proposal:
+) -> MixtureProposal:
     """Fit the mixture that maximises the likelihood of weighted episodes, by expectation maximisation."""
     weight = weight / weight.sum()
     effective_size = 1.0 / float((weight**2).sum())  # episodes of equal weight that would say as much
@@ -182,7 +184,7 @@ def _fit(
     means = 0.3 * total[seeds] / np.maximum(count[seeds], 1.0)
     shares = np.full(components, 1.0 / components)
     for _ in range(30):
-        log_shares = np.log(shares) + Proposal(shares, means).log_ratios(total, count)
+        log_shares = np.log(shares) + MixtureProposal(shares, means).log_ratios(total, count)
         # The log-sum-exp shift: only ratios of the components matter.
         log_shares -= log_shares.max(axis=1, keepdims=True)
         responsibilities = np.exp(log_shares)
@@ -191,12 +193,12 @@ def _fit(
         # A component of share 0 could never recover, since its log would be minus infinity.
         shares = np.maximum(responsibilities.sum(axis=0) / effective_size, 1e-3)
         shares /= shares.sum()
-    return Proposal(np.concatenate([[defence], (1.0 - defence) * shares]), means)
+    return MixtureProposal(np.concatenate([[defence], (1.0 - defence) * shares]), means)
 
 
 def importance(
-    process: Process, proposal: Proposal, random: np.random.Generator, *, episodes: int, training: float = 0.0
-) -> tuple[RareEstimate, Sample]:
+    process: Process, proposal: MixtureProposal, random: np.random.Generator, *, episodes: int, training: float = 0.0
+) -> tuple[RareEstimate, WeightedEpisodes]:
     """Estimate the probability of failure with a proposal that does not depend on these episodes.
 
     Args:

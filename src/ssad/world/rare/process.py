@@ -132,10 +132,10 @@ class WorldProcess:
             self.world.capture(steps=self.steps)
             self._recorded = True
         # Agents that leave before the end count as well.
-        self._work += float((self.world.array("step") * self._there()).sum())
+        self._work += float((self.world.array("step") * self._is_inside()).sum())
         return self.failed()
 
-    def _there(self) -> npt.NDArray[np.int64]:
+    def _is_inside(self) -> npt.NDArray[np.int64]:
         counts = np.array([sum(1 for _ in episode.agents) for episode in self.world.episodes])
         return np.asarray(counts[self.world.array("episode")])
 
@@ -214,7 +214,7 @@ class WorldProcess:
         return self._work
 
 
-class Told(World):
+class ReplayedWorld(World):
     """World of one scene that replays a given future: keys by step, and shifted means."""
 
     def __init__(

@@ -66,7 +66,7 @@ class _History:
         # A particle can be replayed from its keys alone, so they are kept for every step.
         self.keys = np.tile(keys, (process.steps + 1, 1))
         self.now = np.zeros(process.batch, np.int64)
-        self.taken = np.zeros(process.batch)  # steps taken, of all lives
+        self.step_counts = np.zeros(process.batch)  # steps taken, of all lives
         self._keep(self.rows, np.full(process.batch, -np.inf))
 
     def _keep(self, rows: npt.NDArray[np.intp], before: F64) -> None:
@@ -82,7 +82,7 @@ class _History:
             previous_best = self.best[self.now[rows], rows]
             self.process.step()
             self.now[rows] += 1
-            self.taken[rows] += 1
+            self.step_counts[rows] += 1
             self._keep(rows, previous_best)
 
     def final(self) -> F64:
@@ -151,12 +151,16 @@ def splitting(
         history.finish()
     failed = history.final() >= 1.0
     estimates = survival * failed.reshape(repeats, particles).mean(axis=1)
-    work = (process.work() - initial_work) * history.taken.reshape(repeats, particles).sum(axis=1) / history.taken.sum()
+    work = (
+        (process.work() - initial_work)
+        * history.step_counts.reshape(repeats, particles).sum(axis=1)
+        / history.step_counts.sum()
+    )
     return Splitting(estimates, passed_levels, failed, history.keys, work, particle_count)
 
 
-def keys_of(found: Splitting, row: int) -> Mapping[int, int]:
-    """From which step on a particle had which key: what it takes to run it again."""
-    row_keys: Any = found.keys[:, row]
+def keys_of(result: Splitting, row: int) -> Mapping[int, int]:
+    """Return the keys of a particle by their first steps: all that a rerun needs."""
+    row_keys: Any = result.keys[:, row]
     changes = [0, *(np.flatnonzero(row_keys[1:] != row_keys[:-1]) + 1).tolist()]
     return {int(step): int(row_keys[step]) for step in changes}

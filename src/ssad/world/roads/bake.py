@@ -22,7 +22,7 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
 from ssad.world.roads.signals import Approaches, place_signals, place_signs
-from ssad.world.roads.xodr import MAX_BYTES, Connection, Lane, Link, Network, Road, read_network
+from ssad.world.roads.xodr import MAX_BYTES, Connection, Lane, Link, MapRoad, Network, read_network
 
 TIMEOUT = 120.0  # s; Town05 takes about 3
 STEP = 2.0  # m, most between two points of a lane
@@ -301,11 +301,11 @@ def _linked(network: Network, key: Key) -> list[Key]:
     ]
 
 
-def _ways(network: Network, link: Link, road: Road) -> list[Connection]:
+def _ways(network: Network, link: Link, road: MapRoad) -> list[Connection]:
     return [connection for connection in network.junctions[link.id] if connection.incoming == road.id]
 
 
-def _door(road: Road, contact: str, lane: int) -> Key:
+def _door(road: MapRoad, contact: str, lane: int) -> Key:
     """Return the key of a lane at one end of a road."""
     return (road.id, len(road.sections) - 1 if contact == "end" else 0, lane)
 

@@ -102,7 +102,7 @@ def proving_ground() -> Town:
     )
 
 
-def shifted(a: Point, b: Point, *, lead: float, aside: float = 0.0) -> tuple[Point, ...]:
+def crossover_points(a: Point, b: Point, *, lead: float, aside: float = 0.0) -> tuple[Point, ...]:
     """Points of a street from a to b that leaves and arrives along one axis and crosses over between.
 
     Args:
@@ -157,7 +157,7 @@ def oldmarket() -> Town:
         (south[1], lower[2]),
         (lower[4], upper[3]),
     ]
-    streets = [street(shifted(start, end, lead=19.0)) for start, end in stop_pairs]
+    streets = [street(crossover_points(start, end, lead=19.0)) for start, end in stop_pairs]
     streets += [
         crescent((south[0], (lower[0][0], south[0][1]), lower[0])),
         crescent((south[2], (lower[4][0], south[2][1]), lower[4])),

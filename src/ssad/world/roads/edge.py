@@ -12,18 +12,18 @@ CELL = 0.5  # m
 MARGIN = 20.0  # m that a raster reaches beyond the points it is made for
 
 
-def edge_raster(query: LaneQuery, held: F64) -> tuple[F64, F64]:
+def edge_raster(query: LaneQuery, points: F64) -> tuple[F64, F64]:
     """Signed distances from the edge of the road, more than 0 off it, at points `CELL` apart.
 
     Args:
         query: Lanes of the town.
-        held: Points [n, 2], m, that the raster holds with a margin of `MARGIN`.
+        points: Points [n, 2], m, that the raster holds with a margin of `MARGIN`.
 
     Returns:
         Distances [rows, columns], m: y and x grow with them; place of the first one [2], m.
     """
-    origin: F64 = np.floor(held.min(0) - MARGIN)
-    shape = np.ceil((held.max(0) + MARGIN - origin) / CELL).astype(int) + 1
+    origin: F64 = np.floor(points.min(0) - MARGIN)
+    shape = np.ceil((points.max(0) + MARGIN - origin) / CELL).astype(int) + 1
     x, y = (origin[axis] + CELL * np.arange(shape[axis]) for axis in (0, 1))
     grid = np.stack(np.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
     off_road = query.off_road(grid).reshape(shape[1], shape[0])

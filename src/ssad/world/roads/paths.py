@@ -39,14 +39,14 @@ def graph_of_paths(name: str, paths: Sequence[F64], *, speeds: Sequence[float], 
     lanes: list[F64] = []
     limits: list[float] = []
     for number, (path, speed) in enumerate(zip(paths, speeds, strict=True)):
-        resampled = _even(path)
+        resampled = _resample(path)
         if number == 0:
             if len(resampled) < LEAST / STEP:
                 raise MapError(f"town '{name}': a path of less than {LEAST:g} m makes no lane")
-            resampled = _longer(resampled)
+            resampled = _extend(resampled)
         if len(resampled) < 2:
             continue
-        uncovered = ~_covered(resampled, lanes, 0.5 * width)
+        uncovered = ~_covered_points(resampled, lanes, 0.5 * width)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], uncovered, [False]]).astype(int)))
         for first_index, last_index in edges.reshape(-1, 2).tolist():
             if last_index - first_index > LEAST / STEP:
@@ -80,7 +80,7 @@ def graph_of_paths(name: str, paths: Sequence[F64], *, speeds: Sequence[float], 
     )
 
 
-def _even(path: F64) -> F64:
+def _resample(path: F64) -> F64:
     """Return a path with a point every `STEP` m, without standstill, jitter and steps back."""
     points = [path[0]]
     direction = np.zeros(2)
@@ -97,7 +97,7 @@ def _even(path: F64) -> F64:
     return np.stack([np.interp(positions, arc_length, xy[:, 0]), np.interp(positions, arc_length, xy[:, 1])], 1)
 
 
-def _longer(path: F64) -> F64:
+def _extend(path: F64) -> F64:
     """Extend a path straight at its ends."""
     first, last = path[0] - path[1], path[-1] - path[-2]
     before = path[0] + np.arange(BEFORE, 0.0, -STEP)[:, None] * (first / np.hypot(*first))
@@ -111,8 +111,8 @@ def _headings(path: F64) -> F64:
     return np.asarray(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))
 
 
-def _covered(path: F64, lanes: Sequence[F64], beside: float) -> Bool:
-    """Which points of a path lie at most so far (m) beside a lane that runs the same way."""
+def _covered_points(path: F64, lanes: Sequence[F64], beside: float) -> Bool:
+    """Return the points of a path that lie within `beside` m of a lane in the same direction."""
     covered = np.zeros(len(path), bool)
     yaw = _headings(path)
     for lane in lanes:

@@ -41,7 +41,7 @@ class Nearest:
 
 
 @dataclass(frozen=True)
-class Grid:
+class SegmentGrid:
     """Segments of centre lines, and for each cell those that can be the nearest to a point of that cell.
 
     Nearness is distance from the centre line minus the half width there, so that two lanes of different width meet at
@@ -75,9 +75,9 @@ class LaneQuery:
 
     def __init__(self, graph: LaneGraph) -> None:
         self.graph = graph
-        self._grids: dict[tuple[int, ...], Grid] = {}
+        self._grids: dict[tuple[int, ...], SegmentGrid] = {}
 
-    def grid(self, types: Sequence[LaneType]) -> Grid:
+    def grid(self, types: Sequence[LaneType]) -> SegmentGrid:
         """Return the grid over lanes of the given types."""
         key = tuple(sorted({int(lane_type) for lane_type in types}))
         if key not in self._grids:
@@ -131,7 +131,7 @@ class LaneQuery:
         return ~self.nearest(xy, DRIVABLE).inside
 
 
-def _measure(grid: Grid, pick: npt.NDArray[np.int32], xy: F32) -> tuple[F32, F32, F32]:
+def _measure(grid: SegmentGrid, pick: npt.NDArray[np.int32], xy: F32) -> tuple[F32, F32, F32]:
     """For pairs of segment and point: distance outside the strip, signed distance (left +), arc length."""
     endpoints, half_width = grid.seg[pick], grid.seg_half[pick]
     x_start, y_start = endpoints[:, 0], endpoints[:, 1]
@@ -165,10 +165,10 @@ def segments(graph: LaneGraph, types: Sequence[int]) -> tuple[F32, F32, I32, F32
     return endpoints, half_width.astype(np.float32), lane[index], graph.s[index]
 
 
-_GRIDS: dict[tuple[int, tuple[int, ...]], tuple[weakref.ref[LaneGraph], Grid]] = {}
+_GRIDS: dict[tuple[int, tuple[int, ...]], tuple[weakref.ref[LaneGraph], SegmentGrid]] = {}
 
 
-def grid_of(graph: LaneGraph, types: Sequence[int]) -> Grid:
+def grid_of(graph: LaneGraph, types: Sequence[int]) -> SegmentGrid:
     """Return `build_grid`, cached while the town is in memory: worlds of one town are often built by the hundred."""
     # An id can be reused after its graph is freed, so the entry also holds a weak reference.
     key = (id(graph), tuple(int(lane_type) for lane_type in types))
@@ -178,12 +178,12 @@ def grid_of(graph: LaneGraph, types: Sequence[int]) -> Grid:
     return entry[1]
 
 
-def build_grid(graph: LaneGraph, types: Sequence[int]) -> Grid:
-    """List for each cell the segments that can be nearest to some point of it (see `Grid`)."""
+def build_grid(graph: LaneGraph, types: Sequence[int]) -> SegmentGrid:
+    """List for each cell the segments that can be nearest to some point of it (see `SegmentGrid`)."""
     endpoints, half_width, lane, arc_length = segments(graph, types)
     if not len(endpoints):
         empty = np.zeros(0, np.int32)
-        return Grid(endpoints, half_width, lane, arc_length, np.zeros(2, np.int32), empty, (0.0, 0.0), 1, 1)
+        return SegmentGrid(endpoints, half_width, lane, arc_length, np.zeros(2, np.int32), empty, (0.0, 0.0), 1, 1)
     ends = endpoints.reshape(-1, 2, 2).astype(np.float64)
     max_half_width = half_width.max(axis=1).astype(np.float64)
     reach = max_half_width + MARGIN
@@ -222,7 +222,7 @@ def build_grid(graph: LaneGraph, types: Sequence[int]) -> Grid:
     order = np.lexsort((segment_index, cell))
     offset = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=nx * ny))]).astype(np.int32)
     lower_left = (float(origin[0]), float(origin[1]))
-    return Grid(
+    return SegmentGrid(
         endpoints, half_width, lane, arc_length, offset, segment_index[order].astype(np.int32), lower_left, nx, ny
     )
 

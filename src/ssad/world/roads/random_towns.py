@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ssad.core.seeding import generator
-from ssad.world.roads.designs import shifted
+from ssad.world.roads.designs import crossover_points
 from ssad.world.roads.writer import write_town
 from ssad.world.roads.writer_parts import CLEARANCE, Point, RoadSpec, Town, plan_pieces
 
@@ -61,7 +61,7 @@ def random_town(number: int) -> Town:
     min_edges = (1.0 - rng.uniform(0.0, 0.22)) * len(all_edges)
     for index in rng.permutation(len(all_edges)):
         # Only streets whose loss creates no dead end and splits no part off may go.
-        if len(edges) - 1 >= min_edges and _holds(positions, edges - {all_edges[index]}):
+        if len(edges) - 1 >= min_edges and _is_connected(positions, edges - {all_edges[index]}):
             edges = edges - {all_edges[index]}
     width, sidewalk = round(rng.uniform(3.1, 3.75), 2), round(rng.uniform(1.6, 3.5), 1)
     shoulder, limit = float(rng.choice([0.5, 0.5, 1.5, 2.0])), float(rng.choice([20.0, 25.0, 30.0, 35.0]))
@@ -69,7 +69,7 @@ def random_town(number: int) -> Town:
     max_bend = rng.uniform(0.0, 12.0)
     setback = lanes * width + CLEARANCE
     streets = tuple(
-        _fitting(RoadSpec(points, lanes, width, shoulder, sidewalk, limit, radius), setback)
+        _fit_corners(RoadSpec(points, lanes, width, shoulder, sidewalk, limit, radius), setback)
         for points in _polylines(positions, edges, lead, lambda: float(rng.uniform(-max_bend, max_bend)))
     )
     # Three or more streets make a junction; two only meet in a bend.
@@ -83,7 +83,7 @@ def random_town(number: int) -> Town:
     )
 
 
-def _fitting(street: RoadSpec, setback: float) -> RoadSpec:
+def _fit_corners(street: RoadSpec, setback: float) -> RoadSpec:
     """Reduce the radius of a street's corners until they leave room for each other."""
     candidates = (replace(street, radius=0.9**step * street.radius) for step in range(20))
     return next(candidate for candidate in candidates if min(_straights(candidate, setback)) > 0.5)
@@ -94,7 +94,7 @@ def _straights(street: RoadSpec, setback: float) -> list[float]:
     return [piece.length for piece in plan_pieces(street, setback, setback) if not piece.curvature]
 
 
-def _holds(places: Iterable[Place], edges: set[Edge]) -> bool:
+def _is_connected(places: Iterable[Place], edges: set[Edge]) -> bool:
     """Return whether every place has two streets or more, and all places are connected."""
     neighbours: dict[Place, set[Place]] = {place: set() for place in places}
     for start, end in edges:
@@ -139,6 +139,6 @@ def _polylines(
                 chain.append(next_place)
             points = [at[start]]
             for start_place, end_place in pairwise(chain):
-                points += shifted(at[start_place], at[end_place], lead=lead, aside=aside())[1:]
+                points += crossover_points(at[start_place], at[end_place], lead=lead, aside=aside())[1:]
             polylines.append(tuple(points))
     return polylines

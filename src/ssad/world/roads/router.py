@@ -86,7 +86,7 @@ def route_along(graph: LaneGraph, keypoints: Sequence[Pose | tuple[float, float]
     return _draw(graph, min(best, key=lambda candidate: candidate[0])[2], spacing)
 
 
-def random_route(graph: LaneGraph, lane: int, s: float, length: float, rng: np.random.Generator) -> Route:
+def random_route(graph: LaneGraph, lane: int, s: float, length: float, random_generator: np.random.Generator) -> Route:
     """Return a route that takes a random driving successor at the end of every lane.
 
     Args:
@@ -94,7 +94,7 @@ def random_route(graph: LaneGraph, lane: int, s: float, length: float, rng: np.r
         lane: Lane that it starts on.
         s: Arc length on that lane, m.
         length: Length of the route, m; it ends early where the road does.
-        rng: Source of randomness.
+        random_generator: Source of randomness.
 
     Raises:
         RouteError: The road ends at the start.
@@ -109,7 +109,7 @@ def random_route(graph: LaneGraph, lane: int, s: float, length: float, rng: np.r
         ]
         if remaining <= 1e-6 or not successors:
             break
-        lane, s = successors[int(rng.integers(len(successors)))], 0.0
+        lane, s = successors[int(random_generator.integers(len(successors)))], 0.0
     return _draw(graph, legs, 1.0)
 
 
@@ -147,7 +147,7 @@ def _candidates(graph: LaneGraph, k: int, point: Pose | tuple[float, float], *, 
                 if neighbour not in used_lanes:
                     used_lanes.add(neighbour)
                     spots.append(
-                        _Spot(neighbour, _across(graph, spot.lane, spot.s, neighbour), spot.cost + BESIDE_COST)
+                        _Spot(neighbour, _level_position(graph, spot.lane, spot.s, neighbour), spot.cost + BESIDE_COST)
                     )
     return spots
 
@@ -163,10 +163,10 @@ def _beside(graph: LaneGraph, lane: int) -> list[int]:
     ]
 
 
-def _across(graph: LaneGraph, lane: int, s: float, other: int) -> float:
+def _level_position(graph: LaneGraph, lane: int, s: float, adjacent_lane: int) -> float:
     """Return the arc length on the adjacent lane, level with s."""
     x, y, _, _ = graph.at(lane, s)
-    span = graph.points(other)
+    span = graph.points(adjacent_lane)
     xy = graph.xy[span].astype(np.float64)
     segments, offsets = np.diff(xy, axis=0), np.array([x, y]) - xy[:-1]
     length = np.hypot(segments[:, 0], segments[:, 1])
@@ -176,7 +176,7 @@ def _across(graph: LaneGraph, lane: int, s: float, other: int) -> float:
     return float(graph.s[span.start + nearest] + share[nearest] * length[nearest])
 
 
-def _after(graph: LaneGraph, lane: int) -> list[int]:
+def _successors(graph: LaneGraph, lane: int) -> list[int]:
     return [successor for successor in graph.successors(lane).tolist() if graph.kind[successor] == LaneType.DRIVING]
 
 
@@ -187,7 +187,7 @@ def _ahead(graph: LaneGraph, lane: int, s: float, distance: float) -> list[tuple
         lane_end = min(float(graph.length[lane]), s + distance)
         parts.append((lane, s, lane_end))
         distance -= lane_end - s
-        successors = _after(graph, lane)
+        successors = _successors(graph, lane)
         if distance <= 1e-6 or len(successors) != 1 or graph.junction[successors[0]] >= 0:
             return parts
         lane, s = successors[0], 0.0
@@ -230,10 +230,10 @@ def _search(graph: LaneGraph, starts: list[tuple[float, _Spot]], goal: _Spot) ->
         if lane == goal.lane and goal.s >= s - 1e-6:
             push(goal.s - s, -1, goal.s, _Leg(((lane, s, max(goal.s, s)),)))
         lane_end = float(graph.length[lane])
-        for successor in _after(graph, lane):
+        for successor in _successors(graph, lane):
             push(lane_end - s, successor, 0.0, _Leg(((lane, s, lane_end),)))
         for neighbour in _beside(graph, lane):
-            parts = _ahead(graph, neighbour, _across(graph, lane, s, neighbour), CHANGE)
+            parts = _ahead(graph, neighbour, _level_position(graph, lane, s, neighbour), CHANGE)
             available = 0.0
             for part_index, (target, part_start, part_end) in enumerate(parts):
                 if (

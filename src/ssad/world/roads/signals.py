@@ -63,7 +63,7 @@ def place_signals(data: Approaches) -> dict[str, Any]:
             approach.light = _facing(data, approach, junction_lanes)
         has_lights = any(approach.light for approach in approaches)
         if not approaches or (
-            not has_lights and (len(arms) < ARMS or not _meet(data, approaches, set(junction_lanes)))
+            not has_lights and (len(arms) < ARMS or not _ways_meet(data, approaches, set(junction_lanes)))
         ):
             continue
         for approach, phase in zip(approaches, _phases(data, approaches), strict=True):
@@ -187,8 +187,8 @@ def _arms(data: Approaches) -> dict[int, list[_Approach]]:
     }
 
 
-def _meet(data: Approaches, arms: list[_Approach], inner: set[int]) -> bool:
-    """Whether ways of different arms come so near that two vehicles could touch; not so at a motorway's interchange."""
+def _ways_meet(data: Approaches, arms: list[_Approach], inner: set[int]) -> bool:
+    """Return True if ways of different arms come close enough for contact; never at a motorway's interchange."""
     paths_by_arm = [
         [
             data.line[connecting_lane][0]
@@ -252,14 +252,14 @@ def _phases(data: Approaches, arms: list[_Approach]) -> list[int]:
     return phases
 
 
-def _heading(data: Approaches, one: _Approach, other: _Approach) -> float:
+def _heading(data: Approaches, first: _Approach, second: _Approach) -> float:
     """Cosine of the angle between the traffic of two arms: -1 if they face each other."""
-    return float(np.cos(data.end[one.lanes[0], 2] - data.end[other.lanes[0], 2]))
+    return float(np.cos(data.end[first.lanes[0], 2] - data.end[second.lanes[0], 2]))
 
 
-def _cross(data: Approaches, one: _Approach, other: _Approach) -> bool:
-    """Whether the traffic of two arms comes neither from opposite sides nor from the same one."""
-    return FACING <= _heading(data, one, other) <= -FACING
+def _cross(data: Approaches, first: _Approach, second: _Approach) -> bool:
+    """Return True if the traffic of two arms comes neither from opposite sides nor from the same side."""
+    return FACING <= _heading(data, first, second) <= -FACING
 
 
 def _stop(data: Approaches, lane: int) -> float:

@@ -79,7 +79,7 @@ def write_town(town: Town) -> str:
             continue
         if junction.place in ramps_by_place:
             continue
-        signed_arms = _ruled(junction)
+        signed_arms = _signed_arms(junction)
         stem_count += len(signed_arms) == 1
         _signs(roads, junction, signed_arms, lengths, stop=len(signed_arms) > 1 or stem_count % YIELDS > 0)
     for roundabout in town.roundabouts:
@@ -166,10 +166,10 @@ def _street(number: int, street: RoadSpec, pieces: list[Piece], ends: tuple[Junc
     return road
 
 
-def _crosswalk(objects: Element, number: int, k: int, s: float, street: RoadSpec) -> None:
+def _crosswalk(objects: Element, number: int, index: int, arc_length: float, street: RoadSpec) -> None:
     half_width = street.lanes * street.width + street.shoulder
-    attributes = {"id": str(100 * number + k), "name": "crosswalk", "type": "crosswalk", "orientation": "none"}
-    position = {"s": decimal(s), "t": "0", "zOffset": "0", "hdg": "0"}
+    attributes = {"id": str(100 * number + index), "name": "crosswalk", "type": "crosswalk", "orientation": "none"}
+    position = {"s": decimal(arc_length), "t": "0", "zOffset": "0", "hdg": "0"}
     crosswalk = SubElement(
         objects, "object", attributes | position, length=decimal(CROSSWALK), width=decimal(2 * half_width)
     )
@@ -357,7 +357,7 @@ def _signals(root: Element, roads: list[Element], junction: Junction, lengths: d
         root.insert(list(root).index(element), controller)
 
 
-def _ruled(junction: Junction) -> list[Arm]:
+def _signed_arms(junction: Junction) -> list[Arm]:
     """Return the arms of a junction without lights that get a sign: all of a crossroads, the stem of a T-junction."""
     if len(junction.arms) < 3:
         return []

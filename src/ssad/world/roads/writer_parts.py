@@ -76,7 +76,7 @@ class Roundabout:
 
 @dataclass(frozen=True)
 class Interchange:
-    """Where a motorway gains a lane a side: towards the wider part a ramp brings it, away from it a ramp takes it.
+    """Place at which a motorway gains a lane a side, from a ramp, or loses it to one.
 
     Both parts, one of n and one of n + 1 lanes a side, end at `place`. The one-way street that ends at `on` goes on as
     the outermost lane of the wider part; the outermost lane that comes from there goes on as the one-way street that

@@ -149,7 +149,7 @@ class SignPlace:
 
 
 @dataclass(frozen=True)
-class Road:
+class MapRoad:
     """Road with its sections, the connections of its ends, and its lights and signs."""
 
     id: int
@@ -184,7 +184,7 @@ class Network:
         signs: Kind of each sign by id.
     """
 
-    roads: dict[int, Road]
+    roads: dict[int, MapRoad]
     junctions: dict[int, tuple[Connection, ...]]
     lights: tuple[str, ...]
     phase: dict[str, int]
@@ -195,31 +195,31 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def fail(self, where: str, what: str) -> NoReturn:
-        raise MapError(f"{self.path}: {where}: {what}; correct the map and import it again")
+    def fail(self, location: str, problem: str) -> NoReturn:
+        raise MapError(f"{self.path}: {location}: {problem}; correct the map and import it again")
 
-    def number(self, element: Element, name: str, where: str, default: float | None = None) -> float:
+    def number(self, element: Element, name: str, location: str, default: float | None = None) -> float:
         text = element.get(name)
         if text is None:
             if default is not None:
                 return default
-            self.fail(where, f"<{element.tag}> has no attribute '{name}'")
+            self.fail(location, f"<{element.tag}> has no attribute '{name}'")
         try:
             value = float(text)
         except ValueError:
-            self.fail(where, f"<{element.tag} {name}='{text[:30]}'> is not a number")
+            self.fail(location, f"<{element.tag} {name}='{text[:30]}'> is not a number")
         if not math.isfinite(value) or abs(value) > MAX_COORDINATE:
-            self.fail(where, f"<{element.tag} {name}='{text[:30]}'> is not finite or beyond {MAX_COORDINATE:g}")
+            self.fail(location, f"<{element.tag} {name}='{text[:30]}'> is not finite or beyond {MAX_COORDINATE:g}")
         return value
 
-    def whole(self, element: Element, name: str, where: str) -> int:
+    def whole(self, element: Element, name: str, location: str) -> int:
         text = element.get(name, "")
         try:
             value = int(text)
         except ValueError:
-            self.fail(where, f"<{element.tag} {name}='{text[:30]}'> is not a whole number")
+            self.fail(location, f"<{element.tag} {name}='{text[:30]}'> is not a whole number")
         if abs(value) >= 2**31:
-            self.fail(where, f"<{element.tag} {name}='{text[:30]}'> is too large")
+            self.fail(location, f"<{element.tag} {name}='{text[:30]}'> is too large")
         return value
 
     def network(self) -> Network:
@@ -230,7 +230,7 @@ class _Reader:
             raise MapError(f"{error}; give a complete OpenDRIVE file (.xodr)") from None
         if root.tag != "OpenDRIVE":
             self.fail(f"<{str(root.tag)[:40]}>", "the root element is not <OpenDRIVE>")
-        roads: dict[int, Road] = {}
+        roads: dict[int, MapRoad] = {}
         total_length = 0.0
         for element in root.findall("road"):
             road = self.road(element)
@@ -283,7 +283,7 @@ class _Reader:
         }
         return Network(roads, junctions, tuple(dict.fromkeys(lights)), phase, signs)
 
-    def road(self, element: Element) -> Road:
+    def road(self, element: Element) -> MapRoad:
         location = f"road {element.get('id')}"
         for descendant in element.iter():
             for name in _NUMBERS.intersection(descendant.keys()):
@@ -313,7 +313,7 @@ class _Reader:
             for name in ("curvature", "curvStart", "curvEnd"):
                 if abs(self.number(shape[0], name, location, 0.0)) > MAX_CURVATURE:
                     self.fail(location, f"{name} is beyond {MAX_CURVATURE:g} 1/m")
-        return Road(
+        return MapRoad(
             id=self.whole(element, "id", location),
             junction=self.whole(element, "junction", location) if element.get("junction") else -1,
             length=length,
@@ -324,47 +324,48 @@ class _Reader:
             signs=tuple(_sign_places(element)),
         )
 
-    def link(self, road: Element, name: str, where: str) -> Link | None:
+    def link(self, road: Element, name: str, location: str) -> Link | None:
         element = road.find(f"link/{name}")
         if element is None:
             return None
         kind = element.get("elementType", "")
         if kind not in ("road", "junction"):
-            self.fail(where, f"<{name} elementType='{kind[:30]}'> is neither road nor junction")
-        return Link(kind, self.whole(element, "elementId", where), element.get("contactPoint", "start"))
+            self.fail(location, f"<{name} elementType='{kind[:30]}'> is neither road nor junction")
+        return Link(kind, self.whole(element, "elementId", location), element.get("contactPoint", "start"))
 
-    def linked(self, road: Road, roads: dict[int, Road], junctions: dict[int, tuple[Connection, ...]]) -> None:
+    def linked(self, road: MapRoad, roads: dict[int, MapRoad], junctions: dict[int, tuple[Connection, ...]]) -> None:
         """Reject links to roads or junctions that the map lacks."""
         for link in (road.predecessor, road.successor):
             if link and link.id not in (roads if link.kind == "road" else junctions):
                 self.fail(f"road {road.id}", f"it is linked to {link.kind} {link.id}, which the map lacks")
 
-    def connections(self, junction: Element, where: str, roads: dict[int, Road]) -> tuple[Connection, ...]:
+    def connections(self, junction: Element, location: str, roads: dict[int, MapRoad]) -> tuple[Connection, ...]:
         found = []
         for element in junction.findall("connection"):
             lane_pairs = tuple(
-                (self.whole(link, "from", where), self.whole(link, "to", where)) for link in element.findall("laneLink")
+                (self.whole(link, "from", location), self.whole(link, "to", location))
+                for link in element.findall("laneLink")
             )
-            incoming = self.whole(element, "incomingRoad", where)
-            connecting = self.whole(element, "connectingRoad", where)
+            incoming = self.whole(element, "incomingRoad", location)
+            connecting = self.whole(element, "connectingRoad", location)
             for road in (incoming, connecting):
                 if road not in roads:
-                    self.fail(where, f"it connects road {road}, which is not in the map")
+                    self.fail(location, f"it connects road {road}, which is not in the map")
             found.append(Connection(incoming, connecting, element.get("contactPoint", "start"), lane_pairs))
         return tuple(found)
 
-    def sections(self, road: Element, where: str, length: float) -> tuple[Section, ...]:
+    def sections(self, road: Element, location: str, length: float) -> tuple[Section, ...]:
         elements = road.findall("lanes/laneSection")
         if not elements:
-            self.fail(where, "it has no <laneSection>")
-        start_positions = [self.number(element, "s", where) for element in elements]
+            self.fail(location, "it has no <laneSection>")
+        start_positions = [self.number(element, "s", location) for element in elements]
         if start_positions != sorted(start_positions) or start_positions[0] < 0.0:
-            self.fail(where, "its lane sections are not in order")
+            self.fail(location, "its lane sections are not in order")
         speed_limits = []
         for road_type in road.findall("type"):
             speed = road_type.find("speed")
             if speed is not None:
-                speed_limits.append((self.number(road_type, "s", where), self.speed(speed, where)))
+                speed_limits.append((self.number(road_type, "s", location), self.speed(speed, location)))
         result = []
         for index, element in enumerate(elements):
             section_end = start_positions[index + 1] if index + 1 < len(start_positions) else length
@@ -373,14 +374,14 @@ class _Reader:
             centre_mark = Marking.NONE
             for side_name in ("left", "center", "right"):
                 for lane in element.findall(f"{side_name}/lane"):
-                    lane_id = self.whole(lane, "id", where)
-                    marking = self.mark(lane, middle, where)
+                    lane_id = self.whole(lane, "id", location)
+                    marking = self.mark(lane, middle, location)
                     if lane_id == 0:
                         centre_mark = marking
                         continue
                     if (lane_id > 0) != (side_name == "left") or lane_id in lanes:
-                        self.fail(where, f"lane {lane_id} is on the wrong side or there twice")
-                    lanes[lane_id] = self.lane(lane, lane_id, marking, where)
+                        self.fail(location, f"lane {lane_id} is on the wrong side or there twice")
+                    lanes[lane_id] = self.lane(lane, lane_id, marking, location)
             valid_limits = [value for position, value in speed_limits if position <= start_positions[index] + middle]
             result.append(
                 Section(
@@ -389,34 +390,34 @@ class _Reader:
             )
         return tuple(result)
 
-    def lane(self, element: Element, number: int, mark: Marking, where: str) -> Lane:
+    def lane(self, element: Element, number: int, mark: Marking, location: str) -> Lane:
         neighbour_ids: list[int | None] = []
         for name in ("predecessor", "successor"):
             link = element.find(f"link/{name}")
-            neighbour_ids.append(None if link is None else self.whole(link, "id", where))
+            neighbour_ids.append(None if link is None else self.whole(link, "id", location))
         speed = element.find("speed")
         return Lane(
             number,
             _KINDS.get(element.get("type", "none"), LaneType.NONE),
             mark,
-            None if speed is None else self.speed(speed, where),
+            None if speed is None else self.speed(speed, location),
             *neighbour_ids,
         )
 
-    def speed(self, element: Element, where: str) -> float | None:
+    def speed(self, element: Element, location: str) -> float | None:
         text = element.get("max", "")
         if text in ("no limit", "undefined", ""):
             return None
         unit = element.get("unit", "")
         if unit not in _SPEED:
-            self.fail(where, f"<speed unit='{unit[:30]}'> is not one of mph, km/h, m/s")
-        value = self.number(element, "max", where) * _SPEED[unit]
+            self.fail(location, f"<speed unit='{unit[:30]}'> is not one of mph, km/h, m/s")
+        value = self.number(element, "max", location) * _SPEED[unit]
         return value if value > 0.0 else None
 
-    def mark(self, lane: Element, at: float, where: str) -> Marking:
+    def mark(self, lane: Element, distance: float, location: str) -> Marking:
         kind = "none"
         for element in lane.findall("roadMark"):
-            if self.number(element, "sOffset", where, 0.0) <= at or kind == "none":
+            if self.number(element, "sOffset", location, 0.0) <= distance or kind == "none":
                 kind = element.get("type", "none")
         return _MARKS.get(kind, Marking.OTHER)
 

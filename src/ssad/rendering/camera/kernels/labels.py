@@ -31,8 +31,8 @@ def cover(
             sky_count += 1
         else:
             same_count = int(1)
-            for other in range(sample + 1, count):
-                if (samples[crop, y * scale + other / scale, x * scale + other % scale] & LAST) == key:
+            for next_sample in range(sample + 1, count):
+                if (samples[crop, y * scale + next_sample / scale, x * scale + next_sample % scale] & LAST) == key:
                     same_count += 1
             best_count = wp.max(best_count, same_count)
     if sky_count < count:

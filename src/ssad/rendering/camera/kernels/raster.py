@@ -30,7 +30,7 @@ class Triangle:
 
 
 @wp.func
-def shown(p: wp.vec3, lens: wp.vec4, scale: float, ortho: int) -> wp.vec3:
+def project_point(p: wp.vec3, lens: wp.vec4, scale: float, ortho: int) -> wp.vec3:
     """Project a point of the camera frame to (x, y, inverse depth) in samples."""
     inverse_depth = 1.0 / p[2]
     perspective = inverse_depth
@@ -210,19 +210,19 @@ def fill(
                 triangle = Triangle()
                 triangle.view = view
                 triangle.slot = 2 * index
-                triangle.a = shown(p, focal, scale, ortho)
+                triangle.a = project_point(p, focal, scale, ortho)
                 if q[2] >= plane:
-                    triangle.b = shown(q, focal, scale, ortho)
+                    triangle.b = project_point(q, focal, scale, ortho)
                     if r[2] >= plane:
-                        triangle.c = shown(r, focal, scale, ortho)
+                        triangle.c = project_point(r, focal, scale, ortho)
                     else:
-                        triangle.c = shown(cut(q, r, plane), focal, scale, ortho)
+                        triangle.c = project_point(cut(q, r, plane), focal, scale, ortho)
                 else:
-                    triangle.b = shown(cut(p, q, plane), focal, scale, ortho)
+                    triangle.b = project_point(cut(p, q, plane), focal, scale, ortho)
                     if r[2] >= plane:
-                        triangle.c = shown(cut(r, q, plane), focal, scale, ortho)
+                        triangle.c = project_point(cut(r, q, plane), focal, scale, ortho)
                     else:
-                        triangle.c = shown(cut(p, r, plane), focal, scale, ortho)
+                        triangle.c = project_point(cut(p, r, plane), focal, scale, ortho)
                 pieces = int(1)
                 if (q[2] >= plane) != (r[2] >= plane):
                     pieces = 2  # one corner behind the plane: four corners remain
@@ -231,9 +231,9 @@ def fill(
                         triangle.slot += 1
                         triangle.b = triangle.c
                         if q[2] >= plane:
-                            triangle.c = shown(cut(p, r, plane), focal, scale, ortho)
+                            triangle.c = project_point(cut(p, r, plane), focal, scale, ortho)
                         else:
-                            triangle.c = shown(r, focal, scale, ortho)
+                            triangle.c = project_point(r, focal, scale, ortho)
                     enter(triangle, largest, samples, large, count)
 
 

@@ -190,14 +190,14 @@ def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
 
 
 @wp.func
-def hit_of(geometry: Geometry, drawn: Drawn, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
+def hit_of(geometry: Geometry, draw_samples: Drawn, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
     """Intersect a ray (camera frame, z = 1) with the plane of a slot's face, clamped to its edges."""
     hit = Hit()
-    owner = drawn.owners[slot / 2]
+    owner = draw_samples.owners[slot / 2]
     hit.draw = owner[0]
     hit.face = owner[1]
     face = hit.face
-    to_camera = drawn.matrices[hit.draw]
+    to_camera = draw_samples.matrices[hit.draw]
     a = wp.transform_point(to_camera, geometry.vertices[geometry.faces[face, 0]])
     b = wp.transform_point(to_camera, geometry.vertices[geometry.faces[face, 1]])
     c = wp.transform_point(to_camera, geometry.vertices[geometry.faces[face, 2]])
@@ -436,7 +436,7 @@ def wear(
 @wp.func
 def shade_pixel(
     geometry: Geometry,
-    drawn: Drawn,
+    draw_samples: Drawn,
     layers: Layers,
     focal: wp.vec4,
     pose: wp.mat44,
@@ -461,11 +461,11 @@ def shade_pixel(
     # The lower half of a key identifies the triangle, 0 the sky.
     top_row = y * scale
     left_column = x * scale
-    first_key = drawn.samples[view, top_row, left_column] & LAST
+    first_key = draw_samples.samples[view, top_row, left_column] & LAST
     different_count = int(0)
     for dy in range(scale):
         for dx in range(scale):
-            if (drawn.samples[view, top_row + dy, left_column + dx] & LAST) != first_key:
+            if (draw_samples.samples[view, top_row + dy, left_column + dx] & LAST) != first_key:
                 different_count += 1
     # Most pixels show one triangle: a single evaluation is enough.
     evaluations = count
@@ -479,20 +479,20 @@ def shade_pixel(
         is_first = int(1)
         if different_count > 0:
             # A triangle is shaded at its first sample.
-            key = drawn.samples[view, top_row + sample / scale, left_column + sample % scale] & LAST
+            key = draw_samples.samples[view, top_row + sample / scale, left_column + sample % scale] & LAST
             covered = int(0)
             sum_x = float(0.0)
             sum_y = float(0.0)
-            other = int(0)
+            sample_index = int(0)
             for dy in range(scale):
                 for dx in range(scale):
-                    if (drawn.samples[view, top_row + dy, left_column + dx] & LAST) == key:
-                        if other < sample:
+                    if (draw_samples.samples[view, top_row + dy, left_column + dx] & LAST) == key:
+                        if sample_index < sample:
                             is_first = 0
                         covered += 1
                         sum_x += float(dx)
                         sum_y += float(dy)
-                    other += 1
+                    sample_index += 1
         if is_first == 1:
             u = float(x) + (sum_x / float(covered) + 0.5) * sample_size - 0.5
             v = float(y) + (sum_y / float(covered) + 0.5) * sample_size - 0.5
@@ -508,13 +508,13 @@ def shade_pixel(
                     colour = colour * veil + light.horizon * (1.0 - veil)
             else:
                 slot = int(LAST - key)
-                hit = hit_of(geometry, drawn, slot, ray, pose)
+                hit = hit_of(geometry, draw_samples, slot, ray, pose)
                 z = hit.z
-                surface_tag = drawn.tags[hit.draw]
+                surface_tag = draw_samples.tags[hit.draw]
                 surface = geometry.surfaces[geometry.material[hit.face]]
                 albedo = surface.colour
                 if surface.paint == 1:
-                    albedo = drawn.paints[hit.draw]
+                    albedo = draw_samples.paints[hit.draw]
                 albedo = textured(surface, albedo, hit.uv, hit.distance / (focal[0] * hit.slant))
                 if layers.any == 1:
                     albedo = albedo * left_by(layers, view, hit.draw, geometry.wearable[hit.face], hit, surface_tag)
@@ -526,7 +526,7 @@ def shade_pixel(
                         open_ = openness(near, row, hit.place)
                 lit = lit_at(light, shadows, near, view, row, hit.place, hit.normal, open_)
                 glow = surface.emission + surface.night * light.lamps
-                if surface.lamp == 1 and drawn.lit[hit.draw] == 0:
+                if surface.lamp == 1 and draw_samples.lit[hit.draw] == 0:
                     glow = 0.0
                 shaded = seen_from(light, near, row, surface, albedo, glow, hit, lit, away)
                 colour = shaded.colour
@@ -573,7 +573,7 @@ def shade_pixel(
 @wp.kernel(cuda_max_registers=REGISTERS)
 def shade(
     geometry: Geometry,
-    drawn: Drawn,
+    draw_samples: Drawn,
     layers: Layers,
     lens: wp.array(dtype=wp.vec4),
     to_world: wp.array(dtype=wp.mat44),
@@ -600,5 +600,5 @@ def shade(
     pose = to_world[view]
     for x in range(lane, out.radiance.shape[2], lanes):
         shade_pixel(
-            geometry, drawn, layers, focal, pose, light, shadows, near, projecting, scale, out, view, y, x
+            geometry, draw_samples, layers, focal, pose, light, shadows, near, projecting, scale, out, view, y, x
         )  # fmt: skip
