@@ -17,7 +17,7 @@ import pytest
 from ssad.core.errors import ConfigError
 from ssad.engine import worker
 from ssad.engine.local import Worker
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 
 def begin(path: Path) -> None:
@@ -45,7 +45,7 @@ def do(what: str) -> Any:
     return sys.path if what == "path" else what
 
 
-def work(process: Worker, what: Any) -> Outcome:
+def work(process: Worker, what: Any) -> TaskOutcome:
     """How a task ended."""
     assert process.give(Task(do, what)) is None
     outcome = process.hear()

@@ -42,9 +42,9 @@ def train_detector(
     ] = None,
 ) -> None:
     """Train a detector and validate it on the split val. To resume, repeat the command."""
-    from ssad.training.detector import Plan, parse_changes, run_training
+    from ssad.training.detector import DetectorPlan, parse_changes, run_training
 
-    plan = Plan(
+    plan = DetectorPlan(
         recipe,
         (data, *(more or [])),
         out,

@@ -34,7 +34,7 @@ COUNTER = "num_batches_tracked"  # BatchNorm's counter of training steps, which 
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
+class WeightsCard:
     """Description and origin of weights.
 
     Attributes:
@@ -202,7 +202,7 @@ def _shard_names(stem: str, count: int) -> list[str]:
     return [f"{stem}-{number:05d}-of-{count:05d}.safetensors" for number in range(1, count + 1)]
 
 
-def read_card(path: str | Path) -> Card:
+def read_card(path: str | Path) -> WeightsCard:
     """Read the card of weights.
 
     Args:
@@ -224,7 +224,7 @@ def read_card(path: str | Path) -> Card:
         )
         raise FormatError(f"{source}: {reason}")
     data = read_json(card_file)
-    required_names = {card_field.name for card_field in fields(Card)}
+    required_names = {card_field.name for card_field in fields(WeightsCard)}
     types_by_name = {
         "data": str,
         "command": str,
@@ -243,10 +243,10 @@ def read_card(path: str | Path) -> Card:
     if not all(isinstance(value, int | float) for value in metrics.values()):
         raise FormatError(f"{card_file}: a metric is no number")
     converted = {"classes": tuple(data["classes"]), "metrics": metrics}
-    return Card(**{name: data[name] for name in required_names & data.keys()} | converted)
+    return WeightsCard(**{name: data[name] for name in required_names & data.keys()} | converted)
 
 
-def load_card(path: str | Path) -> tuple[Card, dict[str, Tensor]]:
+def load_card(path: str | Path) -> tuple[WeightsCard, dict[str, Tensor]]:
     """Read a card and the weights beside it, whose hash must be the card's.
 
     Raises:
@@ -265,8 +265,8 @@ def load_card(path: str | Path) -> tuple[Card, dict[str, Tensor]]:
 
 
 def save_weights(
-    path: str | Path, state: Mapping[str, Tensor], *, card: Card, half: bool = False, shard_mb: float = 15.0
-) -> Card:
+    path: str | Path, state: Mapping[str, Tensor], *, card: WeightsCard, half: bool = False, shard_mb: float = 15.0
+) -> WeightsCard:
     """Write NAME.safetensors (or its shards) and the card NAME.json; the same bytes for the same tensors.
 
     Every file is written atomically, the card last; shards of older weights of this name are removed.
@@ -314,7 +314,7 @@ def save_weights(
     return card
 
 
-def _card_text(card: Card, where: str) -> str:
+def _card_text(card: WeightsCard, where: str) -> str:
     """Return the card as JSON; a NaN metric (a class absent from the data) becomes null."""
     try:
         metrics = {name: float(metric) if math.isfinite(metric) else None for name, metric in card.metrics.items()}

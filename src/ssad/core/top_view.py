@@ -67,7 +67,7 @@ class _Canvas:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class TopViewScene:
     """Content of one top view; agent 0 is the ego.
 
     Attributes:
@@ -107,7 +107,7 @@ class TopView:
         self.areas = junction_areas(graph, self.lanes)
         self.size, self.scale = size, size[0] / across
 
-    def draw(self, moment: Moment) -> Frame:
+    def draw(self, moment: TopViewScene) -> Frame:
         """Return an RGB image [H, W, 3] around the ego, north up."""
         centre = (float(moment.pose[0, 0]), float(moment.pose[0, 1]))
         canvas = _Canvas(self.size, self.scale, centre)
@@ -140,7 +140,7 @@ class TopView:
         return canvas.image
 
 
-def _agent(canvas: _Canvas, moment: Moment, agent: int) -> None:
+def _agent(canvas: _Canvas, moment: TopViewScene, agent: int) -> None:
     kind = AgentKind(int(moment.kind[agent]))
     x, y, yaw = (float(coordinate) for coordinate in moment.pose[agent])
     length, width = (float(coordinate) for coordinate in moment.size[agent])

@@ -16,7 +16,7 @@ from typing import Any
 
 from ssad.core.errors import ConfigError, SSADError, StoreError, install_extra
 from ssad.engine.local import LocalProcesses, Start
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 LOST_NODES = 5  # repeats of a task whose node was lost
 AHEAD = 2  # more than one, so that no CPU idles until the next task arrives
@@ -100,7 +100,7 @@ class RayCluster:
         """Submit a task; call only while `busy` is below `capacity`."""
         self._tasks[self._remote.remote((task.function, task.argument, task.timeout_s), self._start)] = task
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:
@@ -122,7 +122,7 @@ class RayCluster:
             except self._ray.exceptions.RayError as ray_error:
                 message = f"the cluster lost its node {LOST_NODES + 1} times: {' '.join(str(ray_error).split())[:200]}"
                 status, value, reason, error, elapsed_s = "crashed", None, message, None, 0.0
-            outcomes.append(Outcome(task, status, value, reason, error, elapsed_s))
+            outcomes.append(TaskOutcome(task, status, value, reason, error, elapsed_s))
         return outcomes
 
     def close(self) -> None:

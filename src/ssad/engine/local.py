@@ -16,7 +16,7 @@ from typing import Any
 
 from ssad.core.errors import SSADError
 from ssad.core.registry import describe
-from ssad.engine.task import Outcome, Status, Task
+from ssad.engine.task import Status, Task, TaskOutcome
 
 START_S = 600.0  # a worker may compile kernels when it starts
 SCARCE = 0.04  # share of the memory; if less remains
@@ -68,7 +68,7 @@ class Worker:
         with contextlib.suppress(OSError):  # a dead worker is noticed by the end of its answers
             self._orders.send(message)
 
-    def give(self, task: Task) -> Outcome | None:
+    def give(self, task: Task) -> TaskOutcome | None:
         """Start a task; return an outcome if the task cannot even be sent."""
         self.task, self.began = task, time.monotonic()
         try:
@@ -79,13 +79,13 @@ class Worker:
 
     def outcome(
         self, status: Status, reason: str = "", *, value: Any = None, error: Exception | None = None
-    ) -> Outcome:
+    ) -> TaskOutcome:
         """Return the outcome of the current task, and clear the task."""
         assert self.task is not None
         task, self.task = self.task, None
-        return Outcome(task, status, value, reason, error, time.monotonic() - self.began)
+        return TaskOutcome(task, status, value, reason, error, time.monotonic() - self.began)
 
-    def hear(self) -> Outcome | None:
+    def hear(self) -> TaskOutcome | None:
         """Read an answer: the worker is ready, or its task has an outcome.
 
         Returns:
@@ -109,7 +109,7 @@ class Worker:
             return self.outcome("ok", value=value)
         return self.outcome("failed", str(value), error=value if isinstance(value, SSADError) else None)
 
-    def overdue(self) -> Outcome:
+    def overdue(self) -> TaskOutcome:
         """Return the outcome of a task that timed out.
 
         Raises:
@@ -178,7 +178,7 @@ class LocalProcesses:
         self._start, self._gpus, self._threads = start, tuple(gpus), threads
         self._workers: list[Worker] = []
         self._waiting: list[Task] = []
-        self._unsent: list[Outcome] = []
+        self._unsent: list[TaskOutcome] = []
         self._started = 0
         self._looked = time.monotonic()
         self._plenty = (0, time.monotonic())  # total memory, and the last time at which enough was free
@@ -192,7 +192,7 @@ class LocalProcesses:
         """Submit a task; call only while `busy` is below `capacity`."""
         self._waiting.append(task)
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:
@@ -239,7 +239,7 @@ class LocalProcesses:
             self._started += 1
             idle += 1
 
-    def _guard_memory(self) -> list[Outcome]:
+    def _guard_memory(self) -> list[TaskOutcome]:
         """Kill workers above the memory limit, and the largest worker before the machine runs out of memory."""
         working = [(worker.memory(), worker) for worker in self._workers if worker.task is not None]
         memory_limit = int(os.environ.get(WORKER_MEMORY) or 0)
@@ -315,7 +315,7 @@ class ThisProcess:
         """Submit a task."""
         self._waiting.append(task)
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         """Run all submitted tasks."""
         if self._start is not None:
             self._start[0](self._start[1])
@@ -326,9 +326,9 @@ class ThisProcess:
             try:
                 value = task.function(task.argument)
             except SSADError as error:
-                outcomes.append(Outcome(task, "failed", None, str(error), error, time.monotonic() - started_at))
+                outcomes.append(TaskOutcome(task, "failed", None, str(error), error, time.monotonic() - started_at))
                 continue
-            outcomes.append(Outcome(task, "ok", value, seconds=time.monotonic() - started_at))
+            outcomes.append(TaskOutcome(task, "ok", value, seconds=time.monotonic() - started_at))
         return outcomes
 
     def close(self) -> None:

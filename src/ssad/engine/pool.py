@@ -11,7 +11,7 @@ from ssad.core.errors import StoreError
 from ssad.core.machine import default_workers, gpu_workers, visible_gpus
 from ssad.engine.cluster import RayCluster
 from ssad.engine.local import LocalProcesses, Start, ThisProcess
-from ssad.engine.task import Backend, Outcome, Task
+from ssad.engine.task import Backend, Task, TaskOutcome
 
 TICK_S = 0.2
 
@@ -19,7 +19,7 @@ TICK_S = 0.2
 class Pool:
     """A queue of tasks before a backend; a context.
 
-    Tasks may be added while outcomes are read. No task costs more than itself: see `Outcome.status`.
+    Tasks may be added while outcomes are read. No task costs more than itself: see `TaskOutcome.status`.
 
     Args:
         backend: where the tasks run; see `open_pool`.
@@ -46,7 +46,7 @@ class Pool:
         self._queue = deque(task for task in self._queue if not unwanted(task))
         return dropped
 
-    def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[Outcome]:
+    def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[TaskOutcome]:
         """How each task ended, as they end, until nothing is left to do; `tick` is called several times a second.
 
         Raises:

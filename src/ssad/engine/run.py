@@ -19,7 +19,7 @@ from ssad.engine.kind import Cell, CellError, Job, Kind, Plan, Resources
 from ssad.engine.pool import Pool, open_pool
 from ssad.engine.progress import Live
 from ssad.engine.store import Store
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 MOST = 1 << 30  # bytes of an artefact that is hashed
 
@@ -119,7 +119,7 @@ class _Schedule:
         self.shared: dict[str, float] = {}  # cell key -> its part of the seconds of its pieces
         self.alone: set[str] = set()  # systems that share no pieces any more
         self.trouble: Counter[str] = Counter()  # system -> its crashes and time-outs
-        self.given_up: dict[str, Outcome] = {}
+        self.given_up: dict[str, TaskOutcome] = {}
         self.pool: Pool
         self.live: Live
 
@@ -165,7 +165,7 @@ class _Schedule:
         argument = (self.kind, name, self.data[name], tuple(systems), self.job)
         self.pool.add(Task(_make, argument, self.timeout, label=(name, tuple(systems))), first=first)
 
-    def _piece_ended(self, name: str, systems: Sequence[str], outcome: Outcome) -> None:
+    def _piece_ended(self, name: str, systems: Sequence[str], outcome: TaskOutcome) -> None:
         """Release the cells that waited; a piece that failed for several systems is done again for each alone."""
         if outcome.status != "ok" and len(systems) > 1:
             for system in systems:
@@ -196,7 +196,7 @@ class _Schedule:
             else:
                 self._add([cell], first=True)
 
-    def _batch_ended(self, batch: list[Cell], outcome: Outcome) -> None:
+    def _batch_ended(self, batch: list[Cell], outcome: TaskOutcome) -> None:
         if outcome.status == "ok":
             for cell in batch:
                 result = dict(outcome.value[cell.key])
@@ -224,7 +224,7 @@ class _Schedule:
                 self._add_piece(name, remaining_systems)
             self._release(name, system)
 
-    def _blame(self, system: str, outcome: Outcome) -> None:
+    def _blame(self, system: str, outcome: TaskOutcome) -> None:
         """Count a system's time-outs and crashes; after `patience` of them, give it up."""
         if self.kind.patience is None or outcome.status not in ("timeout", "crashed"):
             return

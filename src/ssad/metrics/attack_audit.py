@@ -88,7 +88,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class AuditFault:
     """An objection against an attack: the violated rule, the detector, a sentence."""
 
     rule: str
@@ -106,7 +106,7 @@ class Verdict:
     """
 
     compared: Mapping[str, int]
-    faults: tuple[Fault, ...]
+    faults: tuple[AuditFault, ...]
 
     @property
     def passed(self) -> bool:
@@ -152,7 +152,7 @@ def audit(attempts: Iterable[Attempt]) -> Verdict:
             for finding in rule(detector_attempts):
                 compared[rule_name] += 1
                 if finding is not None:
-                    faults.append(Fault(rule_name, detector, finding))
+                    faults.append(AuditFault(rule_name, detector, finding))
     return Verdict(compared, tuple(faults))
 
 

@@ -56,7 +56,7 @@ class Clusters:
 
 
 @dataclass(frozen=True)
-class Limits:
+class ConfidenceLimits:
     """Mean, limits [...] (NaN: no interval) and the name of the method."""
 
     mean: F64
@@ -65,7 +65,7 @@ class Limits:
     method: str
 
 
-def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> Limits:
+def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> ConfidenceLimits:
     """Return the interval of the mean of values in [0, 1]: beta limits at an effective number of cases.
 
     The effective number is that of independent yes-or-no cases whose share would vary as the clusters do (Korn
@@ -78,7 +78,7 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> L
         cap: Maximum effective number; twice the number of cases for values that are 0 or 1.
 
     Returns:
-        Limits [...]; NaN where values inside (0, 1) do not vary at all and `cap` is infinite.
+        The limits [...]; NaN where values inside (0, 1) do not vary at all and `cap` is infinite.
     """
     means, mean, contributions = _contributions(sums, clusters)
     cluster_counts = clusters.member.sum(axis=0)
@@ -102,10 +102,10 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> L
         )
     low, high = share_limits(mean, np.where(np.isinf(effective), 1.0, effective))
     has_interval = np.isfinite(effective)
-    return Limits(mean, np.where(has_interval, low, np.nan), np.where(has_interval, high, np.nan), "beta")
+    return ConfidenceLimits(mean, np.where(has_interval, low, np.nan), np.where(has_interval, high, np.nan), "beta")
 
 
-def mean_limits(sums: F64, clusters: Clusters) -> Limits:
+def mean_limits(sums: F64, clusters: Clusters) -> ConfidenceLimits:
     """Interval of the mean of values without bounds: Student's, wider at both ends and on the side of the skew.
 
     The degrees of freedom fall with the kurtosis of the clusters; each end leaves room for 0.3 of a cluster more
@@ -116,7 +116,7 @@ def mean_limits(sums: F64, clusters: Clusters) -> Limits:
         clusters: their sizes and strata.
 
     Returns:
-        Limits [...]; NaN where fewer than `MIN_DIFFERENT` clusters differ from the commonest value.
+        The limits [...]; NaN where fewer than `MIN_DIFFERENT` clusters differ from the commonest value.
     """
     _, mean, contributions = _contributions(sums, clusters)
     spread = _spread(contributions, clusters)
@@ -126,7 +126,7 @@ def mean_limits(sums: F64, clusters: Clusters) -> Limits:
     low = mean - t * standard_error - np.maximum(-skewed, 0.0) + _ROOM * contributions.min(axis=-1)
     high = mean + t * standard_error + np.maximum(skewed, 0.0) + _ROOM * contributions.max(axis=-1)
     has_interval = (_different(sums / clusters.size) >= MIN_DIFFERENT) & ~_flat(spread.variance, mean)
-    return Limits(mean, np.where(has_interval, low, np.nan), np.where(has_interval, high, np.nan), "t")
+    return ConfidenceLimits(mean, np.where(has_interval, low, np.nan), np.where(has_interval, high, np.nan), "t")
 
 
 def replicate_limits(value: F64, variance: F64, clusters: int, *, bounded: bool) -> tuple[F64, F64]:

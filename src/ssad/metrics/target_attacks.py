@@ -28,7 +28,7 @@ CONFIDENCES = (0.25, 0.5)  # from which score on a box counts as a detection
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class TargetView:
     """Detections in one image of the target, as plain arrays.
 
     Attributes:
@@ -82,7 +82,7 @@ def _on_target(box: F64, score: F64, real: F64) -> float:
     return float(score[is_on_target].max(initial=0.0))
 
 
-def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
+def sighting(drive: str, found: Detections, truth: Truth) -> TargetView:
     """What was found of the class of the target, the first object of the truth, and on it of any class."""
     target_label = int(truth.label[0])
     is_own_class, is_same_class = (found.label == target_label).cpu(), (truth.label == target_label).cpu()
@@ -91,7 +91,7 @@ def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
     crowd_flags = (
         np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
     )
-    return Sighting(
+    return TargetView(
         drive,
         box[is_own_class.numpy()],
         score[is_own_class.numpy()],
@@ -101,7 +101,7 @@ def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
     )
 
 
-def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]]) -> Iterator[Sighting]:
+def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]]) -> Iterator[TargetView]:
     """What a detector finds in pictures, one after another.
 
     Args:
@@ -124,7 +124,7 @@ def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]])
 
 
 def target_scores(
-    sightings: Sequence[Sighting], clean: Sequence[Sighting] | None = None, *, replicates: int = 100, seed: int = 0
+    sightings: Sequence[TargetView], clean: Sequence[TargetView] | None = None, *, replicates: int = 100, seed: int = 0
 ) -> dict[str, Any]:
     """Scores of a set of pictures.
 
@@ -199,7 +199,7 @@ def target_scores(
     }
 
 
-def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least: float = 0.0) -> float | None:
+def precision(sightings: Sequence[TargetView], *, target_only: bool = True, least: float = 0.0) -> float | None:
     """AP50 of boxes above a score: of the target alone (others count neither way), or of all vehicles of its class."""
     truth, boxes = _tables(sightings, target_only=target_only, least=least)
     ap = average_precision(truth, boxes, labels=1, threshold=IOU)[0]
@@ -207,7 +207,7 @@ def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least:
 
 
 def _precisions(
-    sightings: Sequence[Sighting], of: I32, drawn: Iterable[I64], *, target_only: bool, least: float
+    sightings: Sequence[TargetView], of: I32, drawn: Iterable[I64], *, target_only: bool, least: float
 ) -> list[float]:
     """`precision` of several draws of drives; what a box hits in its picture does not depend on the draw.
 
@@ -241,7 +241,7 @@ def _precisions(
     return [value for value in values if not np.isnan(value)]
 
 
-def _tables(sightings: Sequence[Sighting], *, target_only: bool, least: float) -> tuple[Boxes2D, Boxes2D]:
+def _tables(sightings: Sequence[TargetView], *, target_only: bool, least: float) -> tuple[Boxes2D, Boxes2D]:
     """True and found boxes of pictures, for their AP."""
     ignored = []
     own_boxes = [(entry.box[entry.score > least], entry.score[entry.score > least]) for entry in sightings]

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ssad.metrics.target_attacks import Sighting, precision
+from ssad.metrics.target_attacks import TargetView, precision
 
 AXES = ("distance", "azimuth", "elevation", "weather")
 
 
 def grid_scores(
-    rows: Sequence[Mapping[str, Any]], clean: Sequence[Sighting], attacked: Sequence[Sighting] | None, *, floor: float
+    rows: Sequence[Mapping[str, Any]],
+    clean: Sequence[TargetView],
+    attacked: Sequence[TargetView] | None,
+    *,
+    floor: float,
 ) -> dict[str, Any]:
     """Return the remaining AP50 in each cell of distance and azimuth, over all elevations and weathers.
 

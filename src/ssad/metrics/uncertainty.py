@@ -20,7 +20,7 @@ from ssad.core.types import F64
 from ssad.metrics.intervals import (
     MIN_CLUSTERS,
     Clusters,
-    Limits,
+    ConfidenceLimits,
     bounded_limits,
     mean_limits,
     replicate_limits,
@@ -285,7 +285,7 @@ def _clusters(values: Sequence[CaseValue]) -> tuple[Clusters, npt.NDArray[np.int
     return Clusters(size, np.array([strata[stratum] for stratum, _ in names])), cluster_index
 
 
-def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> Limits:
+def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> ConfidenceLimits:
     """The interval, or the range of the clusters' means where there is none; one cluster has neither."""
     if len(sums) >= MIN_CLUSTERS:
         if kind == "mean":
@@ -297,5 +297,5 @@ def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> Limits:
     means = sums / clusters.size
     mean = np.asarray(means @ clusters.weight)
     if len(means) == 1:
-        return Limits(mean, np.asarray(math.nan), np.asarray(math.nan), "none")
-    return Limits(mean, means.min(), means.max(), "range")
+        return ConfidenceLimits(mean, np.asarray(math.nan), np.asarray(math.nan), "none")
+    return ConfidenceLimits(mean, means.min(), means.max(), "range")

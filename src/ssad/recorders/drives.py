@@ -9,7 +9,17 @@ import numpy as np
 from ssad.core.errors import ConfigError, MapError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario, SignalPlan
+from ssad.core.types import (
+    Controller,
+    Episode,
+    EpisodeAgent,
+    EpisodeLimits,
+    LaneType,
+    Pose,
+    Route,
+    Scenario,
+    SignalPlan,
+)
 from ssad.rendering.scene_objects import thin_shares
 from ssad.rendering.street import STYLES, Street, build_street, cached_street
 from ssad.scenarios.dynamic.episode import forced_signals
@@ -127,7 +137,7 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
     drive_name = "/".join(str(piece) for piece in key)
     end_poses = (agents[0].pose, Pose(float(route.xy[-1, 0]), float(route.xy[-1, 1]), float(route.yaw[-1])))
     steps = math.ceil(seconds / 0.1) + 2
-    limits = Limits(max_steps=steps, max_time=2 * seconds + 60)
+    limits = EpisodeLimits(max_steps=steps, max_time=2 * seconds + 60)
     scenario = Scenario(f"drive/{drive_name}", "Custom", graph.name, end_poses, limits=limits)
     signals = forced_signals(graph, route, SignalPlan(ego="green", others="green", until=1e6), whole_town=True)
     return Episode(f"drive/{graph.name}/{drive_name}", scenario, graph.name, tuple(agents), signals, 1e6, limits)

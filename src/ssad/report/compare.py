@@ -11,10 +11,18 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
-from ssad.metrics import METRICS, CaseValue, Estimate, Outcome, paired_difference, replicate_difference, sign_flip_test
+from ssad.metrics import (
+    METRICS,
+    CaseValue,
+    EpisodeOutcome,
+    Estimate,
+    paired_difference,
+    replicate_difference,
+    sign_flip_test,
+)
 from ssad.report.load import Run, load_run
 from ssad.report.pages import render
-from ssad.report.tables import METHODS, Cell, Row, Table, write_tables
+from ssad.report.tables import METHODS, Table, TableCell, TableRow, write_tables
 
 SHOWN = ("CR", "OR", "DR", "RC", "DS")
 EVERYTHING = "all"
@@ -141,7 +149,7 @@ def _labels(folders: Sequence[Path]) -> list[str]:
 
 def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison:
     pairs = _subject_pairs(first, second)
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     verdicts: list[str] = []
     equal = both = 0
     unshared = [0, 0]
@@ -240,7 +248,7 @@ def _subject_pairs(first: ComparedRun, second: ComparedRun) -> list[tuple[str, s
 
 def _rows(
     first: Run, second: Run, title: str, own: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
-) -> Iterator[Row]:
+) -> Iterator[TableRow]:
     """Yield the differences of one subject: of all shared cells if the metrics are means, then of each group."""
     if first.kind == "driving":
         groups = {EVERYTHING: list(own)} | {
@@ -264,7 +272,7 @@ def _rows(
 
 def _driving_row(
     title: str, group: str, symbol: str, own: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
-) -> Row:
+) -> TableRow:
     metric = METRICS[symbol]
     kind = "share" if metric.kind == "share" else "mean"
     values = [{name: _case(line, metric.field, kind) for name, line in lines.items()} for lines in (own, other)]
@@ -273,17 +281,17 @@ def _driving_row(
         name for name in shared if not any(cases[name].failed or math.isnan(cases[name].value) for cases in values)
     ]
     difference = paired_difference(values[1], values[0], kind=kind)  # type: ignore[arg-type]
-    test = Cell(sign_flip_test(values[1], values[0]), digits=4)
+    test = TableCell(sign_flip_test(values[1], values[0]), digits=4)
     means = [
-        Cell(math.fsum(cases[name].value for name in measured) / len(measured) if measured else math.nan)
+        TableCell(math.fsum(cases[name].value for name in measured) / len(measured) if measured else math.nan)
         for cases in values
     ]
-    return Row((title, group, symbol), (*means, Cell.of(difference), test))
+    return TableRow((title, group, symbol), (*means, TableCell.of(difference), test))
 
 
 def _case(line: Mapping[str, Any], field: str, kind: str) -> CaseValue:
     """Return the value of a line in a metric; failed episodes have none, since a pair needs two that ran."""
-    outcome = Outcome.from_record(line)
+    outcome = EpisodeOutcome.from_record(line)
     number = None if outcome.metrics is None else getattr(outcome.metrics, field)
     value = math.nan if number is None else float(number)
     if kind == "share" and not math.isnan(value):
@@ -293,7 +301,7 @@ def _case(line: Mapping[str, Any], field: str, kind: str) -> CaseValue:
 
 def _score_row(
     title: str, name: str, metric: str, own: Mapping[str, Any], other: Mapping[str, Any], *, paired: bool
-) -> Row:
+) -> TableRow:
     """A score in each run; the interval of the difference where both resampled the same scenes in the same way."""
     first_score, second_score = float(own["metrics"][metric]), float(other["metrics"][metric])
     replicates = [(line.get("replicates") or {}).get(metric) or [] for line in (own, other)]
@@ -311,8 +319,9 @@ def _score_row(
             [second_draw - first_draw for first_draw, second_draw in zip(*replicates, strict=True)],
             difference,
         )
-    return Row(
-        (title, name, metric), (Cell(first_score), Cell(second_score), Cell.of(difference), Cell(p_value, digits=4))
+    return TableRow(
+        (title, name, metric),
+        (TableCell(first_score), TableCell(second_score), TableCell.of(difference), TableCell(p_value, digits=4)),
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
-from ssad.report.tables import Cell
+from ssad.report.tables import TableCell
 
 SERIES = 5  # colours of the style sheet, --s0 to --s4
 
@@ -48,11 +48,11 @@ def dot(x: object, y: object, radius: int, colour: str, tip: str = "") -> str:
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """A number of a line: its place along the axis, 0 to 1, the number, and its tool tip."""
 
     at: float
-    cell: Cell
+    cell: TableCell
     tip: str
 
 
@@ -68,7 +68,7 @@ class Panel:
 
     title: str
     ticks: Sequence[tuple[float, str]]
-    lines: Sequence[Sequence[Point]]
+    lines: Sequence[Sequence[CurvePoint]]
 
 
 PANEL_WIDTH, PANEL_HEIGHT, PANEL_COLUMNS, PANEL_GAP = 178, 118, 4, 34
@@ -196,7 +196,7 @@ class Interval:
     """A number with its interval: number of the series (for its colour), the number, and its tool tip."""
 
     series: int
-    cell: Cell
+    cell: TableCell
     tip: str
 
 
@@ -241,11 +241,11 @@ def interval_plot(groups: Sequence[tuple[str, Sequence[Interval]]], *, label: st
 
 
 @dataclass(frozen=True)
-class Change:
+class MetricChange:
     """A point of a scatter plot: change along each axis with its interval, its name, its group and its tool tip."""
 
-    x: Cell
-    y: Cell
+    x: TableCell
+    y: TableCell
     name: str
     group: str
     tip: str
@@ -256,7 +256,7 @@ NAME_ROOM = (110.0, 13.0)  # pixels of a name
 
 
 def change_plot(
-    changes: Sequence[Change], colours: Mapping[str, str], *, label: str, x_title: str, y_title: str
+    changes: Sequence[MetricChange], colours: Mapping[str, str], *, label: str, x_title: str, y_title: str
 ) -> str:
     """Draw changes of two metrics against each other, with their intervals; as SVG text, "" without a change.
 

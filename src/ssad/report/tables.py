@@ -26,7 +26,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """One number, with the interval and counts of `ssad.metrics.Estimate`; a published number has only its mean."""
 
     mean: float
@@ -39,12 +39,12 @@ class Cell:
     digits: int = 2
 
     @classmethod
-    def of(cls, e: Estimate) -> Cell:
+    def of(cls, e: Estimate) -> TableCell:
         """Return the cell of an estimate."""
         return cls(e.mean, e.low, e.high, e.n, e.failed, e.clusters, e.method)
 
     @classmethod
-    def value(cls, number: float | None, *, digits: int = 2) -> Cell:
+    def value(cls, number: float | None, *, digits: int = 2) -> TableCell:
         """Return the cell of a number without an interval; None: it was not measured."""
         return cls(math.nan if number is None else number, digits=digits)
 
@@ -83,17 +83,17 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A line of a table; `published` marks numbers that are not ours."""
 
     head: tuple[str, ...]
-    cells: tuple[Cell, ...]
+    cells: tuple[TableCell, ...]
     published: bool = False
 
     @classmethod
-    def of_published(cls, head: Sequence[str], numbers: Iterable[float | None]) -> Row:
+    def of_published(cls, head: Sequence[str], numbers: Iterable[float | None]) -> TableRow:
         """Return a row of published numbers; None: the publication has no number there."""
-        return cls(tuple(head), tuple(Cell.value(number) for number in numbers), published=True)
+        return cls(tuple(head), tuple(TableCell.value(number) for number in numbers), published=True)
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Table:
     title: str
     heads: tuple[str, ...]
     columns: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     note: str = ""
     source: str = ""
 
@@ -117,11 +117,11 @@ class Table:
         *,
         rows: Mapping[str, Callable[[Record], object]],
         columns: Mapping[Column, str],
-        metric: Callable[[Sequence[Record], Column], Cell],
+        metric: Callable[[Sequence[Record], Column], TableCell],
         key: Callable[[Record], Hashable] | None = None,
         having: Callable[[Sequence[Record]], bool] | None = None,
-        published: Callable[[Record], Iterable[Row]] | None = None,
-        below: Iterable[Row] = (),
+        published: Callable[[Record], Iterable[TableRow]] | None = None,
+        below: Iterable[TableRow] = (),
         note: str = "",
         source: str = "",
     ) -> Table:
@@ -145,12 +145,12 @@ class Table:
         for record in records:
             group = key(record) if key else tuple(str(factor(record)) for factor in rows.values())
             groups.setdefault(group, []).append(record)
-        table_rows: list[Row] = []
+        table_rows: list[TableRow] = []
         for group_records in groups.values():
             if having is None or having(group_records):
                 first = group_records[0]
                 head = tuple(str(factor(first)) for factor in rows.values())
-                table_rows.append(Row(head, tuple(metric(group_records, column) for column in columns)))
+                table_rows.append(TableRow(head, tuple(metric(group_records, column) for column in columns)))
                 table_rows += published(first) if published else ()
         return cls(name, title, tuple(rows), tuple(columns.values()), (*table_rows, *below), note, source)
 
@@ -163,9 +163,9 @@ class Table:
         *,
         rows: Mapping[str, Callable[[Record], object]],
         columns: Mapping[Column, str],
-        metric: Callable[[Record, Column], Cell],
-        published: Callable[[Record], Iterable[Row]] | None = None,
-        below: Iterable[Row] = (),
+        metric: Callable[[Record, Column], TableCell],
+        published: Callable[[Record], Iterable[TableRow]] | None = None,
+        below: Iterable[TableRow] = (),
         note: str = "",
         source: str = "",
     ) -> Table:

@@ -13,7 +13,7 @@ from PIL import Image
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import atomic_path
-from ssad.core.top_view import Frame, Moment, TopView
+from ssad.core.top_view import Frame, TopView, TopViewScene
 from ssad.core.types import EpisodeTrace
 
 CODECS = ("vp09", "mp4v")  # VP9, which browsers play; where it is missing MPEG-4 part 2, which most players know
@@ -35,7 +35,7 @@ def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (96
         steps_since_contact = None if first_hit is None or step < first_hit else step - int(first_hit)
         trail = pose[max(step - 30, 0) : step + 1, 0, :2]
         yield top_view.draw(
-            Moment(
+            TopViewScene(
                 pose[step],
                 sizes,
                 trace.kind,

@@ -26,7 +26,7 @@ ROOM = 0.6  # share of the free memory for images
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class TrainingImage:
     """One image: a function that reads it (uint8 RGB [H, W, 3]), and its truth."""
 
     read: Callable[[], U8]
@@ -37,7 +37,7 @@ class Item:
 class OnDisk:
     """Images that are read on access: uint8 [n, H, W, 3] for indices [n] or a slice."""
 
-    items: Sequence[Item]
+    items: Sequence[TrainingImage]
     shape: tuple[int, ...]
 
     @property
@@ -62,7 +62,7 @@ class PictureSet:
         return len(self.truth)
 
 
-def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = None) -> PictureSet:
+def fill(items: Sequence[TrainingImage], *, device: str = "cpu", threads: int | None = None) -> PictureSet:
     """Read all images, in parallel, into the fastest memory that has room for them.
 
     That is the device, else the host; if neither has room, images stay on disk and are read on access.
@@ -97,7 +97,7 @@ def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = No
     return PictureSet(images, truth)
 
 
-def _read(items: Sequence[Item], number: int, shape: tuple[int, ...]) -> Tensor:
+def _read(items: Sequence[TrainingImage], number: int, shape: tuple[int, ...]) -> Tensor:
     image = items[number].read()
     if image.shape != shape:
         raise ConfigError(f"picture {number} has the size {image.shape[:2]}, the first {shape[:2]}")
@@ -211,7 +211,7 @@ def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class Augmentation:
     """Geometric augmentation of one image: mirrored, then scaled by `zoom` and moved by `shift` (x, y) pixels."""
 
     mirror: bool
@@ -221,7 +221,7 @@ class Change:
 
 def draw_change(
     recipe: Recipe, size: tuple[int, int], rng: np.random.Generator, *, lens: Tensor | None = None
-) -> Change:
+) -> Augmentation:
     """A random change of a picture of `size` (height, width).
 
     With an intrinsic `lens` [3, 3] the zoom is about the principal point, as a lens zooms: where the ground meets an
@@ -236,11 +236,11 @@ def draw_change(
     if lens is not None:
         crop_position = [float(lens[0, 2]) / size[1], float(lens[1, 2]) / size[0]]
         crop_position[0] = 1.0 - crop_position[0] if mirror else crop_position[0]
-    return Change(mirror, zoom, (crop_position[0] * free_range[0], crop_position[1] * free_range[1] + row_shift))
+    return Augmentation(mirror, zoom, (crop_position[0] * free_range[0], crop_position[1] * free_range[1] + row_shift))
 
 
 def change_truths(
-    truths: Sequence[Truth], changes: Sequence[Change], size: tuple[int, int], *, keep: float
+    truths: Sequence[Truth], changes: Sequence[Augmentation], size: tuple[int, int], *, keep: float
 ) -> list[Truth]:
     """Return the truth of augmented images.
 
@@ -347,7 +347,7 @@ def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
     )
 
 
-def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
+def change_pictures(pictures: Tensor, changes: Sequence[Augmentation]) -> Tensor:
     """Pictures float [B, 3, H, W] after their changes; grey where there is nothing.
 
     Below a zoom of `SHRUNK` samples are taken from the picture averaged to half its size: at full size they would skip

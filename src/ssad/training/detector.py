@@ -19,7 +19,7 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.core import errors, safeio
-from ssad.core.checkpoints import Card, hash_state, load_weights, save_weights, start_from
+from ssad.core.checkpoints import WeightsCard, hash_state, load_weights, save_weights, start_from
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -29,7 +29,7 @@ from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import score_2d, score_3d
-from ssad.training.batches import Item, PictureSet, fill
+from ssad.training.batches import PictureSet, TrainingImage, fill
 from ssad.training.data import nuscenes_items
 from ssad.training.loop import LAST, LOG, Share, read_last, read_rows, train, write_row
 from ssad.training.recipe import Recipe, find_recipe, recipe_data, set_words
@@ -39,7 +39,7 @@ VAL_SCENES = 4  # scenes of a nuScenes data set for validation during training; 
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class DetectorPlan:
     """Plan of a detector training.
 
     Attributes:
@@ -102,7 +102,7 @@ def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
     ]
 
 
-def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
+def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[TrainingImage]]:
     """Return classes and images of a split of recordings.
 
     Raises:
@@ -114,11 +114,11 @@ def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
     data = read_coco(path)
     truths = coco_truth(data)
     return data.classes, [
-        Item(partial(read_image, image.file), truth) for image, truth in zip(data.images, truths, strict=True)
+        TrainingImage(partial(read_image, image.file), truth) for image, truth in zip(data.images, truths, strict=True)
     ]
 
 
-def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
+def run_training(plan: DetectorPlan, *, say: Say = print) -> Iterator[str]:
     """Train a detector, and write OUT/NAME.safetensors with its card.
 
     Args:
@@ -176,7 +176,7 @@ def _free_port() -> int:
         return int(listener.getsockname()[1])
 
 
-def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> None:
+def _worker(rank: int, plan: DetectorPlan, recipe: Recipe, port: int, backend: str) -> None:
     """Run the training in one of several processes."""
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     process_count = plan.gpus
@@ -190,7 +190,7 @@ def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> N
         distributed.destroy_process_group()
 
 
-def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
+def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
     """Run data loading, training and validation. All settings are checked before images are read."""
     sources, options = _items(plan, three=recipe.three)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
@@ -239,7 +239,7 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     if row["epoch"] < row["of"]:
         say(f"stopped after {row['epoch']} of {row['of']} epochs; run it again to go on")
     folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
-    card = Card(
+    card = WeightsCard(
         data="; ".join(map(describe_data, folders)),
         command=command_of(plan),
         seed=recipe.seed,
@@ -276,7 +276,7 @@ def _card_epochs(weights: Path) -> int:
     return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
 
 
-def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:
+def _items(plan: DetectorPlan, *, three: bool) -> tuple[list[TrainingImage], dict[str, Any]]:
     """Pictures of all folders, and options of the detector. ConfigError: none, or options that do nothing."""
     options: dict[str, Any] = {}
     if not three and plan.val_data is not None:
@@ -296,7 +296,7 @@ def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:
     return sources, options
 
 
-def _hash_items(items: Sequence[Item]) -> str:
+def _hash_items(items: Sequence[TrainingImage]) -> str:
     """Of what is to be learned: labels and boxes of all pictures, in their order."""
     digest_state = hashlib.sha256()
     for source in items:
@@ -334,7 +334,7 @@ def describe_data(folder: Path) -> str:
     return " ".join(["ssad record", folder.name, *arguments])
 
 
-def command_of(plan: Plan) -> str:
+def command_of(plan: DetectorPlan) -> str:
     """Return the command that repeats the training, with the names of the folders."""
     arguments = ["ssad", "train", "detector", plan.recipe, "--data", plan.data[0].name]
     for folder in plan.data[1:]:
@@ -351,7 +351,7 @@ def command_of(plan: Plan) -> str:
     return shlex.join([*arguments, *set_words(plan.changes)])
 
 
-def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
+def _validation(plan: DetectorPlan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
     """Metrics of a detector on the validation split."""
     if three:
         root = plan.val_data or plan.data[0]

@@ -19,7 +19,7 @@ import torch
 from pydantic.dataclasses import dataclass
 
 from ssad.core import safeio
-from ssad.core.checkpoints import Card, read_state, save_weights
+from ssad.core.checkpoints import WeightsCard, read_state, save_weights
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.core.schema import VALUES, Above, Part, Whole, checked
@@ -225,7 +225,7 @@ def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dic
 def policy_now(model: Any, learning: Learning) -> Policy:
     """Return the current policy of a model."""
     tensors, policy_config = export(model, learning)
-    return policy_of(Card("", "", learning.seed, (), config=policy_config), tensors, "training")
+    return policy_of(WeightsCard("", "", learning.seed, (), config=policy_config), tensors, "training")
 
 
 def learn(
@@ -462,9 +462,9 @@ def finish(
     best_row = state["best_row"]
     recipe_values = {recipe_field.name: getattr(learning, recipe_field.name) for recipe_field in fields(learning)}
     config = export(model, learning)[1] | recipe_values | {"steps_done": best_row["step"], **(about or {})}
-    draft_card = Card("", "", learning.seed, (), config=config)
+    draft_card = WeightsCard("", "", learning.seed, (), config=config)
     metrics = test(PolicyDriver(policy_of(draft_card, state["best"], str(path.parent)), name=path.stem))
-    card = Card(data=data, command=command, seed=learning.seed, classes=(), metrics=metrics, config=config)
+    card = WeightsCard(data=data, command=command, seed=learning.seed, classes=(), metrics=metrics, config=config)
     save_weights(path, state["best"], card=card)
     draw_curves(path.parent)
     summary = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())

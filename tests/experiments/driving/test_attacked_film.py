@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ssad.core.errors import FormatError, SSADError
-from ssad.core.types import AgentKind, Controller, EpisodeTrace, Limits
+from ssad.core.types import AgentKind, Controller, EpisodeLimits, EpisodeTrace
 from ssad.experiments.driving.attacked_film import attacked_frames, first_ahead
 from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.scene_edit import SceneEdit
@@ -44,7 +44,7 @@ def trace() -> EpisodeTrace:
     """Two steps; another car stands 12 m before the ego."""
     scenario = next(s for s in load_scenarios("precrash") if s.name == "RedlightRunning/00")
     town = load_town("ProvingGround")
-    episode = replace(build_episode(scenario, town, seed=0), limits=Limits(max_steps=2))
+    episode = replace(build_episode(scenario, town, seed=0), limits=EpisodeLimits(max_steps=2))
     (made,) = rollout(World([episode], {town.name: town}), Standing())
     x, y, yaw = made.x.copy(), made.y.copy(), made.yaw.copy()
     cos, sin = np.cos(yaw[:, 0]), np.sin(yaw[:, 0])

@@ -65,7 +65,7 @@ class _File(msgspec.Struct):
 
 
 @dataclass(frozen=True)
-class Results:
+class DetectionResults:
     """A results file.
 
     Attributes:
@@ -84,7 +84,7 @@ class Results:
 
 def read_results(
     path: str | Path, samples: Sequence[str] | None = None, *, subset: bool = False, max_boxes: int = MAX_BOXES
-) -> Results:
+) -> DetectionResults:
     """Read a results file. Velocities may be NaN (also written null).
 
     Args:
@@ -114,7 +114,7 @@ def read_results(
         raise FormatError(f"{path}: sample {unexpected} is not in the split; leave it out or choose its split")
     with uncollected():
         boxes, points = _columns(path, sample_boxes, sample_index, max_boxes=max_boxes)
-    return Results(sample_tokens, boxes, points, meta)
+    return DetectionResults(sample_tokens, boxes, points, meta)
 
 
 def with_ego(boxes: BoxTable, ego: F64) -> BoxTable:

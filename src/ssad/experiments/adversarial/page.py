@@ -22,7 +22,7 @@ from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import NATURAL, SOURCE
 from ssad.report.records import Line, field, metric_of
-from ssad.report.tables import METHODS, Cell, Row, Table
+from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -97,14 +97,14 @@ def careful_table(run: Run) -> Table | None:
 def transfer_table(run: Run) -> Table | None:
     """Return the CR of other systems in the saved scenarios, against the bases; None if none was transferred."""
 
-    def metric(drives: Sequence[tuple[Line, str]], column: str) -> Cell:
+    def metric(drives: Sequence[tuple[Line, str]], column: str) -> TableCell:
         with_adversary, base = (
             {str(line["key"]): _case(line, float(line["transfer"][system][condition])) for line, system in drives}
             for condition in ("found", "base")
         )
         if column == "difference":
-            return Cell.of(paired_difference(with_adversary, base))
-        return Cell.of(estimate((with_adversary if column == "found" else base).values(), "bounded"))
+            return TableCell.of(paired_difference(with_adversary, base))
+        return TableCell.of(estimate((with_adversary if column == "found" else base).values(), "bounded"))
 
     table = Table.pivot(
         "transfer",
@@ -142,7 +142,7 @@ def against_table(run: Run) -> Table | None:
     """Return the CR of each generator minus that of random search, over the same bases."""
     random_lines = {system: lines for (generator, system), lines in _searches(run).items() if generator == RANDOM}
 
-    def metric(lines: Sequence[Line], _: str) -> Cell:
+    def metric(lines: Sequence[Line], _: str) -> TableCell:
         generator_cases, random_cases = (
             {
                 f"{line['cluster']}#{line['spec']['repetition']}": _case(line, _within(line))
@@ -151,7 +151,7 @@ def against_table(run: Run) -> Table | None:
             }
             for search_lines in (lines, random_lines[str(lines[0]["system"])])
         )
-        return Cell.of(paired_difference(generator_cases, random_cases, kind="share"))
+        return TableCell.of(paired_difference(generator_cases, random_cases, kind="share"))
 
     table = Table.pivot(
         "against_random",
@@ -189,7 +189,7 @@ def traffic_table(run: Run) -> Table | None:
     if not natural_lines:
         return None
 
-    def metric(drives: Sequence[tuple[Line, str]], column: str) -> Cell:
+    def metric(drives: Sequence[tuple[Line, str]], column: str) -> TableCell:
         collided = {str(line["key"]): 1.0 - metric_of(line, "survived") for line, _ in drives}
         natural = {str(line["key"]): _case(line, collided[str(line["key"])]) for line, _ in drives}
         adversarial = {
@@ -197,8 +197,12 @@ def traffic_table(run: Run) -> Table | None:
         }
         among_adversaries = drives[0][1] == "Adv.PPO"
         if column == "CR":
-            return Cell.of(estimate((adversarial if among_adversaries else natural).values(), "share"))
-        return Cell.of(paired_difference(adversarial, natural, kind="share")) if among_adversaries else Cell.value(None)
+            return TableCell.of(estimate((adversarial if among_adversaries else natural).values(), "share"))
+        return (
+            TableCell.of(paired_difference(adversarial, natural, kind="share"))
+            if among_adversaries
+            else TableCell.value(None)
+        )
 
     return Table.pivot(
         "traffic",
@@ -212,7 +216,7 @@ def traffic_table(run: Run) -> Table | None:
         columns={"CR": "CR", "increase": "more than in natural traffic"},
         metric=metric,
         below=[
-            Row.of_published((system, "natural" if traffic == "Autopilot" else traffic, town), (rate, None))
+            TableRow.of_published((system, "natural" if traffic == "Autopilot" else traffic, town), (rate, None))
             for (system, traffic), by_town in NATURAL.items()
             for town, (rate, _, _) in by_town.items()
         ],
@@ -273,9 +277,9 @@ def _within(line: Line, most: float = math.inf) -> float:
     return float(bool(metrics["CR"]) and metrics["rollouts"] <= most)
 
 
-def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> Cell:
+def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> TableCell:
     """Return the mean of a value of searches, over their base scenarios."""
-    return Cell.of(estimate([_case(line, value(line)) for line in lines], kind))
+    return TableCell.of(estimate([_case(line, value(line)) for line in lines], kind))
 
 
 def _case(line: Line, value: float) -> CaseValue:

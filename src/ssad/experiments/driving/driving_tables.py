@@ -11,7 +11,7 @@ from ssad.experiments.driving.episodes import DrivingRun
 from ssad.metrics import FAMILIES, METRICS, Estimate
 from ssad.metrics.driving import DIVISORS, normalised
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS, SOURCE
-from ssad.report.tables import METHODS, Cell, Row, Table
+from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
 SHOWN = ("CR", "OR", "DR", "RC")
 AVERAGE = FAMILIES["pre-crash"]
@@ -23,10 +23,10 @@ def precrash_table(run: DrivingRun) -> Table | None:
     if not systems:
         return None
 
-    def published(row: tuple[str, str]) -> list[Row]:
+    def published(row: tuple[str, str]) -> list[TableRow]:
         symbol, system = row
         rows_of_paper = PRECRASH[symbol].items() if system == systems[-1] else ()
-        return [Row.of_published((symbol, name), values) for name, values in rows_of_paper]
+        return [TableRow.of_published((symbol, name), values) for name, values in rows_of_paper]
 
     return Table.listing(
         "precrash",
@@ -42,9 +42,9 @@ def precrash_table(run: DrivingRun) -> Table | None:
     )
 
 
-def _cell(run: DrivingRun, key: tuple[str, str], symbol: str) -> Cell:
+def _cell(run: DrivingRun, key: tuple[str, str], symbol: str) -> TableCell:
     """Return a metric of a system in a group; n/a where the system has no episodes in it."""
-    return Cell.of(run.numbers[key][symbol]) if key in run.numbers else Cell.value(None)
+    return TableCell.of(run.numbers[key][symbol]) if key in run.numbers else TableCell.value(None)
 
 
 def _counts(run: DrivingRun, systems: list[str]) -> str:
@@ -79,7 +79,7 @@ def natural_table(run: DrivingRun) -> Table | None:
         columns={symbol: symbol for symbol in SHOWN},
         metric=partial(_cell, run),
         below=[
-            Row.of_published((system, traffic, town), (*numbers, None))
+            TableRow.of_published((system, traffic, town), (*numbers, None))
             for (system, traffic), by_town in NATURAL.items()
             for town, numbers in by_town.items()
         ],
@@ -109,11 +109,11 @@ def full_table(run: DrivingRun) -> Table:
 def normalised_table(run: DrivingRun) -> Table:
     """Return the terms of SafeBench's overall score, each 0 (best) to 1 (worst), and the two scores made of them."""
 
-    def metric(key: tuple[str, str], column: str) -> Cell:
+    def metric(key: tuple[str, str], column: str) -> TableCell:
         estimate = run.numbers[key]["OS" if column == "FREA" else column]
         if column in ("OR", "DR", "TS"):
-            return Cell.of(_scaled(column, estimate))
-        return Cell.of(estimate.scaled(-1.0, 1.0) if column in ("RC", "FREA") else estimate)
+            return TableCell.of(_scaled(column, estimate))
+        return TableCell.of(estimate.scaled(-1.0, 1.0) if column in ("RC", "FREA") else estimate)
 
     return Table.listing(
         "normalised",

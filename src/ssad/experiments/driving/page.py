@@ -16,7 +16,7 @@ from ssad.report.artefacts import pictures
 from ssad.report.figures import Interval, interval_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
-from ssad.report.tables import Cell, Table
+from ssad.report.tables import Table, TableCell
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -87,7 +87,7 @@ def _tile(run: DrivingRun, system: str) -> dict[str, Any]:
     for family, title in FAMILY_TITLES.items():
         values = run.average(system, family)
         if values:
-            cells = {symbol: Cell.of(values[symbol]) for symbol in ("CR", "RC", "DS")}
+            cells = {symbol: TableCell.of(values[symbol]) for symbol in ("CR", "RC", "DS")}
             has_several = (
                 len(
                     {
@@ -111,7 +111,7 @@ def _collision_rates(run: DrivingRun) -> list[tuple[str, list[Interval]]]:
     """Return the collision rate of every system in every group and average."""
 
     def interval(number: int, system: str, group: str) -> Interval:
-        cell = Cell.of(run.numbers[system, group]["CR"])
+        cell = TableCell.of(run.numbers[system, group]["CR"])
         return Interval(number, cell, f"{system}: {cell.text}, {cell.tip}")
 
     return [

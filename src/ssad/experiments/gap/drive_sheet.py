@@ -44,11 +44,11 @@ def drive_sheet(trace: EpisodeTrace, seen: Perceived, shots: Sequence[tuple[floa
         if len(contact_steps)
         else [end_time * quarter / 4 for quarter in (1, 2, 3)]
     )
-    return np.vstack([_row(Seen("", trace, seen, shots), time, graph) for time in row_times])
+    return np.vstack([_row(RecordedDrive("", trace, seen, shots), time, graph) for time in row_times])
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RecordedDrive:
     """Drive with the perception of its driver.
 
     Attributes:
@@ -69,7 +69,7 @@ class Seen:
         return (len(self.trace.x) - 1) * self.trace.dt
 
 
-def drive_film(drives: Sequence[Seen], graph: LaneGraph, *, every: float = 0.2) -> Iterator[U8]:
+def drive_film(drives: Sequence[RecordedDrive], graph: LaneGraph, *, every: float = 0.2) -> Iterator[U8]:
     """Drives side by side, moment by moment; one that has ended stays at its last moment.
 
     Args:
@@ -85,7 +85,7 @@ def drive_film(drives: Sequence[Seen], graph: LaneGraph, *, every: float = 0.2) 
         yield np.hstack([_row(drive, min(frame_index * every, drive.end), graph, exact=True) for drive in drives])
 
 
-def _row(drive: Seen, time: float, graph: LaneGraph, *, exact: bool = False) -> U8:
+def _row(drive: RecordedDrive, time: float, graph: LaneGraph, *, exact: bool = False) -> U8:
     """Draw a moment of a drive; unless `exact`, all of it is shown at the time of the nearest image."""
     trace, perceived = drive.trace, drive.perceived
     shown_time, image = min(drive.shots, key=lambda timed_image: abs(timed_image[0] - time))

@@ -20,7 +20,7 @@ from ssad.core.traces import first_difference, load_trace
 from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
 from ssad.experiments.gap import page
-from ssad.experiments.gap.drive_sheet import Seen, drive_film, drive_sheet
+from ssad.experiments.gap.drive_sheet import RecordedDrive, drive_film, drive_sheet
 from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired
 from ssad.experiments.gap.verdict import verdict
 from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
@@ -242,7 +242,7 @@ class Gap(ScenarioKind):
                     if driven_cell is cell and spec["severity"]
                     else "clean"
                 )
-                drives.append(Seen(title, trace, perception.perceived(0), images))
+                drives.append(RecordedDrive(title, trace, perception.perceived(0), images))
         filmed_drives = [drive for drive in drives if drive.shots]
         film = (drive_film(filmed_drives, graph, every=EVERY), EVERY) if filmed_drives else None
         driver_perception = drives[-1] if drives and drives[-1].trace is replayed_traces[-1] else None

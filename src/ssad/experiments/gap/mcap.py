@@ -22,7 +22,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import matrix_to_quaternion, yaw_to_quaternion
 from ssad.core.types import F64, U8, AgentKind, EpisodeTrace, LaneType
 from ssad.drivers.perceiving.objects import SIZES
-from ssad.experiments.gap.drive_sheet import Seen
+from ssad.experiments.gap.drive_sheet import RecordedDrive
 
 WORLD, EGO, ABOVE = "world", "ego", "above"
 AHEAD: Final = 50.0  # m of the route that are shown as the plan
@@ -51,7 +51,7 @@ def write_mcap(
     trace: EpisodeTrace,
     graph: LaneGraph,
     *,
-    seen: Seen | None = None,
+    seen: RecordedDrive | None = None,
     above: Iterable[U8] = (),
 ) -> Path:
     """Write a drive as MCAP, whole or not at all; its clock starts at 0.
@@ -121,7 +121,7 @@ def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
         yield time, "/plan", _update("plan", time, lines=[line], words=controls)
 
 
-def _perceived(seen: Seen) -> Iterator[Message]:
+def _perceived(seen: RecordedDrive) -> Iterator[Message]:
     """What the driver saw, found and believed."""
     for seconds, image in seen.shots:  # none of a perceiver without cameras
         name, camera = next(iter(seen.perceived.cameras.items()))

@@ -7,7 +7,7 @@ import math
 from ssad.experiments.gap import page as gap
 from ssad.report.load import Run
 from ssad.report.records import metric_of
-from ssad.report.tables import Cell
+from ssad.report.tables import TableCell
 from ssad.report.verdict import mean_of
 
 
@@ -43,10 +43,10 @@ def verdict(run: Run) -> list[str]:
     return sentences
 
 
-def _known(change: Cell) -> bool:
+def _known(change: TableCell) -> bool:
     return change.method not in ("range", "none") and bool(change.interval)
 
 
-def _sure(change: Cell) -> str:
+def _sure(change: TableCell) -> str:
     """Return a change with its interval, if there is one."""
     return f"{change.mean:+.2f} {change.interval}" if _known(change) else f"{change.mean:+.2f}"

@@ -71,7 +71,7 @@ def picture_shifts(names: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ShiftedImage:
     """One picture under one shift: the unit of work of a worker.
 
     Attributes:
@@ -169,12 +169,12 @@ def shift_pictures(
 
 def _picture(
     path: Path, source: Path, root: Path, *, how: tuple[str, Strength], settings: Mapping[str, Any]
-) -> Picture:
+) -> ShiftedImage:
     shift, strength = how
     spec = ShiftSpec(
         shift, 1 if strength == "random" else int(strength), seed=settings["seed"], calibration=settings["calibration"]
     )
-    return Picture(
+    return ShiftedImage(
         path,
         path.relative_to(source).as_posix(),
         root.absolute(),
@@ -185,11 +185,11 @@ def _picture(
     )
 
 
-def _name(one: Picture) -> str:
+def _name(one: ShiftedImage) -> str:
     return f"{one.root.name}/{one.key}"
 
 
-def _written(one: Picture) -> dict[str, Any]:
+def _written(one: ShiftedImage) -> dict[str, Any]:
     """In a worker: shift one picture; what is recorded of it."""
     spec = replace(one.spec, severity=random_severity(one.spec, one.key, one.key)) if one.random else one.spec
     quiet_warp()
@@ -209,7 +209,7 @@ def _written(one: Picture) -> dict[str, Any]:
     return {"status": "ok", "severity": spec.severity, **details}
 
 
-def _encoded(image: U8, one: Picture) -> bytes:
+def _encoded(image: U8, one: ShiftedImage) -> bytes:
     if one.path.suffix.lower() not in JPEG:
         return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1].tobytes())
     chroma = one.subsampling

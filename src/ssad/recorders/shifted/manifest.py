@@ -81,7 +81,7 @@ def digest_file(path: Path) -> str:
 
 
 @dataclass(slots=True)
-class Tally:
+class ManifestCounts:
     """Counts over the lines of a root, added scene by scene so that only one scene is in memory."""
 
     scenes: dict[str, str] = field(default_factory=dict)
@@ -115,7 +115,7 @@ class Tally:
 
 
 def page(
-    identity: Mapping[str, Any], source: Mapping[str, Any], tally: Tally, *, labels: str, transformed: str
+    identity: Mapping[str, Any], source: Mapping[str, Any], tally: ManifestCounts, *, labels: str, transformed: str
 ) -> dict[str, Any]:
     """Build manifest.json of a complete root: identity, source, counts, and hashes of lines and new boxes."""
     return {

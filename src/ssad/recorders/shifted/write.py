@@ -18,7 +18,16 @@ from ssad.datasets.nuscenes.tables import stream, table_path
 from ssad.engine.pool import open_pool, run_all
 from ssad.engine.store import locked
 from ssad.recorders.parts import TIME_LIMIT, claim
-from ssad.recorders.shifted.manifest import FOLDER, PAGE, TABLE, Tally, digest_file, page, read_lines, shard_path
+from ssad.recorders.shifted.manifest import (
+    FOLDER,
+    PAGE,
+    TABLE,
+    ManifestCounts,
+    digest_file,
+    page,
+    read_lines,
+    shard_path,
+)
 from ssad.recorders.shifted.options import Options, Shard, Strength
 from ssad.recorders.shifted.scene_writer import UNFINISHED, check_folders, finished, link, make_shard
 from ssad.scenarios.static.shifts.sun import NO_SUN
@@ -158,7 +167,7 @@ def _finish(
     The page covers the scenes of earlier runs as well, if they are whole: scenes may be spread over runs.
     """
     root = options.root(shift, severity)
-    tally, scene_boxes = Tally(), dict[str, msgspec.Raw]()
+    tally, scene_boxes = ManifestCounts(), dict[str, msgspec.Raw]()
     for scene in known:
         scene_labels = finished(root, scene)
         if scene_labels is None and scene in scenes:

@@ -46,7 +46,7 @@ def attack_record(
     Raises:
         ConfigError: The attack is about an object that these scenes do not have.
     """
-    scorer = Eye(examination, system)
+    scorer = BoxScorer(examination, system)
     clean_scenes = [SceneCondition(condition.scene) for condition in scenes[: len(scenes) // max(len(specs), 1)]]
     # The clean boxes are a by-product of other cells; missing ones are found now.
     for condition in clean_scenes:
@@ -82,7 +82,7 @@ def attack_record(
     }
 
 
-class Eye:
+class BoxScorer:
     """Comparisons of the boxes of a system: in the world for 3D detectors, in the images for 2D detectors.
 
     Attributes:

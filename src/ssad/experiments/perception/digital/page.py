@@ -39,12 +39,12 @@ from ssad.experiments.perception.digital.tables import (
 from ssad.experiments.perception.shifts.page import CLASSES, interval_note, replicates_of
 from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit
 from ssad.report.artefacts import pictures
-from ssad.report.figures import Panel, Point, panels
+from ssad.report.figures import CurvePoint, Panel, panels
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import DETECTORS, DIGITAL_STEPS
 from ssad.report.paper import DIGITAL as PUBLISHED
-from ssad.report.tables import Cell, Row, Table
+from ssad.report.tables import Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -102,9 +102,9 @@ def score_columns(run: DigitalRun) -> dict[tuple[str, str], str]:
 def main_table(run: DigitalRun) -> Table:
     """Return attack x detector: mAP and NDS, the paper's rows between ours."""
 
-    def published(setting: Setting) -> list[Row]:
+    def published(setting: Setting) -> list[TableRow]:
         found = published_scores(run, setting)
-        return [Row.of_published(*found)] if found else []
+        return [TableRow.of_published(*found)] if found else []
 
     note = f"Percent; each camera image is attacked by itself, its stored 8-bit picture is scored; {interval_note(run)}"
     note += run.about_flat
@@ -130,12 +130,12 @@ def lost_table(run: DigitalRun) -> Table:
     """Return attack x detector: the share of the clean score that is lost, the paper's shares between ours."""
     clean = published_scores(run, Setting())
 
-    def published(setting: Setting) -> list[Row]:
+    def published(setting: Setting) -> list[TableRow]:
         attacked = published_scores(run, setting)
         if attacked is None or clean is None:
             return []
         pairs = zip(attacked[1], clean[1], strict=True)
-        return [Row.of_published(attacked[0], [100 * (1 - score / clean_score) for score, clean_score in pairs])]
+        return [TableRow.of_published(attacked[0], [100 * (1 - score / clean_score) for score, clean_score in pairs])]
 
     return Table.listing(
         "lost",
@@ -153,10 +153,12 @@ def lost_table(run: DigitalRun) -> Table:
 def effort_table(run: DigitalRun) -> Table:
     """Return the cost of each attack, and its effect on the loss that it ascends."""
 
-    def metric(row: DetectorSetting, name: str) -> Cell:
+    def metric(row: DetectorSetting, name: str) -> TableCell:
         value = run.records[row].get(name)
         scale = 100 if name in ("used", "gradient_error") else 1
-        return Cell.value(None if value is None else float(value) * scale, digits=0 if name in ("idle", "batch") else 2)
+        return TableCell.value(
+            None if value is None else float(value) * scale, digits=0 if name in ("idle", "batch") else 2
+        )
 
     def direct(row: DetectorSetting) -> bool:
         setting = row[1]
@@ -191,9 +193,9 @@ def short_of(run: DigitalRun) -> str:
 def every_table(run: DigitalRun) -> Table:
     """Return every cell."""
 
-    def metric(row: DetectorSetting, name: str) -> Cell:
+    def metric(row: DetectorSetting, name: str) -> TableCell:
         if name == "lost":
-            return lost_cell(run, *row, "mAP") if row[1].attack else Cell.value(None)
+            return lost_cell(run, *row, "mAP") if row[1].attack else TableCell.value(None)
         return metric_cell(run.record(*row), name)
 
     return Table.listing(
@@ -281,7 +283,7 @@ def audit_table(verdict: Verdict) -> Table:
         RULES,
         rows={"Rule": lambda rule: RULES[rule][0]},
         columns={"comparisons": "comparisons", "faults": "faults"},
-        metric=lambda rule, column: Cell(faults[rule] if column == "faults" else verdict.compared[rule], digits=0),
+        metric=lambda rule, column: TableCell(faults[rule] if column == "faults" else verdict.compared[rule], digits=0),
         note=" ".join([verdict.text, *(f"{fault.detector}: {fault.text}." for fault in verdict.faults)]),
     )
 
@@ -315,7 +317,7 @@ def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP
             ]
             lines.append(
                 [
-                    Point(value / axis_values[-1], metric_cell(record, metric), f"{detector}, {what} {value:g}")
+                    CurvePoint(value / axis_values[-1], metric_cell(record, metric), f"{detector}, {what} {value:g}")
                     for value, record in zip(axis_values, records, strict=True)
                 ]
             )
@@ -365,8 +367,8 @@ def tiles(run: DigitalRun) -> list[dict[str, Any]]:
                 "mAP": metric_cell(clean, "mAP"),
                 "NDS": metric_cell(clean, "NDS"),
                 "worst": f"{title_of(strongest)}; {size_of(strongest)}" if strongest else "no attack ran",
-                "left": metric_cell(run.record(detector, strongest), "mAP") if strongest else Cell(math.nan),
-                "lost": lost_cell(run, detector, strongest, "mAP") if strongest else Cell(math.nan),
+                "left": metric_cell(run.record(detector, strongest), "mAP") if strongest else TableCell(math.nan),
+                "lost": lost_cell(run, detector, strongest, "mAP") if strongest else TableCell(math.nan),
             }
         )
     return entries

@@ -11,7 +11,7 @@ from ssad.core.registry import label_of, split_weights
 from ssad.experiments.perception.shifts.page import cell_of, replicates_of
 from ssad.metrics import replicate_difference
 from ssad.report.load import Run
-from ssad.report.tables import Cell
+from ssad.report.tables import TableCell
 
 TITLES = {
     "fgsm": "FGSM",
@@ -217,31 +217,31 @@ def circumstances(setting: Setting) -> str:
     return ", ".join(part for part in [*parts, awareness if setting.defence else ""] if part)
 
 
-def metric_cell(record: Mapping[str, Any] | None, metric: str) -> Cell:
+def metric_cell(record: Mapping[str, Any] | None, metric: str) -> TableCell:
     """Return a metric in percent with its interval over the record's own scenes; n/a where there is none."""
-    return Cell(math.nan) if record is None else cell_of(Resampling(int(record.get("scenes", 0))), record, metric)
+    return TableCell(math.nan) if record is None else cell_of(Resampling(int(record.get("scenes", 0))), record, metric)
 
 
-def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> Cell:
+def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> TableCell:
     """Return the share of the clean score that an attack removed, percent; the interval from paired replicates.
 
     A score that more than doubled has no interval.
     """
     clean, attacked = run.clean(detector, setting), run.record(detector, setting)
     if clean is None or attacked is None or not clean["metrics"].get(metric) or attacked["metrics"].get(metric) is None:
-        return Cell(math.nan)
+        return TableCell(math.nan)
     pairs = zip(replicates_of(clean, metric), replicates_of(attacked, metric), strict=True)
     value = 1.0 - attacked["metrics"][metric] / clean["metrics"][metric]
     if value < -1.0:  # else it lies in [-1, 1], as a difference of two scores does
-        return Cell(100.0 * value)
+        return TableCell(100.0 * value)
     return _difference(value, [1.0 - after / before for before, after in pairs if before > 0], attacked)
 
 
-def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> Cell:
+def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> TableCell:
     """Return how much higher the first of two detectors scores, in points; the interval from paired replicates."""
     first, second = (run.record(name, setting) for name in detectors)
     if first is None or second is None or first["metrics"].get(metric) is None or second["metrics"].get(metric) is None:
-        return Cell(math.nan)
+        return TableCell(math.nan)
     pairs = zip(replicates_of(first, metric), replicates_of(second, metric), strict=True)
     return _difference(
         first["metrics"][metric] - second["metrics"][metric],
@@ -250,6 +250,6 @@ def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, m
     )
 
 
-def _difference(value: float, replicates: Sequence[float], record: Mapping[str, Any]) -> Cell:
+def _difference(value: float, replicates: Sequence[float], record: Mapping[str, Any]) -> TableCell:
     interval = replicate_difference(value, replicates, n=record["n"], clusters=int(record.get("scenes", 0)))
-    return Cell.of(interval.scaled(100.0))
+    return TableCell.of(interval.scaled(100.0))

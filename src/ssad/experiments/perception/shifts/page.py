@@ -17,12 +17,12 @@ from ssad.metrics.intervals import MIN_CLUSTERS
 from ssad.metrics.rank import family_correlation
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
 from ssad.report.artefacts import pictures
-from ssad.report.figures import Panel, Point, panels
+from ssad.report.figures import CurvePoint, Panel, panels
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import DETECTORS
 from ssad.report.paper import SHIFTS as PUBLISHED
-from ssad.report.tables import Cell, Row, Table
+from ssad.report.tables import Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -107,19 +107,19 @@ def load_detection_run(run: Run) -> DetectionRun:
     return DetectionRun(run, records)
 
 
-def score_cell(run: Resampled, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> Cell:
+def score_cell(run: Resampled, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> TableCell:
     """Return a score in percent with its interval; all intervals of this page are made here."""
-    return Cell.of(replicate_estimate(value, replicates, n=n, clusters=run.scenes, bounded=bounded).scaled(100.0))
+    return TableCell.of(replicate_estimate(value, replicates, n=n, clusters=run.scenes, bounded=bounded).scaled(100.0))
 
 
-def cell_of(run: Resampled, record: Mapping[str, Any] | None, metric: str) -> Cell:
+def cell_of(run: Resampled, record: Mapping[str, Any] | None, metric: str) -> TableCell:
     """Return a metric in percent with its interval; n/a where there is none."""
     value = None if record is None else record["metrics"].get(metric)
     if record is None or value is None:
-        return Cell(math.nan)
+        return TableCell(math.nan)
     replicates, interval = replicates_of(record, metric), (record.get("intervals") or {}).get(metric)
     if not replicates and interval:
-        return Cell(100 * value, 100 * interval[0], 100 * interval[1], record["n"], method="given")
+        return TableCell(100 * value, 100 * interval[0], 100 * interval[1], record["n"], method="given")
     return score_cell(run, value, replicates, record["n"])
 
 
@@ -128,7 +128,7 @@ def replicates_of(record: Mapping[str, Any], metric: str) -> list[float]:
     return (record.get("replicates") or {}).get(metric) or []
 
 
-def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
+def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> TableCell:
     """Return a shift's number: at the random severity if that ran, else the mean over severities."""
     if not shift or run.record(detector, shift, "random") is not None:
         return cell_of(run, run.record(detector, shift, "random"), metric)
@@ -138,18 +138,18 @@ def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> C
         or len(records) < len(run.numbers)
         or any(record["metrics"].get(metric) is None for record in records)
     ):
-        return Cell(math.nan)
+        return TableCell(math.nan)
     mean = math.fsum(record["metrics"][metric] for record in records) / len(records)
     replicates = [replicates_of(record, metric) for record in records]
     means = [math.fsum(draw) / len(draw) for draw in zip(*replicates, strict=True)] if all(replicates) else []
     return score_cell(run, mean, means, records[0]["n"])
 
 
-def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
+def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> TableCell:
     """Share of the clean score that is left under a shift, percent; the interval from paired replicates."""
     clean, shifted = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
     if clean is None or math.isnan(shifted.mean) or not clean["metrics"].get(metric):
-        return Cell(math.nan)
+        return TableCell(math.nan)
     random_record = run.record(detector, shift, "random")
     records = (
         [random_record]
@@ -189,11 +189,11 @@ def main_table(run: DetectionRun) -> Table:
     """Return shift x detector: mAP and NDS, the paper's rows between ours."""
     names = published_names(run)
 
-    def published(shift: str) -> list[Row]:
+    def published(shift: str) -> list[TableRow]:
         if shift not in PUBLISHED or not any(names):
             return []
         scores = [PUBLISHED[shift].get(name, (None, None)) for name in names]
-        return [Row.of_published((run.family(shift), title_of(shift)), chain.from_iterable(scores))]
+        return [TableRow.of_published((run.family(shift), title_of(shift)), chain.from_iterable(scores))]
 
     if "random" not in run.suite["severities"]:
         strength = f"mean over severities {', '.join(run.numbers)}"
@@ -230,7 +230,7 @@ def left_table(run: DetectionRun) -> Table:
     names = published_names(run)
     has_published = any(names) and any(shift in PUBLISHED for shift in run.shifts)
 
-    def published(shift: str) -> list[Row]:
+    def published(shift: str) -> list[TableRow]:
         if shift not in PUBLISHED or not any(names):
             return []
         shares = [
@@ -238,7 +238,7 @@ def left_table(run: DetectionRun) -> Table:
             for name in names
             for number in (0, 1)
         ]
-        return [Row.of_published((run.family(shift), title_of(shift)), shares)]
+        return [TableRow.of_published((run.family(shift), title_of(shift)), shares)]
 
     return Table.listing(
         "left",
@@ -265,10 +265,10 @@ def order_table(run: DetectionRun) -> Table | None:
     if len(shifts) < 3 or not published_by_detector:
         return None
 
-    def metric(detector: str, score: str) -> Cell:
+    def metric(detector: str, score: str) -> TableCell:
         scores = [summary_cell(run, detector, shift, score).mean for shift in shifts]
         published = [PUBLISHED[shift][published_by_detector[detector]][SCORES.index(score)] for shift in shifts]
-        return Cell.of(family_correlation(scores, published, shifts))
+        return TableCell.of(family_correlation(scores, published, shifts))
 
     return Table.listing(
         "order",
@@ -316,10 +316,10 @@ def car_table(run: DetectionRun) -> Table:
 def class_table(run: DetectionRun) -> Table:
     """Return the AP of each class and the errors of true positives on the clean data."""
 
-    def metric(detector: str, column: str) -> Cell:
+    def metric(detector: str, column: str) -> TableCell:
         record = run.record(detector, "", "0")
         if column in ERRORS:
-            return Cell.value(record["metrics"].get(column) if record else None)
+            return TableCell.value(record["metrics"].get(column) if record else None)
         return cell_of(run, record, column)
 
     return Table.listing(
@@ -355,7 +355,7 @@ def robustness_table(run: DetectionRun) -> Table | None:
     def scores(detector: str, number: Callable[[Mapping[str, Any]], float]) -> dict[str, list[float]]:
         return {shift: [number(record) for record in records[detector, shift]] for shift in ["", *run.shifts]}
 
-    def metric(detector: str, column: tuple[str, str]) -> Cell:
+    def metric(detector: str, column: tuple[str, str]) -> TableCell:
         name, score = column
 
         def value(number: Callable[[Mapping[str, Any]], float]) -> float:
@@ -407,7 +407,7 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
     for shift in run.shifts:
         lines = [
             [
-                Point(
+                CurvePoint(
                     int(severity) / 5,
                     cell_of(run, run.record(detector, shift if severity != "0" else "", severity), metric),
                     f"{detector}, {title_of(shift)} {severity}",
@@ -435,7 +435,7 @@ def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
                 "name": detector,
                 "mAP": cell_of(run, clean, "mAP"),
                 "NDS": cell_of(run, clean, "NDS"),
-                "mRR": robust.rows[number].cells[1] if robust else Cell(math.nan),
+                "mRR": robust.rows[number].cells[1] if robust else TableCell(math.nan),
                 "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else "",
             }
         )
