@@ -48,7 +48,7 @@ def test_rows_are_left_out_by_a_condition_on_all_their_records() -> None:
         rows={"System": field("system"), "Town": field("town")},
         columns={"A": "in A"},
         metric=share,
-        having=lambda lines: len(lines) > 1,
+        condition=lambda lines: len(lines) > 1,
     )
     assert [row.head for row in table.rows] == [("b", "A")]
 
@@ -73,7 +73,7 @@ def test_published_rows_follow_the_row_of_a_record_and_others_stand_below() -> N
         columns={"A": "A", "B": "B"},
         metric=share,
         published=published,
-        below=[TableRow.of_published(["others"], (1, 1))],
+        footer_rows=[TableRow.of_published(["others"], (1, 1))],
         source="somewhere",
     )
     assert [row.head[0] for row in table.rows] == ["b", "the paper", "a", "others"]

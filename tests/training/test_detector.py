@@ -56,7 +56,9 @@ def done(clips: Path, shared: Shared) -> Path:
     """A finished training."""
 
     def make(out: Path) -> None:
-        list(run_training(DetectorPlan("yolov5n", (clips,), out, changes=SHORT, device="cpu"), say=lambda line: None))
+        list(
+            run_training(DetectorPlan("yolov5n", (clips,), out, changes=SHORT, device="cpu"), report=lambda line: None)
+        )
 
     return shared("trained", make)
 
@@ -79,9 +81,9 @@ def test_the_card_tells_what_the_first_weights_were_made_of(done: Path, clips: P
     more = DetectorPlan(
         "yolov5n", (clips,), tmp_path / "a", changes=(*SHORT, ("epochs", 1)), weights=first, device="cpu"
     )
-    list(run_training(more, say=lambda line: None))
+    list(run_training(more, report=lambda line: None))
     second = tmp_path / "a" / "yolov5n.safetensors"
-    list(run_training(replace(more, out=tmp_path / "b", weights=second), say=lambda line: None))
+    list(run_training(replace(more, out=tmp_path / "b", weights=second), report=lambda line: None))
     cards = [read_card(path) for path in (first, second, tmp_path / "b" / "yolov5n.safetensors")]
     known = [
         {"data": c.data, "command": c.command, "hash": c.hash, "epochs_done": n}
@@ -102,7 +104,7 @@ def test_first_weights_with_a_page_that_is_no_card(text: str, tmp_path: Path) ->
 def test_a_finished_training_does_nothing_more(done: Path, clips: Path) -> None:
     before = {path.name: path.stat().st_mtime_ns for path in done.iterdir()}
     said: list[str] = []
-    list(run_training(DetectorPlan("yolov5n", (clips,), done, changes=SHORT, device="cpu"), say=said.append))
+    list(run_training(DetectorPlan("yolov5n", (clips,), done, changes=SHORT, device="cpu"), report=said.append))
     assert said == ["all 2 epochs are done, and yolov5n.safetensors is there"]
     assert {path.name: path.stat().st_mtime_ns for path in done.iterdir()} == before
 
@@ -142,7 +144,7 @@ def test_what_is_missing_is_said_before_anything_is_read(
         (replace(flat, changes=(("options", {"depth": 50}),)), "unexpected keyword argument 'depth'"),
     ):
         with pytest.raises((ConfigError, FormatError), match=words) as error:
-            list(run_training(plan, say=lambda line: None))
+            list(run_training(plan, report=lambda line: None))
         assert "\n" not in str(error.value)
 
 
@@ -152,7 +154,7 @@ def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypat
     first = SHIPPED / "pgd-det-light.safetensors"
     plan = DetectorPlan("pgd-det-light", (drives,), tmp_path, changes=changes, weights=first, device="cpu", seconds=0.0)
     said: list[str] = []
-    list(run_training(plan, say=said.append))
+    list(run_training(plan, report=said.append))
     assert "pgd-det-light.safetensors: 8 weights do not fit and start fresh: " in said[0]
     fresh = {name.split(".")[1] for name in said[0].split("fresh: ")[1].split(", ")}
     assert fresh == {"conv_regs", "conv_dir_cls_prev", "conv_dir_cls"}
@@ -169,7 +171,7 @@ def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypat
 
 def test_a_3d_detector_learns_from_several_data_sets(drives: Path) -> None:
     (one, _), (two, _) = (
-        training._items(DetectorPlan("fcos3d-light", n * (drives,), Path("out")), three=True) for n in (1, 2)
+        training._items(DetectorPlan("fcos3d-light", n * (drives,), Path("out")), is_3d=True) for n in (1, 2)
     )
     assert len(two) == 2 * len(one) > 0
 

@@ -38,13 +38,13 @@ from ssad.training.batches import (
     repeats,
 )
 from ssad.training.detector import parse_changes
-from ssad.training.loop import LAST, LOG, train, weighed
+from ssad.training.loop import LAST_CHECKPOINT, LOG, train, weighed
 from ssad.training.recipe import RECIPES, Recipe, find_recipe, set_words
 
 
 def change_truth(truth: Truth, change: Augmentation, size: tuple[int, int], *, keep: float) -> Truth:
     """Truth of one changed picture."""
-    return change_truths([truth], [change], size, keep=keep)[0]
+    return change_truths([truth], [change], size, min_visible_share=keep)[0]
 
 
 def same(a: Any, b: Any) -> bool:
@@ -126,7 +126,7 @@ def test_the_log_has_a_line_an_epoch(tmp_path: Path) -> None:
         return {"AP50": 0.25}
 
     recipe = replace(RECIPE, epochs=3, validate=2)
-    train(fresh(), bank(), recipe, out=tmp_path, validate=validate, say=said.append)
+    train(fresh(), bank(), recipe, out=tmp_path, validate=validate, report=said.append)
     rows = [json.loads(line) for line in (tmp_path / LOG).read_text().splitlines()]
     assert [row["epoch"] for row in rows] == [1, 2, 3]
     assert all({"lr", "images_s", "loss_box", "loss_obj", "loss_cls"} <= row.keys() for row in rows)
@@ -147,7 +147,7 @@ def test_a_lost_epoch_is_logged_once(tmp_path: Path) -> None:
 
 def test_another_recipe_in_the_same_folder_is_one_line(tmp_path: Path) -> None:
     train(fresh(), bank(), RECIPE, out=tmp_path, seconds=0.0)
-    with pytest.raises(FormatError, match=f"{LAST}: of another recipe; choose another folder") as caught:
+    with pytest.raises(FormatError, match=f"{LAST_CHECKPOINT}: of another recipe; choose another folder") as caught:
         train(fresh(), bank(), replace(RECIPE, lr=1e-3), out=tmp_path)
     assert "\n" not in str(caught.value)
 
@@ -155,7 +155,7 @@ def test_another_recipe_in_the_same_folder_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["text", "empty", "cut", "list", "pickle", "other"])
 def test_a_broken_checkpoint_is_one_line(kind: str, tmp_path: Path) -> None:
     train(fresh(), bank(4), replace(RECIPE, epochs=2), out=tmp_path, seconds=0.0)
-    last = tmp_path / LAST
+    last = tmp_path / LAST_CHECKPOINT
     if kind == "cut":
         last.write_bytes(last.read_bytes()[: last.stat().st_size // 2])
     elif kind == "list":
@@ -167,7 +167,7 @@ def test_a_broken_checkpoint_is_one_line(kind: str, tmp_path: Path) -> None:
         torch.save(state | {"model": {"a": torch.zeros(1)}}, last)
     else:
         last.write_bytes(b"hello" if kind == "text" else b"")
-    with pytest.raises(FormatError, match=LAST) as caught:
+    with pytest.raises(FormatError, match=LAST_CHECKPOINT) as caught:
         train(fresh(), bank(4), replace(RECIPE, epochs=2), out=tmp_path)
     assert "\n" not in str(caught.value)
 
@@ -177,7 +177,7 @@ def test_a_loss_that_is_not_finite_is_one_line(tmp_path: Path) -> None:
     detector.network.outputs()[0].bias.data.fill_(math.nan)
     with pytest.raises(ConfigError, match="the loss is not finite in epoch 1; use a smaller lr"):
         train(detector, bank(4), RECIPE, out=tmp_path)
-    assert not (tmp_path / LAST).exists()
+    assert not (tmp_path / LAST_CHECKPOINT).exists()
 
 
 def test_a_folder_that_is_a_file_is_one_line(tmp_path: Path) -> None:
@@ -258,16 +258,16 @@ def test_pictures_of_rare_classes_are_repeated() -> None:
 @given(st.integers(0, 10**6), st.integers(1, 7), st.lists(st.floats(1.0, 3.0), min_size=8, max_size=40))
 def test_an_epoch_shows_each_picture_as_often_as_asked(seed: int, batch: int, wanted: list[float]) -> None:
     often = np.array(wanted)
-    epochs = [order(len(often), batch, seed=seed, epoch=e, often=often) for e in range(2)]
+    epochs = [order(len(often), batch, seed=seed, epoch=e, weights=often) for e in range(2)]
     shown = math.ceil(often.sum() - 1e-9)
     assert len(epochs[0]) == len(epochs[1]) == max(shown // batch, 1)
-    single = [k for one in order(len(often), 1, seed=seed, epoch=0, often=often) for k in one]
+    single = [k for one in order(len(often), 1, seed=seed, epoch=0, weights=often) for k in one]
     counts = np.bincount(single, minlength=len(often))
     assert counts.sum() == shown
     assert (counts >= np.floor(often)).all()
     assert (counts <= np.ceil(often * shown / often.sum() - 1e-9)).all()
     whole = np.full(len(often), 2.0)
-    twice = np.bincount([k for one in order(len(often), 1, seed=seed, epoch=1, often=whole) for k in one])
+    twice = np.bincount([k for one in order(len(often), 1, seed=seed, epoch=1, weights=whole) for k in one])
     assert (twice == 2).all()
 
 

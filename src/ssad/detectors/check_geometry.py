@@ -197,7 +197,7 @@ def _fit(trial: CheckCase, everything: list[Detections], reading: Reading) -> fl
         hulls = hull(project(solid_corners(solid.centre, solid.size_lhw, solid.yaw), intrinsic[0].to(solid.centre)))
         box, hulls = _cut(detections.box[:BEST], trial.size), _cut(hulls[:BEST], trial.size)
         is_visible = area(box) > 4
-        image_overlaps.append(iou(box[is_visible], hulls[is_visible], least=1e-6))
+        image_overlaps.append(iou(box[is_visible], hulls[is_visible], min_union=1e-6))
     overlap = torch.cat(image_overlaps) if image_overlaps else torch.zeros(0)
     return float(overlap.double().mean()) if len(overlap) else 0.0
 

@@ -39,11 +39,11 @@ class Pool:
         """
         (self._urgent if first else self._queue).append(task)
 
-    def drop(self, unwanted: Callable[[Task], bool]) -> list[Task]:
-        """Remove the waiting tasks that `unwanted` selects, and return them."""
-        dropped = [task for task in (*self._urgent, *self._queue) if unwanted(task)]
-        self._urgent = deque(task for task in self._urgent if not unwanted(task))
-        self._queue = deque(task for task in self._queue if not unwanted(task))
+    def drop(self, is_unwanted: Callable[[Task], bool]) -> list[Task]:
+        """Remove the waiting tasks that `is_unwanted` selects, and return them."""
+        dropped = [task for task in (*self._urgent, *self._queue) if is_unwanted(task)]
+        self._urgent = deque(task for task in self._urgent if not is_unwanted(task))
+        self._queue = deque(task for task in self._queue if not is_unwanted(task))
         return dropped
 
     def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[TaskOutcome]:
@@ -106,7 +106,7 @@ def run_all(
     arguments: Sequence[Any],
     *,
     timeout_s: float = float("inf"),
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda completed, total: None,
 ) -> list[Any]:
     """Call a function on each argument, for work whose parts are useful only together.
 
@@ -127,10 +127,10 @@ def run_all(
     results: list[Any] = [None] * len(arguments)
     failures: list[str] = []
     with pool:
-        for number, argument in enumerate(arguments):
-            pool.add(Task(function, argument, timeout_s, label=number))
-        for done, outcome in enumerate(pool.outcomes(), 1):
-            progress(done, len(arguments))
+        for index, argument in enumerate(arguments):
+            pool.add(Task(function, argument, timeout_s, label=index))
+        for finished_count, outcome in enumerate(pool.outcomes(), 1):
+            progress(finished_count, len(arguments))
             results[outcome.task.label] = outcome.value
             if outcome.error is not None:
                 raise outcome.error

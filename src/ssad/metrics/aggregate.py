@@ -150,7 +150,7 @@ def aggregate(outcomes: Sequence[EpisodeOutcome]) -> dict[str, Estimate]:
     for symbol, metric in METRICS.items():
         if metric.field:
             values = [_value(outcome, metric) for outcome in outcomes]
-            estimates[symbol] = estimate(values, metric.kind, scale=metric.scale, least=0.0)
+            estimates[symbol] = estimate(values, metric.kind, scale=metric.scale, min_value=0.0)
     return {symbol: estimates.get(symbol) or _overall(outcomes) for symbol in METRICS}
 
 
@@ -219,5 +219,5 @@ def _overall(outcomes: Sequence[EpisodeOutcome]) -> Estimate:
     if not scores:
         return replace(NOTHING, failed=sum(outcome.metrics is None for outcome in outcomes))
     mean = math.fsum(scores) / len(scores)
-    lower_estimate, upper_estimate = estimate(optimistic, "mean", least=0.0), estimate(pessimistic, "mean")
+    lower_estimate, upper_estimate = estimate(optimistic, "mean", min_value=0.0), estimate(pessimistic, "mean")
     return replace(lower_estimate, mean=mean, low=min(lower_estimate.low, mean), high=max(upper_estimate.high, mean))

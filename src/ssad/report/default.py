@@ -78,8 +78,8 @@ def _cell(lines: Sequence[Line], name: str) -> TableCell:
     values = [(line.get("metrics") or {}).get(name) if line["status"] == "ok" else None for line in lines]
     own_interval = (lines[0].get("intervals") or {}).get(name) if len(lines) == 1 else None
     if own_interval and values[0] is not None:
-        low, high = (math.nan if limit is None else float(limit) for limit in own_interval)
-        return TableCell(float(values[0]), low, high, int(lines[0].get("n", 1)), method="given")
+        lower, upper = (math.nan if limit is None else float(limit) for limit in own_interval)
+        return TableCell(float(values[0]), lower, upper, int(lines[0].get("n", 1)), method="given")
     are_booleans = [isinstance(value, bool) for value in values if value is not None]
     cell = metric_cell(lines, name, "share" if are_booleans and all(are_booleans) else "mean")
     is_count = len(values) == 1 and type(values[0]) is int

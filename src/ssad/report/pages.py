@@ -65,6 +65,6 @@ def heat(cell: TableCell, symbol: str) -> str:
     if metric is None or math.isnan(cell.mean) or metric.unit not in ("", "m") or not metric.better:
         return ""
     scale = {"OR": 10.0, "DR": 5.0}.get(symbol, metric.scale)
-    share = min(max(cell.mean / scale, 0.0), 1.0)
-    badness = share if metric.better == "lower" else 1.0 - share
-    return f"--bad:{100 * badness:.0f}%"
+    fraction = min(max(cell.mean / scale, 0.0), 1.0)
+    redness = fraction if metric.better == "lower" else 1.0 - fraction
+    return f"--bad:{100 * redness:.0f}%"

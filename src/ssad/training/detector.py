@@ -69,18 +69,18 @@ class DetectorPlan:
     val_data: Path | None = None
 
 
-def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
+def parse_changes(settings: Sequence[str]) -> tuple[tuple[str, Any], ...]:
     """Parse key=value pairs, values as YAML.
 
     Raises:
         ConfigError: A pair has no "=".
     """
     changes = []
-    for text in texts:
-        key, equals, value = text.partition("=")
+    for setting in settings:
+        key, equals, value = setting.partition("=")
         if not equals:
-            raise ConfigError(f"--set {text}: expected key=value")
-        parsed = safeio.parse_yaml(value, text)
+            raise ConfigError(f"--set {setting}: expected key=value")
+        parsed = safeio.parse_yaml(value, setting)
         changes.append((key.strip(), tuple(parsed) if isinstance(parsed, list) else parsed))
     return tuple(changes)
 
@@ -118,12 +118,12 @@ def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Training
     ]
 
 
-def run_training(plan: DetectorPlan, *, say: Say = print) -> Iterator[str]:
+def run_training(plan: DetectorPlan, *, report: Say = print) -> Iterator[str]:
     """Train a detector, and write OUT/NAME.safetensors with its card.
 
     Args:
         plan: Plan of the training.
-        say: Called with progress messages.
+        report: Called with progress messages.
 
     Yields:
         Lines about what was written.
@@ -141,7 +141,7 @@ def run_training(plan: DetectorPlan, *, say: Say = print) -> Iterator[str]:
         with _one_line():
             spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)  # type: ignore[no-untyped-call]
     else:
-        _run(plan, recipe, device, Share(), say)
+        _run(plan, recipe, device, Share(), report)
     log_lines = safeio.read_text(plan.out / LOG).splitlines()
     yield (
         f"{plan.out / f'{recipe.detector}.safetensors'}: {len(log_lines)} epochs; card, {LOG} and curves.png beside it"
@@ -162,12 +162,12 @@ def _one_line() -> Iterator[None]:
         raise getattr(errors, name)(text) from None
 
 
-def _device(wanted: str) -> str:
-    if wanted not in ("auto", "cpu", "cuda"):
-        raise ConfigError(f"--device {wanted}: expected auto, cpu or cuda")
-    if wanted == "cuda" and not torch.cuda.is_available():
+def _device(requested: str) -> str:
+    if requested not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"--device {requested}: expected auto, cpu or cuda")
+    if requested == "cuda" and not torch.cuda.is_available():
         raise ConfigError("--device cuda: no CUDA device is usable here (see: ssad doctor); use --device cpu")
-    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+    return "cuda" if requested != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def _free_port() -> int:
@@ -190,20 +190,20 @@ def _worker(rank: int, plan: DetectorPlan, recipe: Recipe, port: int, backend: s
         distributed.destroy_process_group()
 
 
-def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
+def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: Say) -> None:
     """Run data loading, training and validation. All settings are checked before images are read."""
-    sources, options = _items(plan, three=recipe.three)
+    sources, options = _items(plan, is_3d=recipe.three)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
         unmatched_weights = start_from(detector, load_weights(plan.weights), str(plan.weights))
         if unmatched_weights:
-            say(
+            report(
                 f"{plan.weights}: {len(unmatched_weights)} weights do not fit and start fresh: "
                 f"{', '.join(unmatched_weights)}"
             )
     fingerprint = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(sources))[:16]
     checkpoint = read_last(plan.out / LAST, recipe, fingerprint)
-    validate = _validation(plan, device, three=recipe.three)
+    validate = _validation(plan, device, is_3d=recipe.three)
     initial_weights = _before(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"
     completed, last_epoch = (
@@ -212,12 +212,12 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, say: Say
         else (0, 1)
     )
     if completed >= last_epoch and _card_epochs(weights) == completed:
-        say(f"all {completed} epochs are done, and {weights.name} is there")
+        report(f"all {completed} epochs are done, and {weights.name} is there")
         return
     del checkpoint
     # Equal shares: all processes must take the same number of steps.
     own_sources = sources[share.rank :: share.world][: len(sources) // share.world]
-    say(f"{len(sources)} pictures to learn from, {sum(len(source.truth.label) for source in sources)} objects")
+    report(f"{len(sources)} pictures to learn from, {sum(len(source.truth.label) for source in sources)} objects")
     trained = train(
         detector,
         fill(own_sources, device=device),
@@ -225,7 +225,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, say: Say
         out=plan.out,
         device=device,
         validate=lambda candidate: validate(candidate, quick=True),
-        say=say,
+        report=report,
         share=share,
         seconds=plan.seconds,
         about=fingerprint,
@@ -235,9 +235,9 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, say: Say
     metrics = validate(trained, quick=False)
     row = read_rows(plan.out)[-1]
     write_row(plan.out, row | metrics)
-    say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
+    report("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
     if row["epoch"] < row["of"]:
-        say(f"stopped after {row['epoch']} of {row['of']} epochs; run it again to go on")
+        report(f"stopped after {row['epoch']} of {row['of']} epochs; run it again to go on")
     folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
     card = WeightsCard(
         data="; ".join(map(describe_data, folders)),
@@ -276,12 +276,12 @@ def _card_epochs(weights: Path) -> int:
     return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
 
 
-def _items(plan: DetectorPlan, *, three: bool) -> tuple[list[TrainingImage], dict[str, Any]]:
+def _items(plan: DetectorPlan, *, is_3d: bool) -> tuple[list[TrainingImage], dict[str, Any]]:
     """Pictures of all folders, and options of the detector. ConfigError: none, or options that do nothing."""
     options: dict[str, Any] = {}
-    if not three and plan.val_data is not None:
+    if not is_3d and plan.val_data is not None:
         raise ConfigError("--val-data is for 3D detectors; clips have a split of their own to validate on")
-    if three:
+    if is_3d:
         sources = [source for folder in plan.data for source in nuscenes_items(folder, None, plan.split)]
     else:
         sources = []
@@ -351,9 +351,9 @@ def command_of(plan: DetectorPlan) -> str:
     return shlex.join([*arguments, *set_words(plan.changes)])
 
 
-def _validation(plan: DetectorPlan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
+def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[..., dict[str, float]]:
     """Metrics of a detector on the validation split."""
-    if three:
+    if is_3d:
         root = plan.val_data or plan.data[0]
         with NuScenes(root) as dataset:
             version = dataset.version

@@ -215,7 +215,7 @@ def traffic_table(run: Run) -> Table | None:
         },
         columns={"CR": "CR", "increase": "more than in natural traffic"},
         metric=metric,
-        below=[
+        footer_rows=[
             TableRow.of_published((system, "natural" if traffic == "Autopilot" else traffic, town), (rate, None))
             for (system, traffic), by_town in NATURAL.items()
             for town, (rate, _, _) in by_town.items()

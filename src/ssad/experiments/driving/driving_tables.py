@@ -78,7 +78,7 @@ def natural_table(run: DrivingRun) -> Table | None:
         },
         columns={symbol: symbol for symbol in SHOWN},
         metric=partial(_cell, run),
-        below=[
+        footer_rows=[
             TableRow.of_published((system, traffic, town), (*numbers, None))
             for (system, traffic), by_town in NATURAL.items()
             for town, numbers in by_town.items()

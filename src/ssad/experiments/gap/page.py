@@ -243,7 +243,7 @@ def cause_table(run: Run) -> Table:
             "repaired": "gone when repaired",
         },
         metric=metric,
-        having=lambda lines: any(line.get("cause") for line in lines),
+        condition=lambda lines: any(line.get("cause") for line in lines),
         note="Collisions by what the object that was hit was in most of the steps from 3 s to 0.5 s before: out of "
         "view or hidden; in view and not found; found more than 2 m from where it was; found, but not believed yet; "
         "believed where it was (then planning or prediction failed). Unknown: for how long before the contact it was "
@@ -269,7 +269,7 @@ def sign_table(run: Run) -> Table:
         rows=CONDITION,
         columns={**SIGNS, "more": "more than clean"},
         metric=metric,
-        having=lambda lines: any((line.get("metrics") or {}).get("sign_recall") is not None for line in lines),
+        condition=lambda lines: any((line.get("metrics") or {}).get("sign_recall") is not None for line in lines),
         note="Of the looks with a stop sign of the way ahead, those in which it was read; attacks on signs are made at "
         "5 to 20 m. Signs run: a drive. More than clean: the rise against the same drives without the perturbation.",
     )

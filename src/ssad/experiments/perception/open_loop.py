@@ -47,7 +47,7 @@ from ssad.experiments.perception.scored_data import (
     detectors_of,
     recording_of,
 )
-from ssad.metrics.target_attacks import TargetView, precision, sightings, target_scores
+from ssad.metrics.target_attacks import TargetSighting, precision, sightings, target_scores
 from ssad.recorders.nuscenes import record_nuscenes
 from ssad.recorders.target_images import record_all
 from ssad.recorders.target_recording import Clips
@@ -101,7 +101,7 @@ class TargetCondition:
     name: str
 
 
-Sightings = Sequence[TargetView]
+Sightings = Sequence[TargetSighting]
 
 
 class OpenLoopKind(Kind):
@@ -404,6 +404,6 @@ def _recorded_scenes(
 
 
 @lru_cache(maxsize=8)
-def _clean_sightings(images: LightableClips, detector: str, weights: str | None) -> tuple[TargetView, ...]:
+def _clean_sightings(images: LightableClips, detector: str, weights: str | None) -> tuple[TargetSighting, ...]:
     """Return a detector's sightings in clean images, which all cells of a target are compared with."""
     return tuple(sightings(loaded_detector(detector, weights=weights, device=images.device), images.clean()))

@@ -208,7 +208,7 @@ def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[Budget, Any]:
     method = options.pop("search", None)
     if method not in (None, "swarm", "greedy", "gradient"):
         raise ConfigError(f"attack {attack}: search={method!r}: choose swarm, greedy or gradient")
-    return checked(Budget, options, what=f"attack {attack}"), method
+    return checked(Budget, options, subject=f"attack {attack}"), method
 
 
 def _write(path: Path, about: Mapping[str, Any]) -> None:
