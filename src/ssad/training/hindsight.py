@@ -111,18 +111,16 @@ class Hindsight:
         return first_row + conflict_start(on_course)
 
     def _drive(self, path: Path, speed_caps: F64, encounter: Encounter, half_length: F64) -> F64:
-        """Poses of the careful driver [N, T, 3]: it starts at the origin and keeps to its path.
+        """Return the poses [N, T, 3] of the careful driver, which starts at the origin and keeps to its path.
 
         Args:
             path: The path.
-            speed_caps: What its bends allow.
+            speed_caps: Speed limits by its bends.
             encounter: The other at each step, as if the driver stayed where it is.
             half_length: [N] half the length of its body, m.
         """
-        speed, bend_positions = (
-            encounter.speed[:, 0],
-            np.arange(speed_caps.shape[1]) - 1.0,
-        )  # a driver sees its route from a metre ahead on
+        speed = encounter.speed[:, 0]
+        bend_positions = np.arange(speed_caps.shape[1]) - 1.0  # a driver sees its route from a metre ahead on
         kept_speed = np.maximum(speed, 1.0)
         arc_position, left, _ = (part[:, 0] for part in path.project(np.zeros((len(speed), 1, 2))))
         x, accel, memory, poses = np.zeros(len(speed)), np.zeros(len(speed)), initial_reaction(speed.shape), []
@@ -153,7 +151,7 @@ class Hindsight:
 
 
 def _stopping(motion: F64, delay: F64) -> F64:
-    """Rows [N, T, 4] of x, y, yaw and speed of who brakes to a stop straight ahead from `delay` = 0 s on."""
+    """Return rows [N, T, 4] of x, y, yaw and speed of an agent that brakes to a stop from `delay` = 0 s on."""
     x, y, yaw, speed = np.moveaxis(motion, -1, 0)
     distance, speed_left = braked(speed, delay)
     return np.stack([x + distance * np.cos(yaw), y + distance * np.sin(yaw), yaw, speed_left], -1)
