@@ -371,7 +371,7 @@ def test_a_system_that_failed_alone_is_left_out_when_a_piece_fails_that_was_at_w
 
     def work(self: Any, missing: Sequence[Cell]) -> None:
         schedule.append(self)
-        self.alone.add("b")
+        self.unshared_systems.add("b")
         original(self, missing)
 
     monkeypatch.setattr(engine._Schedule, "work", work)

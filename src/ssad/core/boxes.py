@@ -90,13 +90,13 @@ class TrackedBoxes(WorldBoxes):
 
 
 def hulls(corners: F64, intrinsic: F64, image_size: tuple[int, int]) -> F64:
-    """What 3D boxes cover of a picture: the rectangles around their corners, cut at its border.
+    """Return the image rectangles around the corners of 3D boxes, cut at the border of the image.
 
     Args:
         corners: [N, 8, 3] in the camera's frame (x right, y down, z forward), m; those nearer than `NEAR` are moved
             there.
         intrinsic: The camera's matrix [3, 3].
-        image_size: Width and height of the picture, px.
+        image_size: Width and height of the image, px.
 
     Returns:
         x1, y1, x2, y2 [N, 4], px.

@@ -217,7 +217,7 @@ class LaneGraph:
         return left < 0 or self.kind[left] != LaneType.DRIVING
 
     def same_direction(self, lane: int, other_lane: int) -> bool:
-        """Whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
+        """Return whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
         return bool(self.lane_id[lane] * self.lane_id[other_lane] > 0 and self.road[lane] == self.road[other_lane])
 
 
@@ -348,7 +348,7 @@ def load_graph(path: Path | str) -> LaneGraph:
 
 
 def equal(first: LaneGraph, second: LaneGraph) -> bool:
-    """Whether two graphs hold the same numbers."""
+    """Return whether two graphs hold the same numbers."""
     return first.name == second.name and all(
         np.array_equal(getattr(first, graph_field.name), getattr(second, graph_field.name))
         for graph_field in fields(LaneGraph)

@@ -115,7 +115,7 @@ class _Table(dict[Any, Any]):
 class _Maker:
     """A function that the file may call but not change; the items it copies count as steps."""
 
-    __slots__ = ("_make", "_steps")
+    __slots__ = ("_factory", "_steps")
 
     def __init__(self, factory: Callable[..., Any], steps: Steps) -> None:
         self._factory, self._steps = factory, steps

@@ -22,7 +22,7 @@ from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, mi
 
 @dataclass(frozen=True)
 class Reference:
-    """What a suite or a command says of a system or a detector: NAME, NAME?KEY=VALUE&KEY=VALUE, NAME@LABEL, or both.
+    """Reference to a system or a detector: NAME, NAME?KEY=VALUE&KEY=VALUE, NAME@LABEL, or both.
 
     Attributes:
         name: A name that `resolve` understands; for some systems with a file behind a colon.

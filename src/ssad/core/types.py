@@ -148,7 +148,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class PhaseTrigger:
-    """What starts a phase.
+    """Condition that starts a phase.
 
     kind `ego_distance`: centre distance between the ego and actor number `actor` falls below `value` metres;
     `ego_speed`: the ego drives faster than `value` m/s; `travelled`: the actor itself has moved more than `value`

@@ -47,7 +47,7 @@ class Pool:
         return dropped
 
     def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[TaskOutcome]:
-        """How each task ended, as they end, until nothing is left to do; `tick` is called several times a second.
+        """Yield the outcomes of all tasks as they end; `tick` is called several times a second.
 
         Raises:
             SSADError: no worker can start.

@@ -60,7 +60,7 @@ class Live:
 
     def line(self) -> None:
         """Print one plain line."""
-        self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}")
+        self.console.print(f"{self.title}: {self.completed}/{self.total} {self.unit}  {self.note()}")
 
     def __enter__(self) -> Self:
         if self.bar:

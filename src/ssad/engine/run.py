@@ -87,7 +87,7 @@ def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
 
 
 def run_json(plan: Plan) -> dict[str, Any]:
-    """What run.json says. `identity` covers all that results depend on, so a folder holds one run only."""
+    """Return the content of run.json. `identity` covers all that results depend on: a folder holds one run."""
     kind = plan.kind
     return {
         "identity": digest("run", plan.device, *[cell.key for cell in plan.cells])[:16],

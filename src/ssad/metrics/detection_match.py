@@ -1,4 +1,4 @@
-"""Which prediction takes which ground-truth box: the devkit's greedy matching, for all boxes at once.
+"""Assignment of predictions to ground-truth boxes: the devkit's greedy matching, for all boxes at once.
 
 The devkit walks through the predictions of a class from the best score down (of equal scores the later first); each
 takes the nearest ground-truth box of its sample that is still free and nearer than the threshold (of equal distances

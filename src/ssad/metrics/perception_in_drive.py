@@ -37,7 +37,7 @@ CAUSES: Final[Mapping[str, str]] = {
 
 
 def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Camera]) -> Bool:
-    """Which agents [N, A] the ego's cameras can see at N steps: not hidden, near enough, their middle in a picture.
+    """Return the agents [N, A] in view of the ego's cameras at N steps: near, not hidden, their middle in an image.
 
     Without cameras (a perceiver of LiDAR or radar) all agents that are near and not hidden count.
     """
@@ -68,7 +68,7 @@ def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Cam
 
 
 def _steps(trace: EpisodeTrace, told: Sequence[tuple[float, Any]]) -> list[int]:
-    """The steps of what was noted at times."""
+    """Return the steps of records with times."""
     return [min(round(time / trace.dt), len(trace.x) - 1) for time, _ in told]
 
 
@@ -193,7 +193,7 @@ def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | Non
 
 
 def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, float | None]:
-    """How well stop signs were read on the frames of a drive; None where none stood before the ego.
+    """Return metrics of the reading of stop signs in a drive; None without a sign before the ego.
 
     Args:
         trace: The drive.
@@ -264,7 +264,7 @@ def average_precision(looks: Sequence[tuple[F64, Bool, Objects | None]]) -> floa
 
 
 def cause_of_collision(trace: EpisodeTrace, seen: Perceived) -> dict[str, Any] | None:
-    """What the object that was hit was to the driver in the three seconds before; None: there was no collision.
+    """Return the perception of the struck object in the three seconds before a collision; None without one.
 
     Returns:
         cause: the commonest of `CAUSES` from 3 s to 0.5 s before the contact; of equal ones the worse. unknown_s: for
@@ -345,7 +345,7 @@ def _belief_metrics(trace: EpisodeTrace, seen: Perceived, target: int | None) ->
 
 
 def _state(trace: EpisodeTrace, step: int, agent: int, seen: Perceived) -> str:
-    """Which of `CAUSES` an agent is at a step."""
+    """Return the entry of `CAUSES` that holds for an agent at a step."""
     time = step * trace.dt
     for record_time, tracks in seen.known:
         if abs(record_time - time) < 0.5 * trace.dt and _gaps(tracks, trace, step, agent).min(initial=np.inf) < NEAR:

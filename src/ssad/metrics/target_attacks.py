@@ -85,7 +85,7 @@ def _on_target(box: F64, score: F64, truth_boxes: F64) -> float:
 
 
 def sighting(drive_name: str, detections: Detections, truth: Truth) -> TargetSighting:
-    """What was found of the class of the target, the first object of the truth, and on it of any class."""
+    """Return the detections of the target's class, and the best of any class on the target, the first true object."""
     target_label = int(truth.label[0])
     is_own_class, is_same_class = (detections.label == target_label).cpu(), (truth.label == target_label).cpu()
     box, score = detections.box.cpu().double().numpy(), detections.score.cpu().double().numpy()
@@ -104,7 +104,7 @@ def sighting(drive_name: str, detections: Detections, truth: Truth) -> TargetSig
 
 
 def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]]) -> Iterator[TargetSighting]:
-    """What a detector finds in pictures, one after another.
+    """Yield the detections of a detector in images, one image after another.
 
     Args:
         detector: Of a 3D detector the hulls of its boxes in the picture count.

@@ -312,7 +312,7 @@ def label_of(kind: str) -> int | None:
 
 
 def faces(sign: F64, viewer: F64) -> bool:
-    """Whether the front of a sign of pose [4, 4] can be read from a place [3]: not from behind or far from aside."""
+    """Return whether the front of a sign of pose [4, 4] can be read from a position [3]: not from behind or aside."""
     forward, left, _ = sign[:3, :3].T @ (viewer - sign[:3, 3])
     return bool(abs(np.degrees(np.arctan2(left, forward))) < BEHIND)
 
@@ -346,7 +346,7 @@ def _follower(viewpoint: Viewpoint) -> F64:
 def _annotate(
     stage: RenderScene, view: View, picture: Rendering, index: int, nearby_objects: Sequence[PlacedObject]
 ) -> tuple[list[dict[str, Any]], str]:
-    """What is seen in a picture, the target among it; and why the picture is of no use (else '')."""
+    """Return the annotation of an image, and the reason why the image is of no use ("" if it is of use)."""
     labels = label_picture(stage, view, picture, index)
     placed_by_tag = {placed.body.tag: placed for placed in nearby_objects}
     is_target = labels.tag == TARGET
@@ -545,7 +545,7 @@ def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ..
 
 
 def recording_of(folder: Path, split: str = "all") -> dict[str, Any]:
-    """What was recorded (see `Clips.identity`).
+    """Return the description of a recording (see `Clips.identity`).
 
     Raises:
         FormatError: No recording.

@@ -188,7 +188,7 @@ def turn_of(numbers: range, count: int, *, key: tuple[object, ...]) -> list[int]
 
 
 def has_room(target: ObjectBody, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject]) -> bool:
-    """Whether nobody stands in the target or where the camera is."""
+    """Return whether no object stands in the target or at the camera."""
     camera_position = viewpoint.camera[:3, 3]
     if not nearby_objects:
         return True
@@ -210,7 +210,7 @@ def has_room(target: ObjectBody, viewpoint: Viewpoint, nearby_objects: Sequence[
 
 
 def free_sight(stage: RenderScene, viewpoints: Sequence[Viewpoint], *, batch: int, height: float = 2 * AIM) -> Bool:
-    """Whether nothing of the street lies between target (at a height, m) and camera, [N]: as the target sees it.
+    """Return whether nothing of the street lies between target (at a height, m) and camera, [N]: as the target sees it.
 
     A camera inside a house sees out of it, for walls have one side; who looks at it from outside sees the wall.
     """

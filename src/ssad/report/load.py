@@ -72,7 +72,7 @@ class Run:
 
     @cached_property
     def changed(self) -> tuple[str, ...]:
-        """What the run does otherwise than the suite of its name, as KEY=VALUE; what changes no result is left out."""
+        """Settings that differ from the suite of this name, as KEY=VALUE; those that change no result are left out."""
         arguments = shlex.split(self.command)
         settings = [argument for option, argument in itertools.pairwise(arguments) if option == "--set"]
         return tuple(setting for setting in settings if setting.partition("=")[0] not in INCIDENTAL)

@@ -118,10 +118,10 @@ def free_memory(device: str) -> float:
 
 
 def repeats(truths: Sequence[Truth], min_share: float) -> F64 | None:
-    """How often to show each picture in an epoch, so that rare classes are seen.
+    """Return the number of repetitions of each image in an epoch, so that rare classes are seen.
 
-    A picture is shown at least once; it is shown sqrt(least / share) times if it shows a class whose share of the
-    pictures is below `min_share`.
+    An image is shown at least once; it is shown sqrt(min_share / share) times if it shows a class whose share of the
+    images is below `min_share`.
 
     Args:
         truths: The truth of each picture [n]; crowd objects do not count.

@@ -251,7 +251,7 @@ def _common_count(count: int, share: Share, device: torch.device) -> int:
 
 
 def _time_is_over(is_over: bool, share: Share, device: torch.device) -> bool:
-    """Whether time is over, as the first process says: all must stop after the same epoch."""
+    """Return whether the time is over in the first process: all must stop after the same epoch."""
     if share.world == 1:
         return is_over
     vote = torch.tensor(float(is_over), device=device)

@@ -33,7 +33,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, config=VALUES)
 class Learning:
-    """How a policy is trained: all that decides the result but the scenarios.
+    """Settings of a policy training: all that decides the result but the scenarios.
 
     Attributes:
         algorithm: ppo, sac, td3, ddpg or dqn (which chooses between actions, see `ssad.world.actions.CHOICES`).

@@ -35,7 +35,7 @@ def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
 
 
 def camera_truth(frame: SensorFrame, annotations: Annotations, *, require_points: bool = True) -> Truth:
-    """What a camera should find of a sample's boxes: those of the ten classes whose middle is in the picture.
+    """Return the boxes of a sample that a camera should find: of the ten classes, with their middle in the image.
 
     Boxes are as `ssad.core.detections` defines them; velocity is in the camera's x and z; box is the hull of the
     projected corners, clipped to the picture.
@@ -74,7 +74,7 @@ def camera_truth(frame: SensorFrame, annotations: Annotations, *, require_points
 def boxes_in_picture(
     frame: SensorFrame, annotations: Annotations, *, require_points: bool = True
 ) -> tuple[npt.NDArray[np.intp], F64, F64]:
-    """Which boxes of a sample a camera should find: those of the ten classes whose middle is in its picture.
+    """Select the boxes of a sample that a camera should find: of the ten classes, with their middle in the image.
 
     Args:
         frame: The camera frame.

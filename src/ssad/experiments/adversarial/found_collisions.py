@@ -83,7 +83,7 @@ def transfer(
     *,
     seeds: Sequence[int],
 ) -> list[dict[str, dict[str, float]]]:
-    """How other systems fare in what was found against one.
+    """Drive other systems through the scenarios that were found against one.
 
     Args:
         systems: The others.

@@ -270,7 +270,7 @@ def _by_search(run: Run) -> list[Line]:
 
 
 def _within(line: Line, most: float = math.inf) -> float:
-    """Whether a search has found a collision within so many rollouts; NaN: nothing to search, or it failed."""
+    """Return 1 if a search has found a collision within so many rollouts, else 0; NaN without a search."""
     metrics = line.get("metrics") or {}
     if line["status"] != "ok" or metrics.get("CR") is None:
         return math.nan

@@ -107,7 +107,7 @@ def _padded(picture: U8, height: int) -> U8:
 
 
 def _at(seen: Sequence[tuple[float, Any]], time: float) -> Any:
-    """What was noted nearest to a time; None: nothing."""
+    """Return the record nearest to a time; None without records."""
     return min(seen, key=lambda record: abs(record[0] - time))[1] if seen else None
 
 

@@ -122,7 +122,7 @@ def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
 
 
 def _perceived(seen: RecordedDrive) -> Iterator[Message]:
-    """What the driver saw, found and believed."""
+    """Yield the images, detections and beliefs of the driver."""
     for seconds, image in seen.shots:  # none of a perceiver without cameras
         name, camera = next(iter(seen.perceived.cameras.items()))
         camera_rotation, camera_position = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()

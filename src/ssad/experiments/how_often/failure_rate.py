@@ -71,7 +71,7 @@ class ChanceEpisode:
         return trace
 
     def usual(self, rows: int = 200) -> tuple[float, float]:
-        """How long an episode takes on average, h, and how far the ego gets, km."""
+        """Return the mean duration of an episode, h, and the mean distance of the ego, km."""
         from ssad.world.rare.brute import draw_keys, run
 
         process = self.process(rows)

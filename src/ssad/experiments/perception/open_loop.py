@@ -68,7 +68,7 @@ class DetectorSuite(SuiteBase, DetectorTable):
 
 
 @dataclass(frozen=True, slots=True)
-class TableRow:
+class CellDescription:
     """A system under a perturbation, or under none, as plain data.
 
     Attributes:
@@ -137,7 +137,7 @@ class OpenLoopKind(Kind):
         """Return what the results depend on of the recorded scenes of a suite; {}: it needs none."""
         return data_of(suite) if isinstance(suite, DetectorSuite) else {}
 
-    def rows(self, suite: Any, victims: Victims, data: Mapping[str, Any]) -> Iterable[TableRow]:
+    def rows(self, suite: Any, victims: Victims, data: Mapping[str, Any]) -> Iterable[CellDescription]:
         """Return the rows of the table of a suite, in order."""
         raise NotImplementedError
 

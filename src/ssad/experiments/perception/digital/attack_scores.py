@@ -88,7 +88,7 @@ def target_success(
     becomes: Mapping[str, str],
     at: Mapping[str, F64] | None = None,
 ) -> dict[str, float]:
-    """How often a targeted attack reaches its target, over the objects that are found in the clean pictures.
+    """Success rate of a targeted attack, over the objects that are found in the clean pictures.
 
     An object is found if the best box within 2 m of it, with a score of 0.1 at least, is of its class. The target is
     reached if, under the attack, the best such box is of the wanted class; where no class is wanted, if the object is

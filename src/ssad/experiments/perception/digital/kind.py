@@ -29,7 +29,7 @@ from ssad.experiments.perception.digital.points import (
     transfers_of,
 )
 from ssad.experiments.perception.digital.verdict import verdict
-from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow
+from ssad.experiments.perception.open_loop import CellDescription, DetectorSuite, OpenLoopKind
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition
 from ssad.experiments.perception.scored_data import Victims, detectors_of
 from ssad.report.load import Run
@@ -88,7 +88,7 @@ class Digital(OpenLoopKind):
         names = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
         return detectors_of(suite.name, names, flat=True)
 
-    def rows(self, suite: DigitalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+    def rows(self, suite: DigitalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield the attacks on each detector, and the images that are made against others."""
         points = points_of(suite)
         main_detectors, hardened_detectors = (
@@ -110,7 +110,7 @@ class Digital(OpenLoopKind):
                 inputs = [safeio.dump_json(data), *([victims.weights[point.source]] if point.source else [])]
                 spec = {"attacks": [one.row for one in point.specs], "source": source, "scenes": point.scenes}
                 fields = {"detector": detector, **point.fields, "task": victims.tasks[detector]}
-                yield TableRow(title, system, fields, spec, inputs)
+                yield CellDescription(title, system, fields, spec, inputs)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Prepare as `OpenLoopKind` does, and print how many gradients the suite takes."""

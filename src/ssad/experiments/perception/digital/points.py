@@ -232,7 +232,7 @@ class AttackPoint:
 
 
 def system_name(detector: str, guard: Guarded | None) -> str:
-    """What a detector behind a defence is called."""
+    """Return the name of a detector behind a defence."""
     return detector if guard is None else f"{detector}+{guard.text.replace(' ', '-')}"
 
 

@@ -14,7 +14,7 @@ from ssad.core.protocols import Detector
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources, SuiteBase, find_cell
 from ssad.engine.progress import Live
-from ssad.experiments.perception.open_loop import OpenLoopKind, Sightings, TableRow, TargetCondition
+from ssad.experiments.perception.open_loop import CellDescription, OpenLoopKind, Sightings, TargetCondition
 from ssad.experiments.perception.physical import page
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_attacks import SearchedLight, TargetAttacks, TrainedTexture, see_all
@@ -92,7 +92,7 @@ class Physical(OpenLoopKind):
                 )
         return victims
 
-    def rows(self, suite: PhysicalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+    def rows(self, suite: PhysicalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield the rows of the table; check the recordings."""
         for row in rows_of(suite):
             source = row.spec.get("light", row.spec).get("source", "")
