@@ -238,7 +238,11 @@ def replay(
     if mcap:
         top_view_frames = frames(replayed.trace, replayed.graph, size=(640, 360))
         path = write_mcap(
-            stem.with_suffix(".mcap"), replayed.trace, replayed.graph, seen=replayed.seen, above=top_view_frames
+            stem.with_suffix(".mcap"),
+            replayed.trace,
+            replayed.graph,
+            recorded_drive=replayed.seen,
+            top_views=top_view_frames,
         )
         print(f"mcap: {path}")
     if write_film is not None:
@@ -275,7 +279,7 @@ def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any
             )
         weather = at_hour(DAY, attack.hour)
         film_frames = attacked_frames(
-            trace, graph, attack.live(agent), detector=film_detector, every=2, weather=weather
+            trace, graph, attack.live(agent), detector=film_detector, frame_stride=2, weather=weather
         )
         return save_frames(film_frames, path, dt=2 * trace.dt)
 

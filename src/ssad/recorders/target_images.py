@@ -176,7 +176,7 @@ def _rounds(
         weather = draw_weather(("clips", *key))
         remaining = iter(
             follow(
-                stage_set.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), draws=rng
+                stage_set.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), rng=rng
             )
         )
         while batch := list(zip(missing(), remaining, strict=False)):

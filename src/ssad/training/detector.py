@@ -31,7 +31,7 @@ from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import score_2d, score_3d
 from ssad.training.batches import PictureSet, TrainingImage, fill
 from ssad.training.data import nuscenes_items
-from ssad.training.loop import LAST, LOG, Share, read_last, read_rows, train, write_row
+from ssad.training.loop import LAST_CHECKPOINT, LOG, Share, read_last, read_rows, train, write_row
 from ssad.training.recipe import Recipe, find_recipe, recipe_data, set_words
 
 Say = Callable[[str], None]
@@ -202,7 +202,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: 
                 f"{', '.join(unmatched_weights)}"
             )
     fingerprint = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(sources))[:16]
-    checkpoint = read_last(plan.out / LAST, recipe, fingerprint)
+    checkpoint = read_last(plan.out / LAST_CHECKPOINT, recipe, fingerprint)
     validate = _validation(plan, device, is_3d=recipe.three)
     initial_weights = _before(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"

@@ -69,7 +69,7 @@ def test_the_car_before_the_ego_is_attacked(trace: EpisodeTrace) -> None:
 
 def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:
     attack = AgentEdit(white, TargetCar(paint="black"), agent=1)
-    frames = list(attacked_frames(trace, load_town("ProvingGround"), attack, width=160, every=2))
+    frames = list(attacked_frames(trace, load_town("ProvingGround"), attack, width=160, frame_stride=2))
     assert len(frames) == 2
     for frame in frames:
         left, right = np.split(frame[:90].astype(int), 2, axis=1)
@@ -90,7 +90,9 @@ def test_a_light_is_exported_and_shines_in_a_drive(trace: EpisodeTrace, tmp_path
     for name in ("projector", "flashlight"):
         made = load_worn(tmp_path / name)
         night = at_hour(DAY, made.hour)
-        frames = attacked_frames(trace, load_town("ProvingGround"), made.live(1), width=160, every=9, weather=night)
+        frames = attacked_frames(
+            trace, load_town("ProvingGround"), made.live(1), width=160, frame_stride=9, weather=night
+        )
         left, right = np.split(next(frames)[:90].astype(int), 2, axis=1)
         brighter = (right - left).max(-1) > 30
         assert 20 < brighter.sum() < 0.3 * brighter.size, name

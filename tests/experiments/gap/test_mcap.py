@@ -40,7 +40,7 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
 
     trace, seen, town = driven()
     above = (np.full((40, 60, 3), 90, np.uint8) for _ in range(len(trace.x)))
-    path = write_mcap(tmp_path / "drive.mcap", trace, town, seen=seen, above=above)
+    path = write_mcap(tmp_path / "drive.mcap", trace, town, recorded_drive=seen, top_views=above)
     told: dict[str, list[tuple[float, Any]]] = {}
     with path.open("rb") as file:
         for schema, channel, message, decoded in make_reader(
@@ -88,8 +88,8 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
             tmp_path / "again.mcap",
             trace,
             town,
-            seen=seen,
-            above=(np.full((40, 60, 3), 90, np.uint8) for _ in range(steps)),
+            recorded_drive=seen,
+            top_views=(np.full((40, 60, 3), 90, np.uint8) for _ in range(steps)),
         ).read_bytes()
     )
 

@@ -126,14 +126,14 @@ def transfer_table(run: Run) -> Table | None:
 def budget_table(run: Run) -> Table:
     """Return the CR within parts of the budget."""
     budget = int(run.suite.get("budget", 1))
-    rollout_limits = sorted({max(1, round(budget * share)) for share in (0.125, 0.25, 0.5, 1.0)})
+    rollout_limits = sorted({max(1, round(budget * fraction)) for fraction in (0.125, 0.25, 0.5, 1.0)})
     return Table.pivot(
         "budget",
         "CR by rollouts spent",
         run.lines,
         rows=SEARCH,
         columns={count: f"CR within {count}" for count in rollout_limits},
-        metric=lambda lines, count: _mean(lines, partial(_within, most=count), "share"),
+        metric=lambda lines, count: _mean(lines, partial(_within, max_rollouts=count), "share"),
         note=METHODS,
     )
 
@@ -191,15 +191,15 @@ def traffic_table(run: Run) -> Table | None:
 
     def metric(drives: Sequence[tuple[Line, str]], column: str) -> TableCell:
         collided = {str(line["key"]): 1.0 - metric_of(line, "survived") for line, _ in drives}
-        natural = {str(line["key"]): _case(line, collided[str(line["key"])]) for line, _ in drives}
+        natural_cases = {str(line["key"]): _case(line, collided[str(line["key"])]) for line, _ in drives}
         adversarial = {
-            str(line["key"]): _case(line, max(collided[str(line["key"])], _found(line))) for line, _ in drives
+            str(line["key"]): _case(line, max(collided[str(line["key"])], _has_found(line))) for line, _ in drives
         }
         among_adversaries = drives[0][1] == "Adv.PPO"
         if column == "CR":
-            return TableCell.of(estimate((adversarial if among_adversaries else natural).values(), "share"))
+            return TableCell.of(estimate((adversarial if among_adversaries else natural_cases).values(), "share"))
         return (
-            TableCell.of(paired_difference(adversarial, natural, kind="share"))
+            TableCell.of(paired_difference(adversarial, natural_cases, kind="share"))
             if among_adversaries
             else TableCell.value(None)
         )
@@ -227,7 +227,7 @@ def traffic_table(run: Run) -> Table | None:
     )
 
 
-def _found(line: Line) -> float:
+def _has_found(line: Line) -> float:
     """Return whether any collision with an adversary was found; 0 where none was tried, NaN where the cell failed."""
     if line["status"] != "ok":
         return math.nan
@@ -247,8 +247,8 @@ def views(run: Run) -> list[dict[str, str]]:
             graph = load_graph(run.folder / "towns" / town_file(trace.town))
         except SSADError:
             continue  # named on the page as missing or damaged
-        picture = found_view(trace, graph, [int(agent) for agent in line["adversaries"]])
-        encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
+        image = found_view(trace, graph, [int(agent) for agent in line["adversaries"]])
+        encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
         caption = f"{generator} against {system} in {line['cluster']}"
         command = f"ssad run quick --set scenarios={run.folder / line['artefacts']['scenarios']} --set systems={system}"
         uri = f"data:image/png;base64,{base64.b64encode(encoded).decode()}"
@@ -269,12 +269,12 @@ def _by_search(run: Run) -> list[Line]:
     return [line for lines in _searches(run).values() for line in lines]
 
 
-def _within(line: Line, most: float = math.inf) -> float:
+def _within(line: Line, max_rollouts: float = math.inf) -> float:
     """Return 1 if a search has found a collision within so many rollouts, else 0; NaN without a search."""
     metrics = line.get("metrics") or {}
     if line["status"] != "ok" or metrics.get("CR") is None:
         return math.nan
-    return float(bool(metrics["CR"]) and metrics["rollouts"] <= most)
+    return float(bool(metrics["CR"]) and metrics["rollouts"] <= max_rollouts)
 
 
 def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> TableCell:

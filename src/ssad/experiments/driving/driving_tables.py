@@ -49,17 +49,17 @@ def _cell(run: DrivingRun, key: tuple[str, str], symbol: str) -> TableCell:
 
 def _counts(run: DrivingRun, systems: list[str]) -> str:
     """Return in a sentence how many episodes and scenarios are behind the numbers."""
-    parts = []
+    count_texts = []
     for system in systems:
         cells = [estimates["CR"] for group in SCENARIOS if (estimates := run.numbers.get((system, group)))]
         ranges = [
-            str(low) if low == high else f"{low} to {high}"
-            for low, high in (
+            str(fewest) if fewest == largest else f"{fewest} to {largest}"
+            for fewest, largest in (
                 (min(counts), max(counts)) for counts in ([cell.n for cell in cells], [cell.clusters for cell in cells])
             )
         ]
-        parts.append(f"{system} {ranges[0]} in {ranges[1]} clusters")
-    return f"Episodes in a cell: {', '.join(parts)}."
+        count_texts.append(f"{system} {ranges[0]} in {ranges[1]} clusters")
+    return f"Episodes in a cell: {', '.join(count_texts)}."
 
 
 def natural_table(run: DrivingRun) -> Table | None:
@@ -140,8 +140,8 @@ def _scaled(name: str, estimate: Estimate) -> Estimate:
         value if math.isnan(value) else normalised(name, value)
         for value in (estimate.mean, estimate.low, estimate.high)
     )
-    mean, low, high = scaled_values
-    return replace(estimate, mean=mean, low=low, high=high)
+    mean, lower, upper = scaled_values
+    return replace(estimate, mean=mean, low=lower, high=upper)
 
 
 def summary_table(run: DrivingRun) -> Table:

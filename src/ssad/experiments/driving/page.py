@@ -31,9 +31,9 @@ PICTURES = {
 """How names of pictures begin -> title of their section, and how to make more of them."""
 
 
-def summary(found: Run) -> Table:
+def summary(run: Run) -> Table:
     """Return the table for the terminal."""
-    return summary_table(load_episodes(found))
+    return summary_table(load_episodes(run))
 
 
 def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
@@ -132,8 +132,8 @@ def _matrix(run: DrivingRun) -> list[dict[str, Any]]:
     groups: dict[str, dict[str, list[dict[str, str]]]] = {}
     for record in run.records:
         reason = record.reason or record.end.replace("_", " ")
-        mark = {"key": record.key, "outcome": outcome_class(record), "scenario": record.scenario, "why": reason}
-        groups.setdefault(record.heading, {}).setdefault(record.system, []).append(mark)
+        cell_mark = {"key": record.key, "outcome": outcome_class(record), "scenario": record.scenario, "why": reason}
+        groups.setdefault(record.heading, {}).setdefault(record.system, []).append(cell_mark)
     return [{"group": name, "systems": systems} for name, systems in groups.items()]
 
 
@@ -152,5 +152,5 @@ def _witness(run: DrivingRun) -> dict[str, Any] | None:
         system_rows = [row for (name, _), row in rows.items() if name == system]
         if len(system_rows) > 1:
             rows[system, "all"] = sum(system_rows, Counter())
-    order = sorted(rows, key=lambda key: run.systems.index(key[0]))
-    return {"rows": {key: rows[key] for key in order}, "columns": {**MODELS, "limit": "any manoeuvre tried"}}
+    ordered_keys = sorted(rows, key=lambda key: run.systems.index(key[0]))
+    return {"rows": {key: rows[key] for key in ordered_keys}, "columns": {**MODELS, "limit": "any manoeuvre tried"}}

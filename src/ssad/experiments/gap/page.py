@@ -161,7 +161,7 @@ def error_table(run: Run) -> Table:
             name: setting for name, setting in ERRORS.items() if not all(math.isnan(metric_of(x, name)) for x in lines)
         },
         metric=metric,
-        having=lambda lines: not all(math.isnan(metric_of(line, "recall")) for line in lines),
+        condition=lambda lines: not all(math.isnan(metric_of(line, "recall")) for line in lines),
         note="Without perturbations. Missed: share of the objects in view that are not found within 2 m; burst: looks "
         "in a row that an object is missed; noise: error of the distance, as a share of it; phantoms: a look.",
     )
@@ -227,8 +227,8 @@ def cause_table(run: Run) -> Table:
         if column == "unknown_s":
             return TableCell(sorted(float(record["unknown_s"]) for record in causes)[len(causes) // 2])
         if column == "repaired":
-            gone = sum(not record["same"] for record in repaired_drives)
-            return TableCell.value(gone if repaired_drives else None, digits=0 if repaired_drives else 2)
+            avoided_count = sum(not record["same"] for record in repaired_drives)
+            return TableCell.value(avoided_count if repaired_drives else None, digits=0 if repaired_drives else 2)
         return TableCell(sum(record["cause"] == column for record in causes), digits=0)
 
     return Table.pivot(
@@ -286,11 +286,14 @@ def scatter(run: Run) -> str:
     families = {line["perturbation"]: family_of_line(line) for line in run.lines}
     points = []
     for system, name, severity in (condition for condition in conditions(run) if condition[2]):
-        fall, rise = (change(run, (system, name, severity), metric) for metric in ("AP", "collision"))
-        if not math.isnan(fall.mean) and not math.isnan(rise.mean):
-            tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
-            lost = replace(fall, mean=-fall.mean, low=-fall.high, high=-fall.low)
-            points.append(MetricChange(lost, rise, f"{name} {severity}", families.get(name, ""), tip))
+        ap_change, collision_change = (change(run, (system, name, severity), metric) for metric in ("AP", "collision"))
+        if not math.isnan(ap_change.mean) and not math.isnan(collision_change.mean):
+            changes_text = f"AP {ap_change.text}, CR {collision_change.text}, {collision_change.count}"
+            tooltip = f"{system}, {name} {severity}: {changes_text}"
+            ap_loss = replace(ap_change, mean=-ap_change.mean, low=-ap_change.high, high=-ap_change.low)
+            points.append(
+                MetricChange(ap_loss, collision_change, f"{name} {severity}", families.get(name, ""), tooltip)
+            )
     return change_plot(
         points,
         COLOURS,
@@ -359,6 +362,6 @@ def _change(lines: Sequence[Line], clean_by_system: Mapping[str, Sequence[Line]]
 
 def _difference(lines: Sequence[Line], other_lines: Sequence[Line], name: str) -> TableCell:
     """Return the difference of a metric from that of other lines of the same drives."""
-    cases, others = values(lines, name), values(other_lines, name)
-    shared = {drive: others[drive] for drive in cases if drive in others}
-    return TableCell.of(paired_difference(cases, shared, kind="share" if name == "collision" else "mean"))
+    cases, other_cases = values(lines, name), values(other_lines, name)
+    shared_cases = {drive: other_cases[drive] for drive in cases if drive in other_cases}
+    return TableCell.of(paired_difference(cases, shared_cases, kind="share" if name == "collision" else "mean"))

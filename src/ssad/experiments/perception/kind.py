@@ -83,7 +83,7 @@ class Perception(OpenLoopKind):
         """Return the detectors of the suite."""
         places = conditions_by_place(suite)
         targets = [parse_target(place) for place in places if place != SCENES]
-        return detectors_of(suite.name, suite.detectors, flat=True, scenes=SCENES in places, targets=targets)
+        return detectors_of(suite.name, suite.detectors, allow_2d=True, scenes=SCENES in places, targets=targets)
 
     def data(self, suite: PerceptionSuite) -> dict[str, Any]:
         """Return what the results depend on of the recorded scenes, if a perturbation acts on them."""

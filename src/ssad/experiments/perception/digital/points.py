@@ -201,7 +201,7 @@ class AttackPoint:
     @property
     def fields(self) -> dict[str, Any]:
         """Columns of a record that describe the condition."""
-        common = {
+        common_fields = {
             "source": self.source,
             "defence": self.defence.text if self.defence else "",
             "aware": self.aware,
@@ -210,7 +210,7 @@ class AttackPoint:
         }
         if not self.specs:
             no_attack = dict.fromkeys(("attack", "loss", "norm"))
-            return {**no_attack, "radius": 0.0, "steps": 0, "options": "", "target": "", **common}
+            return {**no_attack, "radius": 0.0, "steps": 0, "options": "", "target": "", **common_fields}
         spec = self.specs[0]
         columns = {
             "attack": spec.attack,
@@ -220,7 +220,7 @@ class AttackPoint:
             "steps": spec.steps,
             "options": _options(spec),
             "target": spec.target,
-            **common,
+            **common_fields,
         }
         if len(self.specs) > 1:
             members = ", ".join(
@@ -414,7 +414,7 @@ def _swept(suite: AttackTable, sweeps: Sequence[Sweep]) -> list[AttackPoint]:
 
 
 def _options(spec: AttackSpec) -> str:
-    others = [(key, value) for key, value in spec.options if key != "steps"]
-    others += [("draws", spec.draws)] if spec.draws else []
-    others += [("precision", spec.precision)] if spec.precision != "float32" else []
-    return " ".join(f"{key}={value}" for key, value in others)
+    other_options = [(key, value) for key, value in spec.options if key != "steps"]
+    other_options += [("draws", spec.draws)] if spec.draws else []
+    other_options += [("precision", spec.precision)] if spec.precision != "float32" else []
+    return " ".join(f"{key}={value}" for key, value in other_options)

@@ -54,12 +54,12 @@ def transfer_table(run: DigitalRun) -> Table:
     return Table.listing(
         "transfer",
         "Transfer between detectors",
-        [(source, white_box) for white_box in white_boxes for source in ("", *run.everyone)],
+        [(source, white_box) for white_box in white_boxes for source in ("", *run.all_detectors)],
         rows={
             **{head: partial(_of_setting, factor) for head, factor in (ATTACK | SCENES).items()},
             "Made against": lambda row: row[0] or "nothing: clean",
         },
-        columns={detector: detector for detector in run.everyone},
+        columns={detector: detector for detector in run.all_detectors},
         metric=metric,
         note="mAP in percent. Where row and column are of one detector the attack is white-box; elsewhere nothing was "
         f"asked of the detector that is shown the pictures.{run.about_flat}",
@@ -71,16 +71,16 @@ def defence_table(run: DigitalRun) -> Table:
     defended_settings: dict[tuple[str, Setting], dict[bool, Setting]] = {}
     for setting in run.settings:
         if setting.defence and setting.attack:
-            bare = setting._replace(defence="", aware=False, options=_without_draws(setting.options))
-            defended_settings.setdefault((setting.defence, bare), {})[setting.aware] = setting
+            bare_setting = setting._replace(defence="", aware=False, options=_without_draws(setting.options))
+            defended_settings.setdefault((setting.defence, bare_setting), {})[setting.aware] = setting
 
     def metric(row: tuple[str, tuple[str, Setting]], column: str) -> TableCell:
         detector, defence = row
-        bare, by_awareness = defence[1], defended_settings[defence]
+        bare_setting, by_awareness = defence[1], defended_settings[defence]
         if column in ("clean", "defended"):
-            like = bare if column == "clean" else next(iter(by_awareness.values()))
-            return metric_cell(run.clean(detector, like), "mAP")
-        attacked = bare if column == "attacked" else by_awareness.get(column == "aware")
+            sample_setting = bare_setting if column == "clean" else next(iter(by_awareness.values()))
+            return metric_cell(run.clean(detector, sample_setting), "mAP")
+        attacked = bare_setting if column == "attacked" else by_awareness.get(column == "aware")
         return metric_cell(run.record(detector, attacked) if attacked else None, "mAP")
 
     return Table.listing(
@@ -245,10 +245,10 @@ def halving(curve: Sequence[tuple[float, float]]) -> float:
     Returns:
         On straight lines between the points; NaN if it never falls so far, or the first score is 0.
     """
-    half = curve[0][1] / 2 if curve else 0.0
-    for (low, before), (high, after) in pairwise(curve):
-        if after <= half < before:
-            return low + (before - half) / (before - after) * (high - low)
+    half_score = curve[0][1] / 2 if curve else 0.0
+    for (lower, score_before), (upper, score_after) in pairwise(curve):
+        if score_after <= half_score < score_before:
+            return lower + (score_before - half_score) / (score_before - score_after) * (upper - lower)
     return math.nan
 
 

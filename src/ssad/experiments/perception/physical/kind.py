@@ -82,7 +82,7 @@ class Physical(OpenLoopKind):
     def victims(self, suite: PhysicalSuite) -> Victims:
         """Return the detectors and judges of the suite."""
         entries, target = [*suite.detectors, *suite.judges], target_of(suite)
-        victims = detectors_of(suite.name, entries, flat=True, scenes=False, targets=[target])
+        victims = detectors_of(suite.name, entries, allow_2d=True, scenes=False, targets=[target])
         for name, file in victims.files.items():
             if file:
                 raise ConfigError(f"suite {suite.name}: {name}={file}: this suite takes shipped weights only")
