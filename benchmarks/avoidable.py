@@ -156,7 +156,7 @@ def run(trial: Trial) -> dict[str, Any]:
             driver: Driver = Adversary()
         else:
             out = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            list(run_adversary_training(AdversaryPlan("adv-ppo", out, test=(), **trial.plan), say=lambda _: None))
+            list(run_adversary_training(AdversaryPlan("adv-ppo", out, test=(), **trial.plan), report=lambda _: None))
             driver = Adversary(out / "adv-ppo.safetensors")
         return {ego: measure(driver, selection, ego) for ego in EGOS}
 

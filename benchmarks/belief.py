@@ -22,7 +22,7 @@ from ssad.core.driving import Belief, Driver, Observation
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import seed32
 from ssad.core.traces import trace_hash
-from ssad.core.types import Episode, EpisodeTrace, Limits
+from ssad.core.types import Episode, EpisodeLimits, EpisodeTrace
 from ssad.drivers.belief import DegradedBelief, LineOfSight
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.metrics.intervals import Clusters, bounded_limits
@@ -78,7 +78,7 @@ TITLES = {name: name for name in SYSTEMS} | {
 def crowd(repetitions: int) -> tuple[list[Episode], dict[str, LaneGraph]]:
     """Dense traffic, in which the ego is one of many."""
     graphs = {name: load_town(name) for name in ("Oldmarket", "Crossgate")}
-    limits = Limits(max_steps=10**6, max_time=90.0, max_distance=1e9)
+    limits = EpisodeLimits(max_steps=10**6, max_time=90.0, max_distance=1e9)
     episodes = []
     for graph in graphs.values():
         routes = town_routes(graph, ROUTES, 1500.0)

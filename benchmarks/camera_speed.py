@@ -34,7 +34,7 @@ import warp as wp
 from ssad.core.driving import Observation
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
-from ssad.core.types import Controller, Limits
+from ssad.core.types import Controller, EpisodeLimits
 from ssad.rendering.bodies import draw_paint, make_body
 from ssad.rendering.camera.lamps import own_lamps
 from ssad.rendering.camera.render import PLAIN, RenderQuality, SceneWeather, View, render
@@ -117,7 +117,7 @@ def in_the_loop(scenes: int, device: str, steps: int) -> dict[str, Any]:
     """Seconds a step of scenes with a camera each, as medians."""
     chosen = load_scenarios("natural")[:scenes]
     graphs = {name: load_town(name) for name in {scenario.town for scenario in chosen}}
-    endless = Limits(max_steps=10**6, max_time=1e6, contact="count")
+    endless = EpisodeLimits(max_steps=10**6, max_time=1e6, contact="count")
     episodes = [replace(build_episode(s, graphs[s.town], seed=0), limits=endless) for s in chosen]
     found: dict[str, Any] = {"scenes": scenes, "towns": len(graphs), "steps": steps}
     for name, camera in (("loop", Camera.typical(640, 384)), ("host", Camera.typical(8, 8))):

@@ -44,7 +44,7 @@ def main() -> None:
             others = [int(k) for k in np.flatnonzero((trace.kind != AgentKind.PROP) & (span > 1.0)) if k]
             gap = np.hypot(*(part[:, others] - part[:, :1] for part in (trace.x, trace.y))).min(1)
             last = None if trace.contact.any() else int(gap.argmin())
-            picture = found_view(trace, graph, others, size=SIZE, last=last)
+            picture = found_view(trace, graph, others, size=SIZE, last_step=last)
             axis = axes[row, column]
             axis.imshow(picture)
             axis.set_axis_off()

@@ -123,7 +123,7 @@ class Clips:
         wanted = {self.files[number] for number in np.unique(self.image[small])}
         for folder in dict.fromkeys(file.parents[1] for file in self.files):
             names = {file.name for file in wanted if file.parents[1] == folder}
-            for one in clip_views(folder, split="test", only=names):
+            for one in clip_views(folder, split="test", selected_keys=names):
                 picture, street = render(one.scene, [one.view]), render(one.scene, [replace(one.view, objects=())])
                 light, behind = (
                     np.minimum(p.radiance[0] * p.exposure[0], BRIGHTEST).mean(-1) for p in (picture, street)

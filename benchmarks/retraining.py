@@ -108,7 +108,7 @@ def train(out: Path, size: Size, arm: str, seed: int) -> None:
         tuple(changes.items()),
         start=None if arm == "before" else out / f"before-{seed}",
     )
-    for line in run_driver_training(plan, say=lambda text: None):
+    for line in run_driver_training(plan, report=lambda text: None):
         print(arm, seed, line.rpartition("/")[2], flush=True)
 
 

@@ -28,8 +28,8 @@ from ssad.core.types import (
     End,
     Episode,
     EpisodeAgent,
+    EpisodeLimits,
     LaneType,
-    Limits,
     Pose,
     Route,
     Scenario,
@@ -103,7 +103,7 @@ def traffic(graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: in
         start = 0.6 * min(wish, float(route.speed_limit[0]))
         pose = Pose(x, y, float(route.yaw[0]))
         agents.append(EpisodeAgent(f"{body} {len(agents)}", body, Controller.AUTOPILOT, pose, start, wish, route=route))
-    limits = Limits(max_steps=10**6, max_time=1e6, max_distance=1e9, contact="count")
+    limits = EpisodeLimits(max_steps=10**6, max_time=1e6, max_distance=1e9, contact="count")
     scenario = Scenario(f"traffic/{key}", "Custom", graph.name, (agents[0].pose, agents[0].pose), limits=limits)
     real = np.flatnonzero(~graph.signal_virtual).tolist()
     forced = dict.fromkeys(real, SignalState.GREEN) if green else {}

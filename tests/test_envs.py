@@ -55,7 +55,7 @@ def test_episodes_of_a_set_are_built_once() -> None:
 
 
 def test_a_picture_from_above_follows_the_ego() -> None:
-    from ssad.core.top_view import CRASH, EGO
+    from ssad.core.top_view import CONTACT, EGO
 
     env = gymnasium.make(ID, scenarios="StraightObstacle/00", render_mode="rgb_array", action="controls")
     env.reset(seed=0)
@@ -71,7 +71,7 @@ def test_a_picture_from_above_follows_the_ego() -> None:
     assert isinstance(last, np.ndarray)
     assert (last != first).any(-1).mean() > 0.01
     assert info["end"] == "collision"
-    assert (last == CRASH).all(-1).sum() > 50, "a collision is marked"
+    assert (last == CONTACT).all(-1).sum() > 50, "a collision is marked"
     envs = gymnasium.make_vec(ID, num_envs=3, scenarios=["RightTurn/00", "LaneChanging"], render_mode="rgb_array")
     envs.reset(seed=0)
     pictures = envs.render()

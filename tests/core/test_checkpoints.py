@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ssad.core.checkpoints import (
-    Card,
+    WeightsCard,
     fit_state,
     hash_state,
     load_card,
@@ -30,7 +30,7 @@ from ssad.core.checkpoints import (
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import MIB
 
-CARD = Card(data="drawn", command="ssad train detector toy", seed=3, classes=("car",), metrics={"AP50": 0.5})
+CARD = WeightsCard(data="drawn", command="ssad train detector toy", seed=3, classes=("car",), metrics={"AP50": 0.5})
 
 
 class Toy(nn.Module):
@@ -453,14 +453,16 @@ def test_a_card_that_lies_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_metric_may_be_undefined(tmp_path: Path) -> None:
-    card = Card("d", "c", 0, ("car",), metrics={"AP": float("nan"), "mAP": np.float32(0.5)})  # type: ignore[dict-item]
+    card = WeightsCard("d", "c", 0, ("car",), metrics={"AP": float("nan"), "mAP": np.float32(0.5)})  # type: ignore[dict-item]
     save_weights(tmp_path / "a.safetensors", toy().state_dict(), card=card)
     assert '"AP": null' in (tmp_path / "a.json").read_text()
     found = read_card(tmp_path / "a.json").metrics
     assert np.isnan(found["AP"])
     assert found["mAP"] == 0.5
     with pytest.raises(ConfigError, match="JSON"):
-        save_weights(tmp_path / "a.safetensors", toy().state_dict(), card=Card("d", "c", 0, (), config={"a": object()}))
+        save_weights(
+            tmp_path / "a.safetensors", toy().state_dict(), card=WeightsCard("d", "c", 0, (), config={"a": object()})
+        )
 
 
 def test_a_bad_name_or_folder_is_one_line(tmp_path: Path) -> None:

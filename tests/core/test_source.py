@@ -148,7 +148,7 @@ def test_a_package_is_followed_from_its_own_place(write: Write) -> None:
 
 def test_the_source_of_a_cell_is_found() -> None:
     """What a drive depends on is in its key, and a report or a detector is not."""
-    found = set(source_files(Driving.__module__, without=Driving.presentation()))
+    found = set(source_files(Driving.__module__, excluded_modules=Driving.presentation()))
     for name in (
         "core.safeio",
         "core.registry",
@@ -166,7 +166,7 @@ def test_the_source_of_a_cell_is_found() -> None:
         assert f"ssad.{name}" in found, name
     assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)
     assert "ssad.experiments.driving.page" not in found
-    seen = set(source_files(Detection.__module__, without=Detection.presentation()))
+    seen = set(source_files(Detection.__module__, excluded_modules=Detection.presentation()))
     for name in (
         "detectors.mono3d.nms",
         "detectors.yolo.decode",

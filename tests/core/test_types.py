@@ -9,12 +9,12 @@ import pytest
 
 from ssad.core.types import (
     AgentKind,
-    Condition,
     Contact,
     Controller,
     EpisodeAgent,
+    EpisodeLimits,
     LaneType,
-    Limits,
+    PhaseTrigger,
     Pose,
     Route,
     Scenario,
@@ -50,9 +50,9 @@ def test_what_a_scenario_leaves_out() -> None:
     assert (scenario.target_speed, scenario.seed, scenario.group, scenario.source) == (8.0, 0, "", "")
     assert (scenario.trigger, scenario.traffic, scenario.actors, scenario.placements) == (None, None, (), ())
     assert scenario.signals == SignalPlan("program", "program", 60.0)
-    assert scenario.limits == Limits(300, 60.0, 1.0e9)
+    assert scenario.limits == EpisodeLimits(300, 60.0, 1.0e9)
     assert TrafficPlan() == TrafficPlan(0.3, 5, 18, 50.0)
-    assert Condition() == Condition("always", 0.0, 0)
+    assert PhaseTrigger() == PhaseTrigger("always", 0.0, 0)
     assert Pose(1.0, 2.0).yaw == 0.0
     agent = EpisodeAgent("a", "car", Controller.NONE, Pose(0, 0))
     assert (agent.speed, agent.target_speed, agent.phases, agent.route, agent.wake_distance) == (

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from ssad.core.checkpoints import Card, save_weights
+from ssad.core.checkpoints import WeightsCard, save_weights
 from ssad.core.detections import Detections, Truth
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.detectors import make_detector
@@ -206,7 +206,7 @@ def test_weights_go_out_and_come_in(suffix: str, tmp_path: Path) -> None:
     if suffix == ".pth":  # as torchvision writes them
         torch.save(detector.model.state_dict(), path)
     else:
-        save_weights(path, detector.state_dict(), card=Card("drawn", "-", 3, CLASSES))
+        save_weights(path, detector.state_dict(), card=WeightsCard("drawn", "-", 3, CLASSES))
     again = torchvision_detector(LITE, classes=CLASSES, weights=path, seed=9)
     assert torch.equal(detector.dense(images).logit, again.dense(images).logit)
     with pytest.raises(FormatError, match="made for 3 or 4 classes, this detector has 2") as caught:

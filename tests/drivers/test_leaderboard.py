@@ -12,7 +12,7 @@ from helpers.command import ssad
 
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
-from ssad.core.types import Actor, Limits, Pose, Scenario
+from ssad.core.types import Actor, EpisodeLimits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard import Leaderboard, RoadOption, _global_plan_of, geolocation
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -190,7 +190,7 @@ def test_lidar_and_radar(tmp_path: Path) -> None:
         Actor("comes", "van", Pose(260.0, -1.75, math.pi), trajectory=nearer),
     )
     route = (Pose(229.0, -3.5), Pose(300.0, -5.25))
-    scenario = Scenario("eyes", "Custom", "ProvingGround", route, actors=actors, limits=Limits(max_steps=6))
+    scenario = Scenario("eyes", "Custom", "ProvingGround", route, actors=actors, limits=EpisodeLimits(max_steps=6))
     episode = build_episode(scenario, load_town("ProvingGround"), seed=0)
     driver = make_system(f"leaderboard:{path}")
     world = World([episode], {episode.town: load_town(episode.town)})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.core.checkpoints import Card, load_card, save_weights
+from ssad.core.checkpoints import WeightsCard, load_card, save_weights
 from ssad.core.errors import FormatError
 from ssad.core.traces import trace_hash
 from ssad.drivers import LEARNED, SYSTEMS, make_system
@@ -93,7 +93,7 @@ def test_other_weights_are_named_with_the_system(tmp_path: Path) -> None:
 def test_weights_that_cannot_be_used_are_named_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no such file"):
         make_system(f"sac:{tmp_path / 'none.safetensors'}")
-    about = Card("", "", 0, (), config={"observation": "frea", "action": "pedals", "squash": "clip"})
+    about = WeightsCard("", "", 0, (), config={"observation": "frea", "action": "pedals", "squash": "clip"})
     save_weights(tmp_path / "five.safetensors", {"0.weight": torch.ones(2, 5), "0.bias": torch.ones(2)}, card=about)
     with pytest.raises(FormatError, match=r"\[2, 5\], but the observation 'frea' has 24 numbers") as found:
         make_system(f"td3:{tmp_path / 'five.safetensors'}")

@@ -14,7 +14,7 @@ import pytest
 from ssad.core.errors import ConfigError, StoreError
 from ssad.engine import cluster
 from ssad.engine.cluster import RayCluster
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 
 class RayError(Exception):
@@ -145,7 +145,7 @@ def test_tasks_are_handed_over_with_the_start_and_come_back_as_outcomes(ray: Fak
         place.submit(task)
     assert place.busy == 2
     assert ray.given == [((abs, -4, 7.0), ("put", start)), ((abs, -5, 7.0), ("put", start))]
-    assert place.wait(0.25) == [Outcome(tasks[0], "ok", -4, "", None, 0.5)]
+    assert place.wait(0.25) == [TaskOutcome(tasks[0], "ok", -4, "", None, 0.5)]
     assert ray.did[-1] == ("wait", 0.25)
     assert place.busy == 1
 
@@ -232,13 +232,13 @@ class FakeProcesses:
         assert not self.closed
         self.tasks.append(task)
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         assert 0 < seconds <= 60
         self.looks += 1
         if self.looks % 2:
             return []
         task = self.tasks[-1]
-        return [Outcome(task, "failed", task.argument, "why", ConfigError("error"), 0.5)]
+        return [TaskOutcome(task, "failed", task.argument, "why", ConfigError("error"), 0.5)]
 
     def close(self) -> None:
         self.closed = True

@@ -19,7 +19,7 @@ from helpers.descriptors import open_files
 from ssad.core.errors import ConfigError, SSADError
 from ssad.engine import local
 from ssad.engine.local import THREADS, WORKER_MEMORY, LocalProcesses, ThisProcess, Worker, memory_left
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 GIB = 1 << 30
 
@@ -112,7 +112,7 @@ def test_a_worker_that_takes_too_long(runs: Callable[[str], Worker], clock: Cloc
     assert worker.give(task) is None
     assert worker.deadline == 5102.5
     clock.now += 3.0
-    assert worker.overdue() == Outcome(task, "timeout", None, "took longer than 2.5 s", None, 3.0)
+    assert worker.overdue() == TaskOutcome(task, "timeout", None, "took longer than 2.5 s", None, 3.0)
     worker.end()
 
 
@@ -175,7 +175,7 @@ class FakeWorker:
         self.cannot_send = False
         self.made.append(self)
 
-    def give(self, task: Task) -> Outcome | None:
+    def give(self, task: Task) -> TaskOutcome | None:
         assert self.ready
         assert self.task is None
         self.task = task
@@ -184,19 +184,19 @@ class FakeWorker:
     def answer(self, what: str) -> None:
         self.theirs.send(what)
 
-    def hear(self) -> Outcome | None:
+    def hear(self) -> TaskOutcome | None:
         answer = self.answers.recv()
         if answer == "ready":
             self.ready = True
             return None
         return self.outcome(answer)
 
-    def outcome(self, status: Any, reason: str = "") -> Outcome:
+    def outcome(self, status: Any, reason: str = "") -> TaskOutcome:
         assert self.task is not None
         task, self.task = self.task, None
-        return Outcome(task, status, None, reason)
+        return TaskOutcome(task, status, None, reason)
 
-    def overdue(self) -> Outcome:
+    def overdue(self) -> TaskOutcome:
         return self.outcome("timeout")
 
     def memory(self) -> int:

@@ -14,7 +14,7 @@ from ssad.core.errors import ConfigError, SSADError, StoreError
 from ssad.engine import pool as pools
 from ssad.engine.local import LocalProcesses, memory_left
 from ssad.engine.pool import Pool, open_pool, run_all
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 
 def seen(number: int) -> tuple[int, str]:
@@ -148,11 +148,11 @@ class Told:
     def submit(self, task: Task) -> None:
         self.task = task
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         assert self.task is not None
         task, self.task = self.task, None
         self.done.append(task)
-        return [Outcome(task, **self.how(task.argument))]
+        return [TaskOutcome(task, **self.how(task.argument))]
 
     def close(self) -> None:
         self.closed = True
@@ -204,9 +204,9 @@ class Slow:
         self.tasks.append(task)
         self.most = max(self.most, self.busy)
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         self.pauses.append(seconds)
-        return [] if len(self.pauses) % 2 else [Outcome(self.tasks.pop(0), "ok")]
+        return [] if len(self.pauses) % 2 else [TaskOutcome(self.tasks.pop(0), "ok")]
 
     def close(self) -> None:
         self.tasks = []

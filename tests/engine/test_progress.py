@@ -54,11 +54,11 @@ def test_a_line_every_ten_seconds_and_one_at_the_end(clock: Clock) -> None:
 def test_time_left_is_told_once_something_was_done_and_until_all_is(clock: Clock) -> None:
     live = Live("recording", 3, 1, console=plain(), unit="scenes")
     clock.now += 61.0
-    assert live.left() == "eta --:--", "what an earlier process did tells nothing"
+    assert live.remaining_time() == "eta --:--", "what an earlier process did tells nothing"
     live.advance(True)
-    assert live.left() == "eta 01:01"
+    assert live.remaining_time() == "eta 01:01"
     live.advance(True)
-    assert live.left() == "eta --:--"
+    assert live.remaining_time() == "eta --:--"
     live.line()
     assert text(live.console) == "recording: 3/3 scenes  eta --:--\n"
 

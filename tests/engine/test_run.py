@@ -19,7 +19,7 @@ from ssad.engine import run as engine
 from ssad.engine.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
 from ssad.engine.pool import Pool
 from ssad.engine.run import hash_artefacts, run, run_json
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 from ssad.experiments.runs import read_plan
 
 TIMEOUT = 8.0
@@ -99,14 +99,14 @@ class Scripted:
     def submit(self, task: Task) -> None:
         self.waiting.append(task)
 
-    def wait(self, seconds: float) -> Iterator[Outcome]:
+    def wait(self, seconds: float) -> Iterator[TaskOutcome]:
         task = self.waiting.pop()
         self.done.append((called(task), task.timeout_s))
         fate = self.fate(task)
         if fate is not None:
-            yield Outcome(task, **({"seconds": self.seconds} | dict(fate)))
+            yield TaskOutcome(task, **({"seconds": self.seconds} | dict(fate)))
         else:
-            yield Outcome(task, "ok", task.function(task.argument), seconds=self.seconds)
+            yield TaskOutcome(task, "ok", task.function(task.argument), seconds=self.seconds)
 
     def close(self) -> None:
         assert not self.waiting
@@ -371,7 +371,7 @@ def test_a_system_that_failed_alone_is_left_out_when_a_piece_fails_that_was_at_w
 
     def work(self: Any, missing: Sequence[Cell]) -> None:
         schedule.append(self)
-        self.alone.add("b")
+        self.unshared_systems.add("b")
         original(self, missing)
 
     monkeypatch.setattr(engine._Schedule, "work", work)

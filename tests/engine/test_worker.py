@@ -17,7 +17,7 @@ import pytest
 from ssad.core.errors import ConfigError
 from ssad.engine import worker
 from ssad.engine.local import Worker
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 
 def begin(path: Path) -> None:
@@ -45,7 +45,7 @@ def do(what: str) -> Any:
     return sys.path if what == "path" else what
 
 
-def work(process: Worker, what: Any) -> Outcome:
+def work(process: Worker, what: Any) -> TaskOutcome:
     """How a task ended."""
     assert process.give(Task(do, what)) is None
     outcome = process.hear()
@@ -131,7 +131,7 @@ def test_a_start_that_fails_is_told_and_ends_it(what: str, message: str) -> None
 def test_it_ends_with_its_input() -> None:
     one = Worker(None, {})
     one.hear()
-    one._orders.close()
+    one._requests.close()
     assert one.process.wait() == 0
     one.end()
 
@@ -140,7 +140,7 @@ def test_it_ends_with_its_input_even_at_work() -> None:
     one = Worker(None, {})
     one.hear()
     assert one.give(Task(signal.sigwait, [signal.SIGUSR1])) is None
-    one._orders.close()
+    one._requests.close()
     assert one.process.wait() == 0
     one.end()
 

@@ -11,7 +11,7 @@ import pytest
 
 from ssad.core.errors import ConfigError, RouteError, UnknownNameError
 from ssad.core.traces import first_difference
-from ssad.core.types import Actor, Controller, Episode, Limits, Pose, Scenario
+from ssad.core.types import Actor, Controller, Episode, EpisodeLimits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.drivers.careful.grade import grade_collision
 from ssad.scenarios.dynamic.episode import build_episode
@@ -38,7 +38,7 @@ def scenario(name: str = "one", **changes: object) -> Scenario:
         TOWN.name,
         route,
         actors=(parked, replace(car, **changes)),
-        limits=Limits(max_steps=60),
+        limits=EpisodeLimits(max_steps=60),
     )
     check(made)
     return made
@@ -139,7 +139,7 @@ def test_a_collision_with_them_is_graded_with_them_at_the_wheel() -> None:
         def act(self, view):
             return 0.0 * super().act(view)
 
-    ahead = replace(built(path=()), limits=Limits(max_steps=80))
+    ahead = replace(built(path=()), limits=EpisodeLimits(max_steps=80))
     (trace,) = rollout(World([ahead], GRAPHS), make_system("blind"), policies=lambda name: Stay())
     assert trace.end == "collision"
     found = grade_collision(ahead, TOWN, trace, policies=lambda name: Stay())

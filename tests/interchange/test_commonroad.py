@@ -12,7 +12,7 @@ import pytest
 from helpers.command import ssad
 from helpers.generated import generated
 
-from ssad.core.types import Actor, Episode, EpisodeTrace, Limits, Pose, Scenario, SignalPlan
+from ssad.core.types import Actor, Episode, EpisodeLimits, EpisodeTrace, Pose, Scenario, SignalPlan
 from ssad.drivers import make_system
 from ssad.interchange.commonroad_reader import read_commonroad
 from ssad.interchange.commonroad_writer import STILL
@@ -113,7 +113,7 @@ def test_who_comes_later_leaves_or_stands_comes_back(tmp_path: Path) -> None:
         parameters={"ego_speed": 3.0},
         actors=(things[0], late, *things[1:], early),
         signals=SignalPlan("red", "green"),
-        limits=Limits(max_steps=60, contact="count"),
+        limits=EpisodeLimits(max_steps=60, contact="count"),
         target_speed=6.5,
     )
     (again,) = returned([scenario], tmp_path, "autopilot")

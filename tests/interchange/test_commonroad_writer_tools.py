@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ssad.core.geometry import obb_distance
-from ssad.core.types import Actor, EpisodeTrace, Limits, Pose, Scenario
+from ssad.core.types import Actor, EpisodeLimits, EpisodeTrace, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.commonroad_reader import read_commonroad
 from ssad.interchange.export import export_commonroad
@@ -167,7 +167,7 @@ def test_time_to_collision_is_that_of_crime_behind_a_slower_car(tmp_path: Path) 
         (Pose(x, y), Pose(x + 110.0, y)),
         parameters={"ego_speed": 8.0},
         actors=(Actor("slow", "suv", Pose(*rows[0][1:]), trajectory=rows),),
-        limits=Limits(max_steps=70),
+        limits=EpisodeLimits(max_steps=70),
         target_speed=8.0,
     )
     ((path, trace),) = driven([scenario], tmp_path)

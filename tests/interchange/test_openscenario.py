@@ -16,7 +16,7 @@ from helpers.command import ssad
 from helpers.generated import generated
 
 from ssad.core.errors import FormatError
-from ssad.core.types import Actor, Condition, Episode, EpisodeTrace, Limits, Phase, Pose, Scenario
+from ssad.core.types import Actor, Episode, EpisodeLimits, EpisodeTrace, Phase, PhaseTrigger, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario
@@ -73,21 +73,21 @@ def test_a_scenario_comes_back_as_the_same_drive(names: Sequence[str], system: s
     same_drives(built(scenarios), built(again), system)
 
 
-def waiting(first: Condition) -> Scenario:
+def waiting(first: PhaseTrigger) -> Scenario:
     """Somebody who goes by the ego, 1.5 s later slower, and stands 2 s after that."""
     phases = (
         Phase(0.0, first),
-        Phase(6.0, Condition("after", 1.5)),
-        Phase(1.0, Condition("after", 2.0)),
-        Phase(0.0, Condition("after", 2.5)),
+        Phase(6.0, PhaseTrigger("after", 1.5)),
+        Phase(1.0, PhaseTrigger("after", 2.0)),
+        Phase(0.0, PhaseTrigger("after", 2.5)),
     )
     car = Actor("car", "suv", Pose(242.0, -1.75, 0.0), phases=phases)
     route = (Pose(217.0, -5.25), Pose(317.0, -5.25))
-    return Scenario("waits/00", "Custom", "ProvingGround", route, actors=(car,), limits=Limits(max_steps=160))
+    return Scenario("waits/00", "Custom", "ProvingGround", route, actors=(car,), limits=EpisodeLimits(max_steps=160))
 
 
-@pytest.mark.parametrize("first", [Condition("ego_distance", 15.0), Condition("after", 1.0)])
-def test_waits_come_back(first: Condition, tmp_path: Path) -> None:
+@pytest.mark.parametrize("first", [PhaseTrigger("ego_distance", 15.0), PhaseTrigger("after", 1.0)])
+def test_waits_come_back(first: PhaseTrigger, tmp_path: Path) -> None:
     """Phases that begin so long after another, whenever that begins."""
     scenario = waiting(first)
     (again,) = returned([scenario], tmp_path)
@@ -161,7 +161,7 @@ def test_asam_checkers_find_nothing(tool: str, bundle: str, suffix: str, names: 
     program = shutil.which(tool)
     if program is None:
         pytest.skip(f"no {tool}: install asam-qc-openscenarioxml and asam-qc-opendrive in an environment of their own")
-    more = generated() if names == "precrash" else [waiting(Condition("ego_distance", 15.0))]
+    more = generated() if names == "precrash" else [waiting(PhaseTrigger("ego_distance", 15.0))]
     files, _ = export_openscenario([*load_scenarios(names), *more], tmp_path)
     assert len([p for p in files if p.suffix == ".xosc"]) == (52 if names == "precrash" else 2)
     for path in (p for p in files if p.suffix == f".{suffix}"):
@@ -299,8 +299,12 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
     path.write_text(text)
     found = read_openscenario(path)
     (actor,) = found.scenario.actors
-    near = Condition("ego_distance", 15.0)
-    assert actor.phases == (Phase(0.0, near), Phase(9.0, Condition("after", 2.0)), Phase(0.0, Condition("after", 3.5)))
+    near = PhaseTrigger("ego_distance", 15.0)
+    assert actor.phases == (
+        Phase(0.0, near),
+        Phase(9.0, PhaseTrigger("after", 2.0)),
+        Phase(0.0, PhaseTrigger("after", 3.5)),
+    )
     assert not any("delay" in line for line in found.lost)
     (trace,) = drive(built([found.scenario]), "blind")
     gap = np.hypot(trace.x[:, 0] - trace.x[:, 1], trace.y[:, 0] - trace.y[:, 1])
@@ -322,7 +326,7 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
         count=1,
     )
     path.write_text(timed)
-    assert read_openscenario(path).scenario.actors[0].phases[0] == Phase(9.0, Condition("time", 3.5))
+    assert read_openscenario(path).scenario.actors[0].phases[0] == Phase(9.0, PhaseTrigger("time", 3.5))
     path.write_text(text.replace('delay="2"', 'delay="soon"'))
     with pytest.raises(FormatError, match="delay is 'soon', not a number"):
         read_openscenario(path)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers.command import ssad
 
-from ssad.core.types import Controller, Episode, EpisodeAgent, Limits, Pose, Scenario
+from ssad.core.types import Controller, Episode, EpisodeAgent, EpisodeLimits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.scenic_programs import Program, load_program, map_of, sample
 from ssad.scenarios.dynamic import build_episode, read_scenarios
@@ -128,7 +128,7 @@ def test_bodies_move_as_the_world_moves_them(tmp_path: Path) -> None:
     )
     ego = EpisodeAgent("ego", "car", Controller.EXTERNAL, start, route=line)
     scenario = Scenario("x", "Custom", TOWN, (start, start))
-    limits = Limits(max_steps=400, contact="count")
+    limits = EpisodeLimits(max_steps=400, contact="count")
     world = World([Episode("x", scenario, TOWN, (ego,), limits=limits)], {TOWN: load_town(TOWN)})
     for row in rows[1:]:
         world.step(np.array([[[1.0, 0.0, 0.05, 0.0]]], np.float32))

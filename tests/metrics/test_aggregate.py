@@ -10,7 +10,7 @@ from helpers.metric_traces import make_trace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.metrics import METRICS, Outcome, aggregate, aggregate_groups, episode_metrics, overall_score
+from ssad.metrics import METRICS, EpisodeOutcome, aggregate, aggregate_groups, episode_metrics, overall_score
 from ssad.metrics.intervals import share_limits
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "reference" / "metrics.md"
@@ -27,7 +27,7 @@ def episode(hit: bool = False, complete: float = 100.0, distance: float = 0.0, s
 
 def outcomes(episodes, group="g", family="other"):
     """Each episode a case and cluster of its own."""
-    return [Outcome(e, group, f"{group}{k}", f"{group}{k}", family) for k, e in enumerate(episodes)]
+    return [EpisodeOutcome(e, group, f"{group}{k}", f"{group}{k}", family) for k, e in enumerate(episodes)]
 
 
 def test_failed_episodes_stay_in_the_denominator():
@@ -72,7 +72,7 @@ EPISODES = [episode(), episode(True, 10), episode(True, 60, 1.5), None, episode(
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(0, 11), max_size=30), st.randoms(use_true_random=False))
 def test_copies_and_order_change_nothing(copies, random):
-    found = [Outcome(e, g, f"{g}{k // 2}", f"{g}{k}", "other") for g in "ab" for k, e in enumerate(EPISODES)]
+    found = [EpisodeOutcome(e, g, f"{g}{k // 2}", f"{g}{k}", "other") for g in "ab" for k, e in enumerate(EPISODES)]
     mixed = found + [found[i] for i in copies]
     random.shuffle(mixed)
     # compared as text, since NaN differs from itself
@@ -81,7 +81,7 @@ def test_copies_and_order_change_nothing(copies, random):
 
 def test_fifty_copies_of_two_motions_are_two_cases():
     hit, free = episode(hit=True), episode()
-    runs = [Outcome(e, "LaneChanging", "LaneChanging/00", case) for e, case in ((hit, "x"), (free, "y"))] * 25
+    runs = [EpisodeOutcome(e, "LaneChanging", "LaneChanging/00", case) for e, case in ((hit, "x"), (free, "y"))] * 25
     result = aggregate(runs)
     assert (result["CR"].n, result["CR"].clusters, result["CR"].mean, result["CR"].method) == (2, 1, 0.5, "none")
 
@@ -122,17 +122,17 @@ def line(**more):
 
 
 def test_outcome_of_a_record():
-    old = Outcome.from_record(line())
+    old = EpisodeOutcome.from_record(line())
     assert (old.cluster, old.case, old.family) == ("RightTurn/01", "k", "pre-crash")
-    assert Outcome.from_record(line(), "hash").case == "hash"
+    assert EpisodeOutcome.from_record(line(), "hash").case == "hash"
     assert old.metrics.stop_signs is None  # written as 0 by a world without stop signs
-    new = Outcome.from_record(line(cluster="route", case="motion"), "hash")
+    new = EpisodeOutcome.from_record(line(cluster="route", case="motion"), "hash")
     assert (new.cluster, new.case, new.metrics.stop_signs) == ("route", "motion", 0)
-    assert Outcome.from_record(line(status="timeout", metrics={})).metrics is None
-    assert Outcome.from_record(
+    assert EpisodeOutcome.from_record(line(status="timeout", metrics={})).metrics is None
+    assert EpisodeOutcome.from_record(
         line(group="Town02", spec={"scenario": {"name": "n", "type": "NaturalJunction"}})
     ).family == ("natural")
-    assert Outcome.from_record(line(group="mine")).family == "other"
+    assert EpisodeOutcome.from_record(line(group="mine")).family == "other"
 
 
 def test_a_metric_that_some_episodes_lack_is_over_those_that_have_it():

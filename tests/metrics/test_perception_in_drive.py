@@ -79,7 +79,9 @@ def test_in_view_is_what_a_camera_shows_and_nothing_hides() -> None:
 
 def test_what_is_found_where_it_is_scores_one_and_what_is_not_found_zero() -> None:
     trace = towards()
-    good = component_metrics(trace, perceived(trace, lambda k: [(25.0, 0.0)], lambda k: [(25.0, 0.0)]), sure=0.3)
+    good = component_metrics(
+        trace, perceived(trace, lambda k: [(25.0, 0.0)], lambda k: [(25.0, 0.0)]), phantom_score=0.3
+    )
     assert good["AP"] == pytest.approx(1.0)
     assert [good[n] for n in ("recall", "target_recall", "distance_error", "phantoms", "believed", "switches")] == [
         1.0,
@@ -91,7 +93,7 @@ def test_what_is_found_where_it_is_scores_one_and_what_is_not_found_zero() -> No
     ]
     assert good["target_recall_30_60"] is None
     assert good["target_recall_15_30"] == 1.0
-    none = component_metrics(trace, perceived(trace, lambda k: [], lambda k: []), sure=0.3)
+    none = component_metrics(trace, perceived(trace, lambda k: [], lambda k: []), phantom_score=0.3)
     assert [none[n] for n in ("AP", "recall", "target_recall", "believed")] == [0.0, 0.0, 0.0, 0.0]
     assert none["distance_error"] is None
     assert none["switches"] is None
@@ -114,17 +116,19 @@ def test_tracks_are_scored_against_who_is_in_view() -> None:
 
 def test_misplaced_objects_have_a_distance_error_and_invented_ones_are_phantoms() -> None:
     trace = towards()
-    found = component_metrics(trace, perceived(trace, lambda k: [(28.0, 0.0), (40.0, 9.0)], lambda k: []), sure=0.3)
+    found = component_metrics(
+        trace, perceived(trace, lambda k: [(28.0, 0.0), (40.0, 9.0)], lambda k: []), phantom_score=0.3
+    )
     assert found["target_recall"] == 0.0
     assert found["distance_error"] == pytest.approx(3.0)
     assert found["phantoms"] == 1.0
-    unsure = component_metrics(trace, perceived(trace, lambda k: [(40.0, 9.0)], lambda k: []), sure=0.95)
+    unsure = component_metrics(trace, perceived(trace, lambda k: [(40.0, 9.0)], lambda k: []), phantom_score=0.95)
     assert unsure["phantoms"] == 0.0
 
 
 def test_a_drive_without_others_has_nothing_to_measure() -> None:
     trace = make_trace(STEPS)
-    alone = component_metrics(trace, perceived(trace, lambda k: [], lambda k: []), sure=0.3)
+    alone = component_metrics(trace, perceived(trace, lambda k: [], lambda k: []), phantom_score=0.3)
     assert all(alone[name] is None for name in ("AP", "recall", "target_recall", "believed"))
     assert alone["phantoms"] == 0.0
 
@@ -193,7 +197,7 @@ def test_who_stands_before_nothing_stands_before_a_phantom() -> None:
 def test_lost_pictures_count_as_looks_in_which_nothing_was_found() -> None:
     trace = towards()
     half = perceived(trace, lambda k: [(25.0, 0.0)] if k % 4 else None, lambda k: [])
-    assert component_metrics(trace, half, sure=0.3)["target_recall"] == pytest.approx(10 / 21)
+    assert component_metrics(trace, half, phantom_score=0.3)["target_recall"] == pytest.approx(10 / 21)
     assert no_objects().score.shape == (0,)
 
 
@@ -219,10 +223,12 @@ def test_how_a_detector_fails_is_what_a_perfect_one_takes_to_fail_alike() -> Non
         look = k // 2
         return [(12.0, 5.0)] if look in {4, 5, 6, 10} else [(21.0, 0.0), (12.0, 5.0)]
 
-    metrics = component_metrics(trace, perceived(trace, found, lambda k: []), sure=0.3)
+    metrics = component_metrics(trace, perceived(trace, found, lambda k: []), phantom_score=0.3)
     assert metrics["recall"] == pytest.approx(1.0 - 4 / 42)
     assert metrics["missed_burst"] == pytest.approx(2.0)
     assert metrics["distance_share"] == pytest.approx(np.sqrt(17 * 0.05**2 / (17 + 21)))
-    all_ = component_metrics(trace, perceived(trace, lambda k: [(20.0, 0.0), (12.0, 5.0)], lambda k: []), sure=0.3)
+    all_ = component_metrics(
+        trace, perceived(trace, lambda k: [(20.0, 0.0), (12.0, 5.0)], lambda k: []), phantom_score=0.3
+    )
     assert all_["missed_burst"] is None
     assert all_["distance_share"] == pytest.approx(0.0, abs=1e-9)

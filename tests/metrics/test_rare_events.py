@@ -33,7 +33,7 @@ def test_without_an_event_the_lower_limit_is_zero_and_the_upper_is_that_of_one_e
 
 
 def test_an_estimate_counts_events_and_how_many_equal_ones_they_are_worth() -> None:
-    found = weighted_estimate(np.array([0.0] * 96 + [2.0, 2.0, 1.0, 1.0]), "drawn", most=5.0, work=7.0)
+    found = weighted_estimate(np.array([0.0] * 96 + [2.0, 2.0, 1.0, 1.0]), "drawn", max_weight=5.0, work=7.0)
     assert (found.probability, found.episodes, found.events) == (pytest.approx(0.06), 100, 4)
     assert found.effective == pytest.approx(36.0 / 10.0)
     assert 0.0 < found.low < 0.06 < found.high < 1.0

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ssad.core.detections import Detections, Truth
-from ssad.metrics.target_attacks import Sighting, _precisions, precision, sighting, target_scores
+from ssad.metrics.target_attacks import TargetSighting, _precisions, precision, sighting, target_scores
 
 TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
 
@@ -17,11 +17,11 @@ def seen(
     drive: str = "a",
     real: tuple[list[float], ...] = (TARGET,),
     any_class: float = 0.0,
-) -> Sighting:
+) -> TargetSighting:
     """A picture with true boxes, the target first, and found boxes with their scores."""
     boxes = np.array([box for box, _ in found], float).reshape(-1, 4)
     scores = np.array([score for _, score in found], float)
-    return Sighting(drive, boxes, scores, np.array(real, float), np.zeros(len(real), bool), any_class)
+    return TargetSighting(drive, boxes, scores, np.array(real, float), np.zeros(len(real), bool), any_class)
 
 
 def test_only_boxes_of_the_targets_class_count() -> None:
@@ -104,7 +104,7 @@ def test_targets_lost_are_those_that_were_found_before() -> None:
 def test_intervals_come_from_drives_and_copies_do_not_narrow_them() -> None:
     draws = np.random.default_rng(0)
 
-    def pictures(drives: int, each: int) -> list[Sighting]:
+    def pictures(drives: int, each: int) -> list[TargetSighting]:
         levels = draws.random(drives)
         return [seen((TARGET, float(level)), drive=str(k)) for k, level in enumerate(levels) for _ in range(each)]
 
@@ -146,6 +146,6 @@ def test_precision_of_drawn_drives_is_that_of_their_pictures() -> None:
         naive = []
         for drives in drawn:
             picked = [pictures[k] for drive in drives for k in np.flatnonzero(of == drive)]
-            naive.append(precision(picked, target_only=target_only, least=least))
-        assert _precisions(pictures, of, drawn, target_only=target_only, least=least) == naive
+            naive.append(precision(picked, target_only=target_only, min_score=least))
+        assert _precisions(pictures, of, drawn, target_only=target_only, min_score=least) == naive
         assert len(set(naive)) > 10

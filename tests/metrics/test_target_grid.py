@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.metrics.target_attacks import Sighting
+from ssad.metrics.target_attacks import TargetSighting
 from ssad.metrics.target_grid import grid_scores
 
 TARGET = np.array([[10.0, 10.0, 50.0, 40.0]])
 
 
-def seen(score: float) -> Sighting:
+def seen(score: float) -> TargetSighting:
     """A picture whose target is found with a score; 0: it is not."""
     found = TARGET if score else np.zeros((0, 4))
-    return Sighting("a", found, np.full(len(found), score), TARGET, np.zeros(1, bool))
+    return TargetSighting("a", found, np.full(len(found), score), TARGET, np.zeros(1, bool))
 
 
 def row(distance: float, azimuth: float, weather: str = "day") -> dict[str, object]:

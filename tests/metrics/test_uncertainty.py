@@ -55,7 +55,7 @@ def test_copies_and_order_change_nothing(sample, data):
 @given(samples())
 def test_limits_hold_the_mean_and_stay_in_bounds(sample):
     kind, values = sample
-    e = estimate(values, kind, least=0.0)
+    e = estimate(values, kind, min_value=0.0)
     if math.isnan(e.mean):
         assert e.n == 0
         return
@@ -113,7 +113,7 @@ def test_scale_and_least():
     assert (hundred.low, hundred.high) == (pytest.approx(100 * one.low), pytest.approx(100 * one.high))
     skewed = [0.0, 0.01, 0.0, 0.02, 0.03, 9.0, 0.04, 0.05, 0.06, 0.07]
     assert estimate(cases(skewed), "mean").low < 0.0
-    assert estimate(cases(skewed), "mean", least=0.0).low == 0.0
+    assert estimate(cases(skewed), "mean", min_value=0.0).low == 0.0
     mirrored = one.scaled(-2.0, 1.0)
     assert (mirrored.low, mirrored.high) == (pytest.approx(1 - 2 * one.high), pytest.approx(1 - 2 * one.low))
     assert mirrored.mean == pytest.approx(1 - 2 * one.mean)
@@ -251,7 +251,7 @@ def test_the_limits_are_those_of_the_intervals():
         pytest.approx(estimate(of_pairs, "mean").low),
         pytest.approx(estimate(of_pairs, "mean").high),
     )
-    assert estimate(of_pairs, "mean", scale=4.0, least=0.45).low == pytest.approx(0.45)
+    assert estimate(of_pairs, "mean", scale=4.0, min_value=0.45).low == pytest.approx(0.45)
 
 
 def test_the_range_is_that_of_the_clusters_means():

@@ -31,9 +31,18 @@ from ssad.core.types import F64, EpisodeTrace
 from ssad.experiments.perception.physical.target_views import solid_target, target_truth
 from ssad.recorders.drives import make_drive
 from ssad.recorders.nuscenes import drive
-from ssad.recorders.target_images import CLASSES, HIDDEN, SECONDS, SEEN, TARGET, _named, clip_views, record_clips
+from ssad.recorders.target_images import (
+    CLASSES,
+    HIDDEN,
+    MIN_VISIBLE_SHARE,
+    SECONDS,
+    TARGET,
+    _body_of_target,
+    clip_views,
+    record_clips,
+)
 from ssad.recorders.target_recording import FOCAL, SMALL, Clips, pair_images
-from ssad.recorders.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
+from ssad.recorders.viewpoints import AIM, CAR_EYE, MIN_CAMERA_HEIGHT, follow, look_at, polar, turn_of, weather_name
 from ssad.rendering.camera.labels import label_picture
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.scene import TextureLayer
@@ -171,7 +180,7 @@ def test_an_orbit_is_seen_from_where_its_row_says(orbits: Path) -> None:
         away, azimuth, elevation = place_of(row)
         assert away == pytest.approx(row["distance"], abs=0.01)
         assert turned(azimuth, row["azimuth"]) < 0.05
-        lowest = float(np.degrees(np.arcsin((EYE - AIM) / row["distance"])))
+        lowest = float(np.degrees(np.arcsin((MIN_CAMERA_HEIGHT - AIM) / row["distance"])))
         assert elevation == pytest.approx(max(row["elevation"], lowest), abs=0.05)
         assert (row["distance"], row["azimuth"], row["elevation"]) not in cells or row["town"] != "Twinford"
         cells.add((row["distance"], row["azimuth"], row["elevation"]))
@@ -222,7 +231,7 @@ def test_boxes_are_in_the_picture_and_the_target_lies_in_its_3d_box(mode: str, r
         assert row["weather"] == weather_name(SceneWeather(**row["light"]))
         thing = target_of(data, row)
         assert not thing["iscrowd"]
-        assert thing["visible"] >= SEEN
+        assert thing["visible"] >= MIN_VISIBLE_SHARE
         assert data["categories"][thing["category_id"] - 1]["name"] == "car"
         x0, y0, x1, y1 = projected(row)
         x, y, w, h = thing["bbox"]
@@ -351,7 +360,7 @@ def test_the_named_target_is_the_same_metal_everywhere() -> None:
     found = []
     for key in ("one", "another"):
         objects = SceneObjects(0.1, (key,))
-        body = _named(objects, target)
+        body = _body_of_target(objects, target)
         found.append(objects.meshes[body.meshes[0]])
         assert body.paint == target.colour
         assert body.size == target.full_size
@@ -540,7 +549,7 @@ def test_a_camera_looks_at_its_point_upright() -> None:
 
 def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: EpisodeTrace) -> None:
     def shots(behind: float) -> list[Any]:
-        return follow(market, SceneWeather(), behind=behind, height=2.0, count=4, draws=generator(1))
+        return follow(market, SceneWeather(), behind=behind, height=2.0, count=4, rng=generator(1))
 
     found = shots(20.0)
     assert len(found) > 20

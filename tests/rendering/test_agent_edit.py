@@ -10,7 +10,7 @@ import torch
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.types import Controller, Limits
+from ssad.core.types import Controller, EpisodeLimits
 from ssad.rendering import episode_scene
 from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.scene_edit import SceneEdit
@@ -75,7 +75,7 @@ def test_what_a_driver_sees_of_an_attack_is_what_the_trace_shows(
     town = load_town("ProvingGround")
     chosen = next(one for one in load_scenarios("precrash") if one.name == scenario)
     episode = build_episode(chosen, town, seed=0)
-    episode = replace(episode, agents=episode.agents[:2], limits=Limits(max_steps=2))  # nothing hides the target
+    episode = replace(episode, agents=episode.agents[:2], limits=EpisodeLimits(max_steps=2))  # nothing hides the target
     weather = at_hour(DAY, "sun_behind", 0.0)
     bare = replace(attack, edit=lambda mesh: SceneEdit())
     seen = []

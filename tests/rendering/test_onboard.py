@@ -13,7 +13,7 @@ import torch
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import AgentKind, Controller, Episode, EpisodeTrace, Limits, SignalState
+from ssad.core.types import AgentKind, Controller, Episode, EpisodeLimits, EpisodeTrace, SignalState
 from ssad.rendering import onboard as loop_sensors
 from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.lamps import SceneLamp
@@ -50,7 +50,7 @@ def episodes() -> tuple[Episode, ...]:
     names = ("StraightObstacle/00", "TurningObstacle/00", "RedlightRunning/00")
     by_name = {s.name: s for s in load_scenarios("precrash")}
     built = [build_episode(by_name[name], town(), seed=0) for name in names]
-    return tuple(replace(e, limits=Limits(max_steps=STEPS - 2 * n)) for n, e in enumerate(built))
+    return tuple(replace(e, limits=EpisodeLimits(max_steps=STEPS - 2 * n)) for n, e in enumerate(built))
 
 
 def world(*numbers: int) -> World:
@@ -302,7 +302,7 @@ def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest
     from ssad.simulators import closed_loop as driving
 
     watcher = Watcher("CAM_BACK")
-    short = replace(episodes()[0], limits=Limits(max_steps=2))
+    short = replace(episodes()[0], limits=EpisodeLimits(max_steps=2))
     monkeypatch.setattr(driving, "episode_of", lambda cell: short)
     monkeypatch.setattr(driving, "system_of", lambda name: watcher)
     cell = SimpleNamespace(key="a", system="watcher", spec={"scenario": {"type": short.scenario.type}})

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 
-from ssad.report.figures import Change, Interval, Panel, Point, change_plot, element, interval_plot, panels
-from ssad.report.tables import Cell
+from ssad.report.figures import CurvePoint, Interval, MetricChange, Panel, change_plot, element, interval_plot, panels
+from ssad.report.tables import TableCell
 
-RANGE = Cell(0.5, 0.25, 0.75, method="range")
+RANGE = TableCell(0.5, 0.25, 0.75, method="range")
 
 
 def parsed(text: str) -> ET.Element:
@@ -22,7 +22,11 @@ def test_an_element_has_its_attributes_in_order_and_leaves_out_none() -> None:
 
 
 def test_panels_share_one_scale_and_leave_out_what_is_not_measured() -> None:
-    points = [Point(0.0, Cell(40.0, 35.0, 45.0), "a"), Point(0.5, Cell(math.nan), "b"), Point(1.0, Cell(12.0), "c")]
+    points = [
+        CurvePoint(0.0, TableCell(40.0, 35.0, 45.0), "a"),
+        CurvePoint(0.5, TableCell(math.nan), "b"),
+        CurvePoint(1.0, TableCell(12.0), "c"),
+    ]
     figure = parsed(panels([Panel("x < y", [(0.0, "0")], [points])] * 2, label="a & b", columns=1))
     assert figure.attrib["aria-label"] == "a & b"
     assert [text.text for text in figure.iter("text") if text.attrib.get("class") == "name"] == ["x < y"] * 2
@@ -31,7 +35,10 @@ def test_panels_share_one_scale_and_leave_out_what_is_not_measured() -> None:
 
 
 def test_intervals_are_bars_and_ranges_are_dashes() -> None:
-    groups = [("g", [Interval(0, Cell(0.5, 0.25, 0.75, method="beta"), "bar"), Interval(1, RANGE, "dash")]), ("h", [])]
+    groups = [
+        ("g", [Interval(0, TableCell(0.5, 0.25, 0.75, method="beta"), "bar"), Interval(1, RANGE, "dash")]),
+        ("h", []),
+    ]
     figure = parsed(interval_plot(groups, label="l"))
     bars = [line for line in figure.iter("line") if line.attrib.get("class") != "grid"]
     assert [bar.attrib.get("stroke-dasharray") for bar in bars] == [None, "3 3"]
@@ -42,9 +49,9 @@ def test_intervals_are_bars_and_ranges_are_dashes() -> None:
 
 def test_crowded_points_have_no_names_but_tips() -> None:
     changes = [
-        Change(Cell(0.1), RANGE, "near", "shift", "near: tip"),
-        Change(Cell(0.1), Cell(0.9), "far", "shift", "far: tip"),
-        Change(Cell(0.1), Cell(0.51), "hidden", "<other>", "hidden: tip"),
+        MetricChange(TableCell(0.1), RANGE, "near", "shift", "near: tip"),
+        MetricChange(TableCell(0.1), TableCell(0.9), "far", "shift", "far: tip"),
+        MetricChange(TableCell(0.1), TableCell(0.51), "hidden", "<other>", "hidden: tip"),
     ]
     figure = parsed(change_plot(changes, {"shift": "blue"}, label="l", x_title="x", y_title="y"))
     texts = [text.text for text in figure.iter("text")]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ssad.report.records import case_of, field, metric_cell, metric_of
-from ssad.report.tables import Cell, Row, Table, to_markdown
+from ssad.report.tables import Table, TableCell, TableRow, to_markdown
 
 
 def line(system: str, town: str, value: float | None, **more: Any) -> dict[str, Any]:
@@ -25,7 +25,7 @@ LINES = [
 ]
 
 
-def share(lines: Any, town: str) -> Cell:
+def share(lines: Any, town: str) -> TableCell:
     return metric_cell([one for one in lines if one["town"] == town], "collision", "share")
 
 
@@ -48,7 +48,7 @@ def test_rows_are_left_out_by_a_condition_on_all_their_records() -> None:
         rows={"System": field("system"), "Town": field("town")},
         columns={"A": "in A"},
         metric=share,
-        having=lambda lines: len(lines) > 1,
+        condition=lambda lines: len(lines) > 1,
     )
     assert [row.head for row in table.rows] == [("b", "A")]
 
@@ -62,8 +62,8 @@ def test_a_key_keeps_rows_of_equal_heads_apart() -> None:
 
 
 def test_published_rows_follow_the_row_of_a_record_and_others_stand_below() -> None:
-    def published(one: dict[str, Any]) -> list[Row]:
-        return [Row.of_published(["the paper"], (0.25, None))] if one["system"] == "b" else []
+    def published(one: dict[str, Any]) -> list[TableRow]:
+        return [TableRow.of_published(["the paper"], (0.25, None))] if one["system"] == "b" else []
 
     table = Table.pivot(
         "t",
@@ -73,7 +73,7 @@ def test_published_rows_follow_the_row_of_a_record_and_others_stand_below() -> N
         columns={"A": "A", "B": "B"},
         metric=share,
         published=published,
-        below=[Row.of_published(["others"], (1, 1))],
+        footer_rows=[TableRow.of_published(["others"], (1, 1))],
         source="somewhere",
     )
     assert [row.head[0] for row in table.rows] == ["b", "the paper", "a", "others"]
@@ -89,8 +89,8 @@ def test_a_listing_has_a_row_for_each_record_even_where_heads_are_equal() -> Non
         LINES,
         rows={"System": field("system"), "Repetition": field("repetition")},
         columns={"collision": "CR"},
-        metric=lambda one, name: Cell.value(one["metrics"][name], digits=0),
-        published=lambda one: [Row.of_published(["p", ""], [2.0])] if one["town"] == "B" else [],
+        metric=lambda one, name: TableCell.value(one["metrics"][name], digits=0),
+        published=lambda one: [TableRow.of_published(["p", ""], [2.0])] if one["town"] == "B" else [],
     )
     assert [row.head for row in table.rows] == [("b", ""), ("a", ""), ("b", ""), ("b", "3"), ("p", "")]
     assert [row.cells[0].text for row in table.rows[:4]] == ["1", "0", "0", "1"]

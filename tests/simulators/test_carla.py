@@ -24,7 +24,7 @@ from matplotlib.path import Path as Path2D
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.types import Actor, Controller, Episode, EpisodeTrace, Limits, Pose, Scenario, SignalState
+from ssad.core.types import Actor, Controller, Episode, EpisodeLimits, EpisodeTrace, Pose, Scenario, SignalState
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard_sensors import camera_of, lidar_of, radar_of
 from ssad.metrics import episode_metrics
@@ -109,7 +109,7 @@ def test_trajectories_are_put_and_leave(carla: ModuleType) -> None:
     rows = ((1.0, 230.0, -1.75, 0.0), (3.0, 250.0, -1.75, 0.0))
     late = Actor("late", "coupe", Pose(*rows[0][1:]), trajectory=rows)
     route = (Pose(217.0, -5.25), Pose(260.0, -5.25))
-    scenario = Scenario("late", "Custom", "ProvingGround", route, actors=(late,), limits=Limits(max_steps=40))
+    scenario = Scenario("late", "Custom", "ProvingGround", route, actors=(late,), limits=EpisodeLimits(max_steps=40))
     (trace,) = drive_there(built([scenario]), "autopilot")
     there = np.flatnonzero(trace.active[:, 1])
     assert (there[0], there[-1]) == (10, 30)
@@ -160,7 +160,7 @@ def test_what_only_carla_feels_ends_the_episode(carla: ModuleType) -> None:
 def test_the_lane_sensor_counts_what_the_body_crosses(carla: ModuleType) -> None:
     """A change to the lane on the left: each corner crosses the broken line once; the mirror counts the body once."""
     route = (Pose(230.0, -5.25), Pose(300.0, -5.25))
-    scenario = Scenario("changes", "Custom", "ProvingGround", route, limits=Limits(max_steps=80))
+    scenario = Scenario("changes", "Custom", "ProvingGround", route, limits=EpisodeLimits(max_steps=80))
     (episode,) = built([scenario])
     simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=SERVER)
     nothing = {"lane_crossings": 0, "lane_markings": {}}
@@ -204,7 +204,7 @@ def looked(system: object, names: Sequence[str], *, server: Server = SERVER, ste
     actors = tuple(
         Actor(f"car {k}", "suv", Pose(pose.x + x, pose.y + y, turn)) for k, (x, y, turn) in enumerate(PLACES)
     )
-    scenario = Scenario("looks", "Custom", "ProvingGround", route, actors=actors, limits=Limits(max_steps=steps))
+    scenario = Scenario("looks", "Custom", "ProvingGround", route, actors=actors, limits=EpisodeLimits(max_steps=steps))
     (episode,) = built([scenario])
     eyes = sensor_blueprints(requested_sensors([system]), 0.1)
     simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server, blueprints=eyes)

@@ -17,7 +17,7 @@ pytest.importorskip("highway_env", reason="needs the extra highway")
 from highway_env.vehicle.behavior import IDMVehicle
 
 from ssad.core.traces import trace_hash
-from ssad.core.types import Controller, Episode, Limits
+from ssad.core.types import Controller, Episode, EpisodeLimits
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.engine.kind import Resources
 from ssad.engine.run import run
@@ -40,7 +40,7 @@ def episodes() -> tuple[Episode, ...]:
 
 
 def make(assign, steps: int = 200) -> HighwayEnv:
-    short = [replace(e, limits=Limits(max_steps=steps)) for e in episodes()]
+    short = [replace(e, limits=EpisodeLimits(max_steps=steps)) for e in episodes()]
     return HighwayEnv(short, GRAPHS, assign=assign)
 
 
@@ -152,7 +152,7 @@ def test_scenarios_round_trip() -> None:
 def test_the_engine_runs_both_simulators_into_one_report_and_replays_to_the_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    short = Limits(max_steps=20)
+    short = EpisodeLimits(max_steps=20)
     monkeypatch.setattr(
         highway_env, "highway_scenarios", lambda: [replace(s, limits=short) for s in highway_scenarios(1)]
     )

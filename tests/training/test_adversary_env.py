@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.core.checkpoints import Card
+from ssad.core.checkpoints import WeightsCard
 from ssad.core.types import Controller
 from ssad.drivers import make_system
 from ssad.training.driver import draw_episodes, find_scenarios
@@ -28,7 +28,7 @@ def some_policy():
     torch.manual_seed(3)
     layers = [torch.nn.Linear(24, 16), torch.nn.Linear(16, 2)]
     config = {"observation": "adversary", "action": "adversary", "squash": "tanh"}
-    return policy_of(Card("", "", 0, (), config=config), tensors_of(layers), "test")
+    return policy_of(WeightsCard("", "", 0, (), config=config), tensors_of(layers), "test")
 
 
 def environment(monkeypatch, **settings) -> AdversaryEnv:

@@ -21,7 +21,7 @@ from ssad.recorders.target_images import record_clips
 from ssad.recorders.target_recording import Clips
 from ssad.rendering.target import parse_target
 from ssad.training import detector as training
-from ssad.training.detector import Plan, command_of, describe_data, run_training
+from ssad.training.detector import DetectorPlan, command_of, describe_data, run_training
 from ssad.training.recipe import find_recipe
 
 SHORT = (("epochs", 2), ("batch", 3), ("validate", 1))
@@ -56,7 +56,9 @@ def done(clips: Path, shared: Shared) -> Path:
     """A finished training."""
 
     def make(out: Path) -> None:
-        list(run_training(Plan("yolov5n", (clips,), out, changes=SHORT, device="cpu"), say=lambda line: None))
+        list(
+            run_training(DetectorPlan("yolov5n", (clips,), out, changes=SHORT, device="cpu"), report=lambda line: None)
+        )
 
     return shared("trained", make)
 
@@ -76,10 +78,12 @@ def test_weights_come_with_a_card_that_says_all(done: Path, clips: Path) -> None
 
 def test_the_card_tells_what_the_first_weights_were_made_of(done: Path, clips: Path, tmp_path: Path) -> None:
     first = done / "yolov5n.safetensors"
-    more = Plan("yolov5n", (clips,), tmp_path / "a", changes=(*SHORT, ("epochs", 1)), weights=first, device="cpu")
-    list(run_training(more, say=lambda line: None))
+    more = DetectorPlan(
+        "yolov5n", (clips,), tmp_path / "a", changes=(*SHORT, ("epochs", 1)), weights=first, device="cpu"
+    )
+    list(run_training(more, report=lambda line: None))
     second = tmp_path / "a" / "yolov5n.safetensors"
-    list(run_training(replace(more, out=tmp_path / "b", weights=second), say=lambda line: None))
+    list(run_training(replace(more, out=tmp_path / "b", weights=second), report=lambda line: None))
     cards = [read_card(path) for path in (first, second, tmp_path / "b" / "yolov5n.safetensors")]
     known = [
         {"data": c.data, "command": c.command, "hash": c.hash, "epochs_done": n}
@@ -100,7 +104,7 @@ def test_first_weights_with_a_page_that_is_no_card(text: str, tmp_path: Path) ->
 def test_a_finished_training_does_nothing_more(done: Path, clips: Path) -> None:
     before = {path.name: path.stat().st_mtime_ns for path in done.iterdir()}
     said: list[str] = []
-    list(run_training(Plan("yolov5n", (clips,), done, changes=SHORT, device="cpu"), say=said.append))
+    list(run_training(DetectorPlan("yolov5n", (clips,), done, changes=SHORT, device="cpu"), report=said.append))
     assert said == ["all 2 epochs are done, and yolov5n.safetensors is there"]
     assert {path.name: path.stat().st_mtime_ns for path in done.iterdir()} == before
 
@@ -108,7 +112,7 @@ def test_a_finished_training_does_nothing_more(done: Path, clips: Path) -> None:
 def test_other_data_and_other_first_weights_are_refused(
     done: Path, clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = Plan("yolov5n", (clips,), done, changes=SHORT, device="cpu")
+    plan = DetectorPlan("yolov5n", (clips,), done, changes=SHORT, device="cpu")
     monkeypatch.setattr(training, "fill", lambda *a, **k: pytest.fail("pictures were read"))
     with pytest.raises(FormatError, match="of other data, other first weights"):
         list(run_training(replace(plan, weights=done / "yolov5n.safetensors")))
@@ -122,7 +126,7 @@ def test_what_is_missing_is_said_before_anything_is_read(
     clips: Path, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "fill", lambda *a, **k: pytest.fail("pictures were read"))
-    flat = Plan("yolov5n", (clips,), tmp_path / "out", changes=SHORT, device="cpu")
+    flat = DetectorPlan("yolov5n", (clips,), tmp_path / "out", changes=SHORT, device="cpu")
     deep = replace(flat, recipe="fcos3d-light", data=(drives,))
     twin = tmp_path / "clips"
     twin.symlink_to(clips)
@@ -140,7 +144,7 @@ def test_what_is_missing_is_said_before_anything_is_read(
         (replace(flat, changes=(("options", {"depth": 50}),)), "unexpected keyword argument 'depth'"),
     ):
         with pytest.raises((ConfigError, FormatError), match=words) as error:
-            list(run_training(plan, say=lambda line: None))
+            list(run_training(plan, report=lambda line: None))
         assert "\n" not in str(error.value)
 
 
@@ -148,9 +152,9 @@ def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(training, "make_detector", partial(make_detector, input_width=160))  # as wide as the pictures
     changes = (("epochs", 2), ("batch", 4), ("options", {"heading": "bins"}), ("weigh", {"dir": 0.5}))
     first = SHIPPED / "pgd-det-light.safetensors"
-    plan = Plan("pgd-det-light", (drives,), tmp_path, changes=changes, weights=first, device="cpu", seconds=0.0)
+    plan = DetectorPlan("pgd-det-light", (drives,), tmp_path, changes=changes, weights=first, device="cpu", seconds=0.0)
     said: list[str] = []
-    list(run_training(plan, say=said.append))
+    list(run_training(plan, report=said.append))
     assert "pgd-det-light.safetensors: 8 weights do not fit and start fresh: " in said[0]
     fresh = {name.split(".")[1] for name in said[0].split("fresh: ")[1].split(", ")}
     assert fresh == {"conv_regs", "conv_dir_cls_prev", "conv_dir_cls"}
@@ -166,12 +170,14 @@ def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypat
 
 
 def test_a_3d_detector_learns_from_several_data_sets(drives: Path) -> None:
-    (one, _), (two, _) = (training._items(Plan("fcos3d-light", n * (drives,), Path("out")), three=True) for n in (1, 2))
+    (one, _), (two, _) = (
+        training._items(DetectorPlan("fcos3d-light", n * (drives,), Path("out")), is_3d=True) for n in (1, 2)
+    )
     assert len(two) == 2 * len(one) > 0
 
 
 def test_the_command_can_be_given_to_a_shell() -> None:
-    plan = Plan(
+    plan = DetectorPlan(
         "yolov5n",
         (Path("a b"), Path("c")),
         Path("out"),
@@ -199,7 +205,7 @@ def test_an_error_of_a_process_is_what_it_was() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_an_error_in_another_process_is_one_line(count: int, tmp_path: Path) -> None:
-    plan = Plan("yolov5n", (tmp_path / "nowhere",), tmp_path / "out", gpus=count)
+    plan = DetectorPlan("yolov5n", (tmp_path / "nowhere",), tmp_path / "out", gpus=count)
     with pytest.raises(ConfigError, match=r"nowhere: no annotations/train.json"), training._one_line():
         spawn(training._worker, (plan, find_recipe("yolov5n"), training._free_port(), "gloo"), nprocs=count)
 

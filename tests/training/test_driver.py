@@ -35,7 +35,7 @@ def plan(out: Path, algorithm: str = "ppo", *, seconds: float | None = None, **c
 
 def test_a_training_writes_weights_that_drive(tmp_path: Path) -> None:
     said: list[str] = []
-    (line,) = run_driver_training(plan(tmp_path), say=said.append)
+    (line,) = run_driver_training(plan(tmp_path), report=said.append)
     assert line.startswith(f"{tmp_path / 'ppo.safetensors'}: best at step")
     card, _ = load_card(tmp_path / "ppo.safetensors")
     assert (card.seed, card.config["algorithm"], card.config["observation"]) == (0, "ppo", "traffic")
@@ -50,37 +50,37 @@ def test_a_training_writes_weights_that_drive(tmp_path: Path) -> None:
     assert (driver.sensors, driver.version) == (("traffic",), card.hash)
     assert driver.policy.actions(np.zeros((3, 69), np.float32)).shape == (3, 2)
     # all of it is done: nothing is trained again
-    again = list(run_driver_training(plan(tmp_path), say=said.append))
+    again = list(run_driver_training(plan(tmp_path), report=said.append))
     assert again == [line]
     assert read_log(tmp_path) == rows
 
 
 def test_a_stopped_training_goes_on(tmp_path: Path) -> None:
     said: list[str] = []
-    list(run_driver_training(plan(tmp_path, seconds=0.0), say=said.append))
+    list(run_driver_training(plan(tmp_path, seconds=0.0), report=said.append))
     assert any("run it again to go on" in line for line in said)
     done = read_log(tmp_path)[-1]["step"]
     assert 0 < done < 512
     kept = torch.load(tmp_path / "last.pt", weights_only=True)["policy"]
-    list(run_driver_training(plan(tmp_path), say=said.append))
+    list(run_driver_training(plan(tmp_path), report=said.append))
     assert 512 <= read_log(tmp_path)[-1]["step"] < 768  # whole rollouts
     assert read_log(tmp_path)[0]["step"] == done
     changed = torch.load(tmp_path / "last.pt", weights_only=True)["policy"]
     assert any(not torch.equal(kept[name], changed[name]) for name in kept)
     with pytest.raises(FormatError, match="another recipe"):
-        list(run_driver_training(plan(tmp_path, lr=1e-5), say=said.append))
+        list(run_driver_training(plan(tmp_path, lr=1e-5), report=said.append))
 
 
 def test_a_training_begins_with_the_networks_of_another(tmp_path: Path) -> None:
-    list(run_driver_training(plan(tmp_path / "first"), say=lambda line: None))
+    list(run_driver_training(plan(tmp_path / "first"), report=lambda line: None))
     still = {"steps": 128, "lr": 1e-12, "seed": 1}
     further = replace(plan(tmp_path / "further", **still), start=tmp_path / "first")
-    list(run_driver_training(further, say=lambda line: None))
+    list(run_driver_training(further, report=lambda line: None))
     old, new = (torch.load(tmp_path / name / "last.pt", weights_only=True)["policy"] for name in ("first", "further"))
     assert all(torch.allclose(old[name], new[name], atol=1e-6) for name in old)
     assert "--start" in load_card(tmp_path / "further" / "ppo.safetensors")[0].command
     with pytest.raises(FormatError, match="another recipe or other scenarios"):
-        list(run_driver_training(replace(further, start=None), say=lambda line: None))
+        list(run_driver_training(replace(further, start=None), report=lambda line: None))
     with pytest.raises(FormatError, match="not those of this training"):
         list(run_driver_training(replace(further, out=tmp_path / "b", changes=(*further.changes, ("hidden", (8,))))))
     with pytest.raises(ConfigError, match="start from the folder of a training"):
@@ -127,7 +127,7 @@ def test_a_diverging_training_keeps_the_last_good_checkpoint(tmp_path: Path) -> 
         return {"score": 0.0}
 
     with pytest.raises(ConfigError, match="diverged before step") as found:
-        learn(model, learning, tmp_path, validate=poison, say=lambda line: None)
+        learn(model, learning, tmp_path, validate=poison, report=lambda line: None)
     assert "\n" not in str(found.value)
     assert f"{tmp_path / 'last.pt'} is of step" in str(found.value)
     kept = torch.load(tmp_path / "last.pt", weights_only=True)
@@ -143,9 +143,9 @@ def test_off_policy_trainings_go_on_with_what_they_remember(
     changes = {"first": 64, "buffer": 1000, "updates": 1}
     with monkeypatch.context() as patch:  # a clock that goes on by a second at each look: the limit comes in mid-way
         patch.setattr("ssad.training.reinforcement.time", SimpleNamespace(monotonic=itertools.count().__next__))
-        list(run_driver_training(plan(tmp_path, algorithm, seconds=60.0, **changes), say=lambda line: None))
+        list(run_driver_training(plan(tmp_path, algorithm, seconds=60.0, **changes), report=lambda line: None))
     before = torch.load(tmp_path / "last.pt", weights_only=True)
-    list(run_driver_training(plan(tmp_path, algorithm, **changes), say=lambda line: None))
+    list(run_driver_training(plan(tmp_path, algorithm, **changes), report=lambda line: None))
     after = torch.load(tmp_path / "last.pt", weights_only=True)
     rows = len(before["memory"]["rewards"])
     assert rows > 10
@@ -159,7 +159,7 @@ def test_an_adversary_is_trained_against_an_ego(tmp_path: Path) -> None:
     changes = (("steps", 256), *[one for one in SMALL if one[0] != "steps"])
     one = ("training/natural/Larkhill_00/00",)
     (line,) = run_adversary_training(
-        AdversaryPlan("adv-ppo", tmp_path, "autopilot", one, one, changes=changes), say=lambda text: None
+        AdversaryPlan("adv-ppo", tmp_path, "autopilot", one, one, changes=changes), report=lambda text: None
     )
     assert "adv-ppo.safetensors: best at step" in line
     card, _ = load_card(tmp_path / "adv-ppo.safetensors")

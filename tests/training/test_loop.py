@@ -25,9 +25,9 @@ from ssad.core.types import U8
 from ssad.detectors.mono3d.decode import hull, project
 from ssad.training import loop
 from ssad.training.batches import (
-    Change,
-    Item,
+    Augmentation,
     OnDisk,
+    TrainingImage,
     change_colours,
     change_pictures,
     change_truths,
@@ -38,13 +38,13 @@ from ssad.training.batches import (
     repeats,
 )
 from ssad.training.detector import parse_changes
-from ssad.training.loop import LAST, LOG, train, weighed
+from ssad.training.loop import LAST_CHECKPOINT, LOG, train, weighed
 from ssad.training.recipe import RECIPES, Recipe, find_recipe, set_words
 
 
-def change_truth(truth: Truth, change: Change, size: tuple[int, int], *, keep: float) -> Truth:
+def change_truth(truth: Truth, change: Augmentation, size: tuple[int, int], *, keep: float) -> Truth:
     """Truth of one changed picture."""
-    return change_truths([truth], [change], size, keep=keep)[0]
+    return change_truths([truth], [change], size, min_visible_share=keep)[0]
 
 
 def same(a: Any, b: Any) -> bool:
@@ -126,7 +126,7 @@ def test_the_log_has_a_line_an_epoch(tmp_path: Path) -> None:
         return {"AP50": 0.25}
 
     recipe = replace(RECIPE, epochs=3, validate=2)
-    train(fresh(), bank(), recipe, out=tmp_path, validate=validate, say=said.append)
+    train(fresh(), bank(), recipe, out=tmp_path, validate=validate, report=said.append)
     rows = [json.loads(line) for line in (tmp_path / LOG).read_text().splitlines()]
     assert [row["epoch"] for row in rows] == [1, 2, 3]
     assert all({"lr", "images_s", "loss_box", "loss_obj", "loss_cls"} <= row.keys() for row in rows)
@@ -147,7 +147,7 @@ def test_a_lost_epoch_is_logged_once(tmp_path: Path) -> None:
 
 def test_another_recipe_in_the_same_folder_is_one_line(tmp_path: Path) -> None:
     train(fresh(), bank(), RECIPE, out=tmp_path, seconds=0.0)
-    with pytest.raises(FormatError, match=f"{LAST}: of another recipe; choose another folder") as caught:
+    with pytest.raises(FormatError, match=f"{LAST_CHECKPOINT}: of another recipe; choose another folder") as caught:
         train(fresh(), bank(), replace(RECIPE, lr=1e-3), out=tmp_path)
     assert "\n" not in str(caught.value)
 
@@ -155,7 +155,7 @@ def test_another_recipe_in_the_same_folder_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["text", "empty", "cut", "list", "pickle", "other"])
 def test_a_broken_checkpoint_is_one_line(kind: str, tmp_path: Path) -> None:
     train(fresh(), bank(4), replace(RECIPE, epochs=2), out=tmp_path, seconds=0.0)
-    last = tmp_path / LAST
+    last = tmp_path / LAST_CHECKPOINT
     if kind == "cut":
         last.write_bytes(last.read_bytes()[: last.stat().st_size // 2])
     elif kind == "list":
@@ -167,7 +167,7 @@ def test_a_broken_checkpoint_is_one_line(kind: str, tmp_path: Path) -> None:
         torch.save(state | {"model": {"a": torch.zeros(1)}}, last)
     else:
         last.write_bytes(b"hello" if kind == "text" else b"")
-    with pytest.raises(FormatError, match=LAST) as caught:
+    with pytest.raises(FormatError, match=LAST_CHECKPOINT) as caught:
         train(fresh(), bank(4), replace(RECIPE, epochs=2), out=tmp_path)
     assert "\n" not in str(caught.value)
 
@@ -177,7 +177,7 @@ def test_a_loss_that_is_not_finite_is_one_line(tmp_path: Path) -> None:
     detector.network.outputs()[0].bias.data.fill_(math.nan)
     with pytest.raises(ConfigError, match="the loss is not finite in epoch 1; use a smaller lr"):
         train(detector, bank(4), RECIPE, out=tmp_path)
-    assert not (tmp_path / LAST).exists()
+    assert not (tmp_path / LAST_CHECKPOINT).exists()
 
 
 def test_a_folder_that_is_a_file_is_one_line(tmp_path: Path) -> None:
@@ -258,16 +258,16 @@ def test_pictures_of_rare_classes_are_repeated() -> None:
 @given(st.integers(0, 10**6), st.integers(1, 7), st.lists(st.floats(1.0, 3.0), min_size=8, max_size=40))
 def test_an_epoch_shows_each_picture_as_often_as_asked(seed: int, batch: int, wanted: list[float]) -> None:
     often = np.array(wanted)
-    epochs = [order(len(often), batch, seed=seed, epoch=e, often=often) for e in range(2)]
+    epochs = [order(len(often), batch, seed=seed, epoch=e, weights=often) for e in range(2)]
     shown = math.ceil(often.sum() - 1e-9)
     assert len(epochs[0]) == len(epochs[1]) == max(shown // batch, 1)
-    single = [k for one in order(len(often), 1, seed=seed, epoch=0, often=often) for k in one]
+    single = [k for one in order(len(often), 1, seed=seed, epoch=0, weights=often) for k in one]
     counts = np.bincount(single, minlength=len(often))
     assert counts.sum() == shown
     assert (counts >= np.floor(often)).all()
     assert (counts <= np.ceil(often * shown / often.sum() - 1e-9)).all()
     whole = np.full(len(often), 2.0)
-    twice = np.bincount([k for one in order(len(often), 1, seed=seed, epoch=1, often=whole) for k in one])
+    twice = np.bincount([k for one in order(len(often), 1, seed=seed, epoch=1, weights=whole) for k in one])
     assert (twice == 2).all()
 
 
@@ -293,7 +293,7 @@ def test_a_picture_that_rises_takes_its_lens_along() -> None:
     moved = [draw_change(recipe, (40, 80), rng, lens=truth.intrinsic).shift for _ in range(50)]
     assert {across for across, _ in moved} == {0.0}
     assert -6 <= min(down for _, down in moved) < -3 < 3 < max(down for _, down in moved) <= 6
-    after = change_truth(truth, Change(False, 1.0, moved[0]), (40, 80), keep=0)
+    after = change_truth(truth, Augmentation(False, 1.0, moved[0]), (40, 80), keep=0)
     assert after.solid is not None
     assert after.intrinsic is not None
     assert truth.solid is not None
@@ -327,7 +327,9 @@ def test_a_batch_is_decided_by_its_key() -> None:
 
 def test_pictures_that_do_not_fit_are_read_when_they_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
     items = [
-        Item(lambda k=k: np.full((6, 8, 3), k, np.uint8), Truth(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4)))  # type: ignore[misc]
+        TrainingImage(
+            lambda k=k: np.full((6, 8, 3), k, np.uint8), Truth(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4))
+        )  # type: ignore[misc]
         for k in range(9)
     ]
     held = fill(items)
@@ -340,7 +342,7 @@ def test_pictures_that_do_not_fit_are_read_when_they_are_wanted(monkeypatch: pyt
     where = torch.device("cpu")
     one, two = (make_batch(b, [4, 1], RECIPE, key=(1, 2), device=where)[0] for b in (bank, held))
     assert torch.equal(one, two)
-    broken = fill([*items[:-1], Item(lambda: np.zeros((5, 8, 3), np.uint8), items[0].truth)])
+    broken = fill([*items[:-1], TrainingImage(lambda: np.zeros((5, 8, 3), np.uint8), items[0].truth)])
     with pytest.raises(ConfigError, match="picture 8 has the size"):
         _ = broken.pictures[torch.tensor([8])]
 
@@ -362,9 +364,9 @@ def test_pictures_are_read_in_order_and_must_be_of_one_size() -> None:
     def reader(k: int) -> U8:
         return data.pictures[k].numpy()
 
-    items = [Item(lambda k=k: reader(k), truth) for k, truth in enumerate(data.truth)]  # type: ignore[misc]
+    items = [TrainingImage(lambda k=k: reader(k), truth) for k, truth in enumerate(data.truth)]  # type: ignore[misc]
     assert torch.equal(fill(items).pictures, data.pictures)
-    items.append(Item(lambda: np.zeros((5, 7, 3), np.uint8), data.truth[0]))
+    items.append(TrainingImage(lambda: np.zeros((5, 7, 3), np.uint8), data.truth[0]))
     with pytest.raises(ConfigError, match=r"picture 40 has the size \(5, 7\)"):
         fill(items)
     with pytest.raises(ConfigError, match="no picture to train on"):
@@ -408,7 +410,7 @@ def test_boxes_stay_on_their_squares(zoom: tuple[float, float]) -> None:
 
 def test_objects_that_are_cut_become_crowd() -> None:
     truth = Truth(torch.tensor([0, 1, 0]), torch.tensor([[0.0, 0, 20, 20], [40, 20, 60, 40], [80, 50, 96, 64]]))
-    after = change_truth(truth, Change(False, 2.0, (-30.0, -10.0)), SIZE, keep=0.3)
+    after = change_truth(truth, Augmentation(False, 2.0, (-30.0, -10.0)), SIZE, keep=0.3)
     assert after.label.tolist() == [0, 1]
     assert after.crowd is not None
     assert after.crowd.tolist() == [True, False]  # a sixth of the first is in sight, all of the second
@@ -417,16 +419,16 @@ def test_objects_that_are_cut_become_crowd() -> None:
 
 def test_a_change_that_does_nothing_leaves_the_picture() -> None:
     pictures = torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-    nothing = Change(False, 1.0, (0.0, 0.0))
+    nothing = Augmentation(False, 1.0, (0.0, 0.0))
     assert torch.equal(change_pictures(pictures, [nothing, nothing]), pictures)
-    mirrored = change_pictures(pictures, [Change(True, 1.0, (0.0, 0.0)), nothing])
+    mirrored = change_pictures(pictures, [Augmentation(True, 1.0, (0.0, 0.0)), nothing])
     torch.testing.assert_close(mirrored[0], pictures[0].flip(2))
     torch.testing.assert_close(mirrored[1], pictures[1])
 
 
 def test_what_is_shrunk_is_averaged() -> None:
     stripes = (torch.arange(96) % 2).float().expand(1, 3, 65, 96)
-    (shrunk,) = change_pictures(stripes, [Change(False, 0.4, (0.0, 0.0))])
+    (shrunk,) = change_pictures(stripes, [Augmentation(False, 0.4, (0.0, 0.0))])
     assert shrunk[:, 2:24, 2:36].std() < 0.05  # 0.25 if taken from the pixels as they are
     assert shrunk[:, 2:24, 2:36].mean() == pytest.approx(0.5, abs=0.02)
 
@@ -446,7 +448,7 @@ def test_colours_stay_colours() -> None:
 SOLID_SIZE = (225, 400)
 
 
-def moved(points: Tensor, change: Change, width: int) -> Tensor:
+def moved(points: Tensor, change: Augmentation, width: int) -> Tensor:
     """Where places in a picture lie after a change."""
     x, y = points[..., 0], points[..., 1]
     x = width - x if change.mirror else x
@@ -456,14 +458,14 @@ def moved(points: Tensor, change: Change, width: int) -> Tensor:
 @pytest.mark.parametrize(
     "change",
     [
-        Change(True, 1.0, (0.0, 0.0)),
-        Change(False, 0.8, (30.0, 12.0)),
-        Change(True, 0.7, (50.0, 40.0)),
-        Change(True, 1.1, (-12.0, -9.0)),
+        Augmentation(True, 1.0, (0.0, 0.0)),
+        Augmentation(False, 0.8, (30.0, 12.0)),
+        Augmentation(True, 0.7, (50.0, 40.0)),
+        Augmentation(True, 1.1, (-12.0, -9.0)),
     ],
     ids=["mirror", "zoom", "both", "larger"],
 )
-def test_solids_project_to_the_changed_places(change: Change) -> None:
+def test_solids_project_to_the_changed_places(change: Augmentation) -> None:
     truth = some_truth(5, seed=2)
     assert truth.solid is not None
     assert truth.intrinsic is not None
@@ -494,7 +496,7 @@ def test_solids_project_to_the_changed_places(change: Change) -> None:
 
 def test_boxes_of_solids_follow_their_corners() -> None:
     truth = some_truth(5, seed=3)
-    after = change_truth(truth, Change(True, 0.6, (90.0, 40.0)), SOLID_SIZE, keep=0.0)
+    after = change_truth(truth, Augmentation(True, 0.6, (90.0, 40.0)), SOLID_SIZE, keep=0.0)
     assert after.solid is not None
     assert after.intrinsic is not None
     box = hull(project(solid_corners(after.solid.centre, after.solid.size_lhw, after.solid.yaw), after.intrinsic))
@@ -503,7 +505,7 @@ def test_boxes_of_solids_follow_their_corners() -> None:
 
 def test_solids_whose_middle_leaves_the_picture_go() -> None:
     truth = some_truth(5, seed=2)
-    after = change_truth(truth, Change(False, 2.0, (0.0, 0.0)), SOLID_SIZE, keep=0.0)
+    after = change_truth(truth, Augmentation(False, 2.0, (0.0, 0.0)), SOLID_SIZE, keep=0.0)
     assert 0 < len(after.label) < 5
     assert after.solid is not None
     assert len(after.solid.centre) == len(after.box) == len(after.label)
@@ -511,7 +513,7 @@ def test_solids_whose_middle_leaves_the_picture_go() -> None:
 
 def test_twice_mirrored_is_as_before() -> None:
     truth = some_truth(4)
-    mirror = Change(True, 1.0, (0.0, 0.0))
+    mirror = Augmentation(True, 1.0, (0.0, 0.0))
     twice = change_truth(change_truth(truth, mirror, SOLID_SIZE, keep=0.0), mirror, SOLID_SIZE, keep=0.0)
     assert twice.solid is not None
     assert truth.solid is not None

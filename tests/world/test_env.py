@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ssad.core.errors import ConfigError
-from ssad.core.types import Limits
+from ssad.core.types import EpisodeLimits
 from ssad.world.env import SingleEnv, VectorEnv
 from tests.world.test_world import bank
 from tests.world.worlds import GRAPHS, ego, episode
@@ -22,7 +22,7 @@ def test_single_env_passes_gymnasiums_checker(observation: str, action: str) -> 
 
 def test_vector_env_equals_gymnasiums_sync_vector_env() -> None:
     """The same episodes and actions through Gymnasium's own vectoriser give the same numbers."""
-    episodes = [episode(ego(speed=v), key=str(v), limits=Limits(max_steps=40)) for v in (2.0, 5.0, 8.0)]
+    episodes = [episode(ego(speed=v), key=str(v), limits=EpisodeLimits(max_steps=40)) for v in (2.0, 5.0, 8.0)]
     ours = VectorEnv(episodes[:1], GRAPHS, 3)
     theirs = gym.vector.SyncVectorEnv(
         [lambda: SingleEnv(episodes[:1], GRAPHS)] * 3, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.core.checkpoints import Card, save_weights
+from ssad.core.checkpoints import WeightsCard, save_weights
 from ssad.core.errors import FormatError
 from ssad.world.actions import WIDTHS, to_controls
 from ssad.world.policy import load_policy, policy_of, tensors_of
@@ -25,8 +25,8 @@ def net(*widths: int, seed: int = 0) -> torch.nn.Sequential:
     return torch.nn.Sequential(*[part for layer in layers for part in (layer, torch.nn.ReLU())][:-1])
 
 
-def card(**config: str) -> Card:
-    return Card("", "", 0, (), config={"observation": "frea", "action": "pedals", "squash": "tanh"} | config)
+def card(**config: str) -> WeightsCard:
+    return WeightsCard("", "", 0, (), config={"observation": "frea", "action": "pedals", "squash": "tanh"} | config)
 
 
 def tensors(body: torch.nn.Sequential) -> dict[str, torch.Tensor]:

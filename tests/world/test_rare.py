@@ -89,7 +89,7 @@ def test_intervals_of_importance_sampling_hold(height: float, steps: int) -> Non
         walk, MixtureProposal(np.array([0.1, 0.9]), push), generator("hold", height), episodes=repeats * size
     )
     values = np.where(drawn.failed, drawn.weight, 0.0).reshape(repeats, size)
-    low, high = weighted_limits(values.sum(1), (values**2).sum(1), values.max(1), size, unlike=True)
+    low, high = weighted_limits(values.sum(1), (values**2).sum(1), values.max(1), size, unequal_weights=True)
     held = ((low <= truth) & (truth <= high)).mean()
     assert 0.93 <= held <= 0.975
     assert values.mean() == pytest.approx(truth, rel=0.05)
@@ -108,7 +108,7 @@ def test_a_learned_proposal_needs_far_fewer_episodes_than_brute_force() -> None:
     needed = 6.0 * 1.96**2 / found.half_width**2 / truth
     assert needed > 1000.0 * found.work
     assert found.effective == pytest.approx(
-        weighted_estimate(drawn.weight * drawn.failed, "", most=10, work=0).effective
+        weighted_estimate(drawn.weight * drawn.failed, "", max_weight=10, work=0).effective
     )
 
 
@@ -142,7 +142,7 @@ def test_intervals_hold_for_few_weights_of_a_long_tail() -> None:
     np.maximum.at(largest, rows, weight)
     held = {}
     for unlike in (False, True):
-        low, high = weighted_limits(*sums, largest, 1e7, unlike=unlike)
+        low, high = weighted_limits(*sums, largest, 1e7, unequal_weights=unlike)
         held[unlike] = ((low <= mean * 1e-7) & (mean * 1e-7 <= high)).mean()
     assert held[False] < 0.93
     assert 0.93 <= held[True] <= 0.97

@@ -12,7 +12,7 @@ import pytest
 from ssad.core.driving import LaneRelation, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.traces import trace_hash
-from ssad.core.types import Contact, Controller, EpisodeAgent, Limits, Pose
+from ssad.core.types import Contact, Controller, EpisodeAgent, EpisodeLimits, Pose
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.world.check import WorldCheckError, check_driver
 from ssad.world.rollout import Loop, rollout
@@ -276,7 +276,8 @@ def test_contacts_end_count_or_remove_as_the_scenario_says() -> None:
     box = EpisodeAgent("box", "cone", Controller.NONE, Pose(30.0, 0.0))
     policies = ("end", "count", "remove")
     episodes = [
-        episode(ego(controller=Controller.FOLLOW, speed=8.0), box, key=p, limits=Limits(contact=p)) for p in policies
+        episode(ego(controller=Controller.FOLLOW, speed=8.0), box, key=p, limits=EpisodeLimits(contact=p))
+        for p in policies
     ]
     ends, counts, present = [], [], []
     for trace in rollout(World(episodes, GRAPHS), {}):
@@ -332,7 +333,7 @@ def test_sensors_are_read_for_who_asks_and_pictures_are_perturbed() -> None:
             shown.append(view.readings["camera"][:, 0, 0, 0].copy())
             return super().act(view)
 
-    short = [replace(e, limits=Limits(max_steps=3)) for e in bank()]
+    short = [replace(e, limits=EpisodeLimits(max_steps=3)) for e in bank()]
     rollout(World(short, GRAPHS), Pusher(), sensors={"camera": camera})
     assert calls == []
     rollout(World(short, GRAPHS), Watcher(), sensors={"camera": camera}, perturbation=Darker())

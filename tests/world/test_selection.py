@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError
-from ssad.core.types import Controller, EpisodeAgent, Limits, Pose
+from ssad.core.types import Controller, EpisodeAgent, EpisodeLimits, Pose
 from ssad.world.rollout import Loop
 from ssad.world.selection import FreaSelection, Note
 from ssad.world.world import World
@@ -64,7 +64,11 @@ class Pusher:
 
 def loop_of(*agents: EpisodeAgent, driver: Pusher, speed: float = 8.0, batch: int = 1, **settings) -> Loop:
     world = World(
-        [episode(ego(100.0, speed, Controller.FOLLOW, target_speed=speed), *agents, limits=Limits(max_steps=400))],
+        [
+            episode(
+                ego(100.0, speed, Controller.FOLLOW, target_speed=speed), *agents, limits=EpisodeLimits(max_steps=400)
+            )
+        ],
         GRAPHS,
         assign=[0] * batch,
     )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError
 from ssad.core.geometry import obb_distance
-from ssad.core.types import LaneType, Limits
+from ssad.core.types import EpisodeLimits, LaneType
 from ssad.world.models import MODELS
 from ssad.world.roads.library import load_town
 from ssad.world.roads.query import LaneQuery
@@ -45,7 +45,7 @@ def start(count: int, speed: np.ndarray, dtype: torch.dtype) -> MotionState:
 def test_every_body_moves_as_in_the_world(seed: int, dtype: torch.dtype) -> None:
     names = list(MODELS)
     speeds = np.where([MODELS[n].max_speed > 0 for n in names], np.linspace(0.0, 3.9, len(names)) * (seed > 0), 0.0)
-    wide = Limits(max_steps=10_000, max_time=1e6)
+    wide = EpisodeLimits(max_steps=10_000, max_time=1e6)
     cases = [
         episode(ego(model=name, speed=float(speed)), key=name, limits=wide)
         for name, speed in zip(names, speeds, strict=True)

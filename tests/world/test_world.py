@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.types import ENDS, Condition, Controller, Episode, EpisodeAgent, Limits, Phase, Pose
+from ssad.core.types import ENDS, Controller, Episode, EpisodeAgent, EpisodeLimits, Phase, PhaseTrigger, Pose
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.check import check_simulator
 from ssad.world.kernels.traffic import LONGEST
@@ -45,7 +45,7 @@ def test_full_brake_stops_where_it_must_and_stays() -> None:
 @given(steer=st.floats(0.05, 0.4), speed=st.floats(1.0, 4.0))
 def test_constant_steer_drives_the_bicycle_models_circle(steer: float, speed: float) -> None:
     car = MODELS["car"]
-    wide = Limits(max_steps=10_000, max_time=1e6)
+    wide = EpisodeLimits(max_steps=10_000, max_time=1e6)
     world = World([episode(ego(speed=speed), limits=wide)], GRAPHS, substeps=8)
     run(world, 10, (0.0, 0.0, steer))  # past the turning of the wheel
     slip = np.arctan(0.5 * np.tan(steer * car.max_steer))
@@ -132,7 +132,7 @@ def test_autopilot_lets_a_walker_cross_that_the_blind_follower_hits() -> None:
         "walker",
         Controller.SCRIPT,
         Pose(60.0, -6.0, np.pi / 2),
-        phases=(Phase(2.5, Condition("ego_distance", 20.0, 0)),),
+        phases=(Phase(2.5, PhaseTrigger("ego_distance", 20.0, 0)),),
     )
     both = [
         episode(ego(speed=8.0, controller=Controller.AUTOPILOT), walker),
@@ -148,9 +148,9 @@ def test_autopilot_lets_a_walker_cross_that_the_blind_follower_hits() -> None:
 
 def test_phases_are_latched_and_in_order() -> None:
     phases = (
-        Phase(6.0, Condition("ego_distance", 35.0, 0)),
-        Phase(2.0, Condition("travelled", 5.0)),
-        Phase(0.0, Condition("time", 8.0)),
+        Phase(6.0, PhaseTrigger("ego_distance", 35.0, 0)),
+        Phase(2.0, PhaseTrigger("travelled", 5.0)),
+        Phase(0.0, PhaseTrigger("time", 8.0)),
     )
     lead = EpisodeAgent("a", "suv", Controller.SCRIPT, Pose(60.0, 0.0, 0.0), phases=phases)
     world = World([episode(ego(controller=Controller.FOLLOW, target_speed=4.0, speed=4.0), lead)], GRAPHS)
@@ -174,8 +174,8 @@ def test_a_phase_waits_after_the_one_before_it(device: str) -> None:
 
     def scene(speed: float, *waits: float) -> Episode:
         phases = (
-            Phase(3.0, Condition("ego_distance", 35.0, 0)),
-            *(Phase(1.0 + k, Condition("after", wait)) for k, wait in enumerate(waits)),
+            Phase(3.0, PhaseTrigger("ego_distance", 35.0, 0)),
+            *(Phase(1.0 + k, PhaseTrigger("after", wait)) for k, wait in enumerate(waits)),
         )
         lead = EpisodeAgent("a", "suv", Controller.SCRIPT, Pose(60.0, 0.0, 0.0), phases=phases)
         return episode(ego(controller=Controller.FOLLOW, target_speed=speed, speed=speed), lead)
@@ -218,9 +218,9 @@ def test_a_phase_waits_after_the_one_before_it(device: str) -> None:
 
 
 def test_a_first_phase_waits_after_the_start() -> None:
-    waits = (Phase(2.0, Condition("after", 1.2)),)
+    waits = (Phase(2.0, PhaseTrigger("after", 1.2)),)
     lead = EpisodeAgent("a", "suv", Controller.SCRIPT, Pose(60.0, 0.0, 0.0), phases=waits)
-    timed = replace(lead, phases=(Phase(2.0, Condition("time", 1.2)),))
+    timed = replace(lead, phases=(Phase(2.0, PhaseTrigger("time", 1.2)),))
     world = World([episode(ego(), one) for one in (lead, timed)], GRAPHS)
     for _ in range(40):
         world.step()
@@ -262,9 +262,9 @@ def test_off_road_and_route_distance() -> None:
 
 def test_limits_end_an_episode() -> None:
     cases = {
-        "max_steps": Limits(max_steps=7),
-        "max_time": Limits(max_time=0.5),
-        "max_distance": Limits(max_distance=3.0),
+        "max_steps": EpisodeLimits(max_steps=7),
+        "max_time": EpisodeLimits(max_time=0.5),
+        "max_distance": EpisodeLimits(max_distance=3.0),
     }
     world = World([episode(ego(speed=8.0), limits=limit) for limit in cases.values()], GRAPHS)
     run(world, 10)
@@ -278,7 +278,7 @@ def bank() -> list:
         "walker",
         Controller.SCRIPT,
         Pose(40.0, -4.0, np.pi / 2),
-        phases=(Phase(1.5, Condition("ego_speed", 2.0)),),
+        phases=(Phase(1.5, PhaseTrigger("ego_speed", 2.0)),),
     )
     traffic = EpisodeAgent(
         "t",
@@ -293,7 +293,7 @@ def bank() -> list:
         episode(ego(speed=5.0), key="a"),
         episode(ego(), walker, key="b"),
         episode(ego(speed=7.0), traffic, walker, key="c"),
-        episode(ego(x=30.0), traffic, key="d", limits=Limits(max_steps=20)),
+        episode(ego(x=30.0), traffic, key="d", limits=EpisodeLimits(max_steps=20)),
     ]
 
 

@@ -16,7 +16,7 @@ from ssad.core.types import (
     Controller,
     Episode,
     EpisodeAgent,
-    Limits,
+    EpisodeLimits,
     Pose,
     Route,
     Scenario,
@@ -27,7 +27,7 @@ from ssad.world.roads import LaneGraph, load_town, random_route
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 
-LIMITS = Limits(max_steps=1000, max_time=1e3)
+LIMITS = EpisodeLimits(max_steps=1000, max_time=1e3)
 
 
 class Drives:
@@ -147,7 +147,7 @@ def test_background_traffic_stops_too_each_time_it_comes_by() -> None:
     ego = alone(graph, past(graph, stop_lanes(graph)[-1])).agents[0]
     parked = EpisodeAgent("ego", "car", Controller.NONE, ego.pose, route=ego.route)
     other = EpisodeAgent("other", "car", Controller.AUTOPILOT, pose, 5.0, 8.0, route=route)
-    limits = Limits(max_steps=5000, max_time=1e4)
+    limits = EpisodeLimits(max_steps=5000, max_time=1e4)
     scenario = Scenario("rounds", "Custom", "Larkhill", (pose, pose), limits=limits)
     world = World([Episode("rounds", scenario, "Larkhill", (parked, other), {}, 0.0, limits)], {"Larkhill": graph})
     lines = set()

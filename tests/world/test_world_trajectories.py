@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError
-from ssad.core.types import Actor, Controller, EpisodeAgent, Limits, Pose, Scenario
+from ssad.core.types import Actor, Controller, EpisodeAgent, EpisodeLimits, Pose, Scenario
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.schema import check
 from ssad.scenarios.dynamic.yamlio import read_scenarios, save_scenarios
@@ -16,7 +16,7 @@ from ssad.world.world import World
 
 from .worlds import GRAPHS, ego, episode
 
-FAR = Limits(max_steps=10_000, max_time=1e6)
+FAR = EpisodeLimits(max_steps=10_000, max_time=1e6)
 
 
 def follower(rows: list[tuple[float, float, float, float]], name: str = "other") -> EpisodeAgent:

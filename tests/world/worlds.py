@@ -13,8 +13,8 @@ from ssad.core.types import (
     Controller,
     Episode,
     EpisodeAgent,
+    EpisodeLimits,
     LaneType,
-    Limits,
     Pose,
     Route,
     Scenario,
@@ -102,7 +102,7 @@ def ego(x: float = 10.0, speed: float = 0.0, controller: Controller = Controller
 def episode(*agents: EpisodeAgent, key: str = "test", **more) -> Episode:
     """An episode on the straight road."""
     scenario = Scenario(name=key, type="Custom", town="Straight", route=(Pose(10, 0), Pose(210, 0)))
-    base = Episode(key=key, scenario=scenario, town="Straight", agents=agents, limits=Limits(max_steps=300))
+    base = Episode(key=key, scenario=scenario, town="Straight", agents=agents, limits=EpisodeLimits(max_steps=300))
     return replace(base, **more)
 
 

@@ -39,9 +39,9 @@ imports.command("routes")(exchange.import_routes)
 imports.command("drive")(exchange.import_drive)
 
 
-def show_version(asked: bool) -> None:
+def show_version(is_requested: bool) -> None:
     """Print the version and exit, if requested."""
-    if asked:
+    if is_requested:
         print(f"ssad {__version__}")
         raise typer.Exit
 
@@ -72,12 +72,12 @@ app.add_typer(train_app, name="train")
 
 @app.command("list")
 def list_names(
-    what: Annotated[str | None, typer.Argument(metavar="[WHAT]", help=f"One of: {', '.join(LISTS)}.")] = None,
+    list_name: Annotated[str | None, typer.Argument(metavar="[WHAT]", help=f"One of: {', '.join(LISTS)}.")] = None,
 ) -> None:
     """List the names that other commands and suites accept. Without WHAT: all lists, scenarios by set and class."""
-    selected_list = ALIASES.get(what or "", what)
+    selected_list = ALIASES.get(list_name or "", list_name)
     if selected_list is not None and selected_list not in LISTS:
-        raise unknown_name("list", str(what), [*LISTS, *ALIASES])
+        raise unknown_name("list", str(list_name), [*LISTS, *ALIASES])
     for name, make_rows in LISTS.items():
         if selected_list not in (None, name):
             continue
@@ -107,11 +107,11 @@ def doctor() -> None:
     """Check this machine: what works, what is missing. Exit code 1: something that every run needs is broken."""
     from ssad.cli.doctor import examine
 
-    broken = False
+    is_broken = False
     for finding in examine():
-        broken |= finding.state == "broken"
-        print(f"{finding.state:<8} {finding.what:<12} {finding.detail}")
-    raise typer.Exit(1 if broken else 0)
+        is_broken |= finding.state == "broken"
+        print(f"{finding.state:<8} {finding.name:<12} {finding.detail}")
+    raise typer.Exit(1 if is_broken else 0)
 
 
 def give_up_output() -> None:

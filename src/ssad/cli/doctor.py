@@ -21,22 +21,22 @@ class Finding:
     """One check.
 
     Attributes:
-        what: Name of the check.
+        name: Name of the check.
         state: ok, missing (some commands need it) or broken (no suite runs without it).
         detail: Result in words.
     """
 
-    what: str
+    name: str
     state: str
     detail: str
 
 
 def examine() -> Iterator[Finding]:
     """Run the checks one by one."""
-    supported = (3, 11) <= sys.version_info < (3, 14)
+    is_supported = (3, 11) <= sys.version_info < (3, 14)
     python = f"{platform.python_version()} on {platform.platform(terse=True)}"
     yield Finding(
-        "python", "ok" if supported else "broken", python if supported else f"{python}; SSAD needs 3.11 to 3.13"
+        "python", "ok" if is_supported else "broken", python if is_supported else f"{python}; SSAD needs 3.11 to 3.13"
     )
     yield Finding("ssad", "ok", ssad.__version__)
     yield _machine()

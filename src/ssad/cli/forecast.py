@@ -70,7 +70,7 @@ def forecast(plan: Plan, folder: Path, resources: Resources, *, sample: int = 0)
     lines += [f"  {system or 'all'}: {count}" for system, count in cells_per_system.items()]
     if not remaining:
         return lines
-    rates, source = measured(plan, resources, sample) if sample else known(plan, folder)
+    rates, source = sampled_rates(plan, resources, sample) if sample else earlier_rates(plan, folder)
     if not rates.seconds:
         unknown_text = f"unknown: no earlier run of kind {plan.kind.name} on {plan.device} lies in {folder.parent}"
         return [
@@ -90,8 +90,8 @@ def forecast(plan: Plan, folder: Path, resources: Resources, *, sample: int = 0)
     # A kind may allow fewer workers than the machine, and more workers than cells would idle.
     worker_count = max(1, min(plan.kind.workers(plan, available_workers) or 1, len(remaining)))
     lines.append(
-        f"time: about {spoken(total_seconds / worker_count)} with {worker_count} workers "
-        f"({spoken(total_seconds)} of work), from {source}"
+        f"time: about {duration_text(total_seconds / worker_count)} with {worker_count} workers "
+        f"({duration_text(total_seconds)} of work), from {source}"
     )
     if unmeasured:
         lines.append(f"  no such cell was measured for {', '.join(sorted(unmeasured))}: as the mean of the others")
@@ -107,7 +107,7 @@ def finished(plan: Plan, folder: Path) -> set[str]:
     return {line["key"] for line in read_lines(folder / RESULTS)} & {cell.key for cell in plan.cells}
 
 
-def known(plan: Plan, folder: Path) -> tuple[Rates, str]:
+def earlier_rates(plan: Plan, folder: Path) -> tuple[Rates, str]:
     """Return the rates of the runs of this kind and device beside a folder, and their source in words."""
     rates, run_names = Rates(), []
     for path in neighbours(folder.parent):
@@ -128,7 +128,7 @@ def neighbours(folder: Path) -> Iterator[Path]:
         yield path.parent
 
 
-def measured(plan: Plan, resources: Resources, sample: int) -> tuple[Rates, str]:
+def sampled_rates(plan: Plan, resources: Resources, sample: int) -> tuple[Rates, str]:
     """Run some cells of each system, spread over the plan, in a temporary folder; return their rates and source."""
     by_system: dict[str, list[Any]] = {}
     for cell in plan.cells:
@@ -145,7 +145,7 @@ def measured(plan: Plan, resources: Resources, sample: int) -> tuple[Rates, str]
     )
 
 
-def spoken(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a duration in words."""
     if seconds < 90:
         return f"{seconds:.0f} s"

@@ -73,7 +73,7 @@ def export_scenarios(
     }
     files, omissions = writers[to](selected, out, seed=seed)
     print(f"{len(selected)} scenarios: {len(files)} files written to {out}")
-    told("not carried over", omissions)
+    print_counted("not carried over", omissions)
 
 
 def import_openscenario(
@@ -92,7 +92,7 @@ def import_openscenario(
     save_scenarios(out, imported.scenario)
     scenario = imported.scenario
     print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
-    told("not carried over", imported.lost)
+    print_counted("not carried over", imported.lost)
 
 
 def import_leaderboard(
@@ -112,7 +112,7 @@ def import_leaderboard(
     print(
         f"{len(imported)} scenarios on {', '.join(sorted({scenario.town for scenario in imported}))}; written to {out}"
     )
-    told("not carried over", omissions)
+    print_counted("not carried over", omissions)
 
 
 def import_commonroad(
@@ -136,7 +136,7 @@ def import_commonroad(
         store_town(imported.graph, town, beside=out)
     save_scenarios(out, imported.scenario)
     print(f"scenario {imported.scenario.name}: {len(imported.scenario.actors)} actors in {town}; written to {out}")
-    told("not carried over", imported.lost)
+    print_counted("not carried over", imported.lost)
 
 
 def import_scenic(
@@ -176,8 +176,8 @@ def import_scenic(
         raise ConfigError(failures[0])
     save_scenarios(out, sampled)
     print(f"{len(sampled)} scenarios in {program.town}; written to {out}")
-    told("not sampled", failures)
-    told("not carried over", omissions)
+    print_counted("not sampled", failures)
+    print_counted("not carried over", omissions)
 
 
 def check_yaml(out: Path) -> None:
@@ -203,8 +203,8 @@ def store_town(graph: LaneGraph, town: str, *, beside: Path) -> None:
     import_map(path, town, home())
 
 
-def told(what: str, lines: Sequence[str]) -> None:
+def print_counted(heading: str, lines: Sequence[str]) -> None:
     """Print lines under a heading, each once, with how often it came."""
     line_counts = {line: lines.count(line) for line in lines}
     for line, count in line_counts.items():
-        print(f"{what}: {line}{f' ({count} scenarios)' if count > 1 else ''}")
+        print(f"{heading}: {line}{f' ({count} scenarios)' if count > 1 else ''}")

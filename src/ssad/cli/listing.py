@@ -61,8 +61,10 @@ def _suite_list() -> dict[str, str]:
 def _shift_list() -> dict[str, str]:
     from ssad.scenarios.static.shifts.spec import EXTRA, KNOWN
 
-    remarks = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
-    return {name: f"{family}: {description}{remarks.get(name, '')}" for name, (family, description) in KNOWN.items()}
+    notes_by_shift = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
+    return {
+        name: f"{family}: {description}{notes_by_shift.get(name, '')}" for name, (family, description) in KNOWN.items()
+    }
 
 
 def _perturbation_list() -> dict[str, str]:
@@ -81,9 +83,9 @@ def _attack_list() -> dict[str, str]:
     from ssad.scenarios.static.physical import default_carrier, physical_names
     from ssad.scenarios.static.physical.lights import LIGHTS
 
-    def describe(name: str, where: str) -> str:
+    def describe(name: str, origin: str) -> str:
         if name not in ATTACKS:
-            return where
+            return origin
         if needs(name):
             return f"made in Python: needs {', '.join(needs(name))} (docs/how-to/attack-detectors.md)"
         access = make_attack(name).access
@@ -109,11 +111,11 @@ def _generator_list() -> dict[str, str]:
 def _detector_list() -> dict[str, str]:
     from ssad.detectors import SHIPPED, detector_names
 
-    def describe(name: str, where: str) -> str:
-        if where.startswith("ssad."):
+    def describe(name: str, origin: str) -> str:
+        if origin.startswith("ssad."):
             kind = "3D" if "fcos3d" in name or "pgd" in name else "2D"
             return f"{kind}, weights shipped" if (SHIPPED / f"{name}.json").is_file() else f"{kind}, no weights shipped"
-        return where
+        return origin
 
     rows = {name: describe(name, origin) for name, origin in detector_names().items()}
     return rows | {"module:object": "a detector of your own (docs/how-to/use-detectors.md)"}

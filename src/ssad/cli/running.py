@@ -77,12 +77,14 @@ def run(
         from ssad.cli.forecast import forecast
         from ssad.engine.run import slice_of
 
-        sliced_plan = replace(plan, cells=tuple(slice_of(plan, _wanted(only or []))))
+        sliced_plan = replace(plan, cells=tuple(slice_of(plan, _selections(only or []))))
         for line in forecast(sliced_plan, folder, Resources(workers, ray, plan.device), sample=sample):
             print(line)
         return
     try:
-        results = run_plan(plan, folder, Resources(workers, ray, plan.device), retry=retry, only=_wanted(only or []))
+        results = run_plan(
+            plan, folder, Resources(workers, ray, plan.device), retry=retry, only=_selections(only or [])
+        )
     except KeyboardInterrupt:
         print(f"stopped; finished cells are kept in {folder}; repeat the command to resume", file=sys.stderr)
         raise typer.Exit(130) from None
@@ -100,7 +102,7 @@ def run(
     raise typer.Exit(1 if failures else 0)
 
 
-def _wanted(texts: list[str]) -> dict[str, list[str]]:
+def _selections(texts: list[str]) -> dict[str, list[str]]:
     """Return the values by field, of texts "field=value,value"."""
     selections: dict[str, list[str]] = {}
     for text in texts:
@@ -236,7 +238,11 @@ def replay(
     if mcap:
         top_view_frames = frames(replayed.trace, replayed.graph, size=(640, 360))
         path = write_mcap(
-            stem.with_suffix(".mcap"), replayed.trace, replayed.graph, seen=replayed.seen, above=top_view_frames
+            stem.with_suffix(".mcap"),
+            replayed.trace,
+            replayed.graph,
+            recorded_drive=replayed.seen,
+            top_views=top_view_frames,
         )
         print(f"mcap: {path}")
     if write_film is not None:
@@ -267,10 +273,14 @@ def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any
     def film(trace: Any, graph: Any, path: Path) -> Path:
         agent = first_ahead(trace, target_kind) if wearer is None else wearer
         if agent is None:
-            whom = target_kind.name.lower()
-            raise ConfigError(f"{trace.key}: no {whom} is ahead of the ego at any time; name the agent with --wearer")
+            kind_name = target_kind.name.lower()
+            raise ConfigError(
+                f"{trace.key}: no {kind_name} is ahead of the ego at any time; name the agent with --wearer"
+            )
         weather = at_hour(DAY, attack.hour)
-        shown = attacked_frames(trace, graph, attack.live(agent), detector=film_detector, every=2, weather=weather)
-        return save_frames(shown, path, dt=2 * trace.dt)
+        film_frames = attacked_frames(
+            trace, graph, attack.live(agent), detector=film_detector, frame_stride=2, weather=weather
+        )
+        return save_frames(film_frames, path, dt=2 * trace.dt)
 
     return film

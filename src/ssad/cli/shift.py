@@ -22,20 +22,20 @@ from ssad.recorders.shifted.write import materialise
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
 
 
-def severities(text: str) -> tuple[Strength, ...]:
+def severities(severity_list: str) -> tuple[Strength, ...]:
     """Parse the severities of --severity, such as "1,3" or "random".
 
     Raises:
         ConfigError: A part is neither a severity nor "random".
     """
     result: list[Strength] = []
-    for word in (item.strip() for item in text.split(",")):
-        if word == "random":
+    for severity_text in (item.strip() for item in severity_list.split(",")):
+        if severity_text == "random":
             result.append("random")
-        elif word in ("0", "1", "2", "3", "4", "5"):
-            result.append(int(word))
+        elif severity_text in ("0", "1", "2", "3", "4", "5"):
+            result.append(int(severity_text))
         else:
-            raise ConfigError(f"--severity {text}: expected comma-separated numbers from 1 to 5, or random")
+            raise ConfigError(f"--severity {severity_list}: expected comma-separated numbers from 1 to 5, or random")
     return tuple(dict.fromkeys(result))
 
 
@@ -264,7 +264,7 @@ def write_contact_sheets(
     print(f"all shifts: {shift_sheet}\nall severities: {severity_sheet}")
 
 
-def checked(root: Path) -> Callable[[dict[str, Any], GroundTruth], dict[str, Any]]:
+def checked(dataset_root: Path) -> Callable[[dict[str, Any], GroundTruth], dict[str, Any]]:
     """Return a check for `score_results` that refuses to score clean data as shifted, or shifted data as clean.
 
     A shifted root must match its manifest. Results may name the data they were made on (`ssad_manifest` in
@@ -273,19 +273,19 @@ def checked(root: Path) -> Callable[[dict[str, Any], GroundTruth], dict[str, Any
 
     def check(meta: dict[str, Any], truth: GroundTruth) -> dict[str, Any]:
         stated_digest = meta.get("ssad_manifest")
-        if read_manifest(root) is None:
+        if read_manifest(dataset_root) is None:
             if stated_digest not in (None, "clean"):
                 raise FormatError(
-                    f"the results were made on shifted data (manifest {stated_digest}), but {root} is a clean dataset; "
-                    "give the shifted folder as --dataroot"
+                    f"the results were made on shifted data (manifest {stated_digest}), but {dataset_root} is a clean "
+                    "dataset; give the shifted folder as --dataroot"
                 )
             return {"data": "clean"}
-        manifest = check_manifest(root, truth.scenes)
-        actual_digest = manifest_digest(root)
+        manifest = check_manifest(dataset_root, truth.scenes)
+        actual_digest = manifest_digest(dataset_root)
         if stated_digest is not None and stated_digest != actual_digest:
             stated_data = "clean data" if stated_digest == "clean" else f"other data (manifest {stated_digest})"
             raise FormatError(
-                f"the results were made on {stated_data}, not on {root} (manifest {actual_digest}); "
+                f"the results were made on {stated_data}, not on {dataset_root} (manifest {actual_digest}); "
                 "give the data that they were made on as --dataroot"
             )
         assert manifest is not None

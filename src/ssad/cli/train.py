@@ -42,9 +42,9 @@ def train_detector(
     ] = None,
 ) -> None:
     """Train a detector and validate it on the split val. To resume, repeat the command."""
-    from ssad.training.detector import Plan, parse_changes, run_training
+    from ssad.training.detector import DetectorPlan, parse_changes, run_training
 
-    plan = Plan(
+    plan = DetectorPlan(
         recipe,
         (data, *(more or [])),
         out,
@@ -57,7 +57,7 @@ def train_detector(
         seconds=seconds,
         val_data=val_data,
     )
-    for line in run_training(plan, say=lambda text: print(text, flush=True)):
+    for line in run_training(plan, report=lambda text: print(text, flush=True)):
         print(line)
 
 
@@ -94,7 +94,7 @@ def train_driver(
         device=device,
         start=start,
     )
-    for line in run_driver_training(plan, say=lambda text: print(text, flush=True)):
+    for line in run_driver_training(plan, report=lambda text: print(text, flush=True)):
         print(line)
 
 
@@ -122,5 +122,5 @@ def train_adversary(
     plan = AdversaryPlan(
         algorithm, out, ego, _names(scenarios), _names(test), literal, off_road, parse_changes(change or []), seconds
     )
-    for line in run_adversary_training(plan, say=lambda text: print(text, flush=True)):
+    for line in run_adversary_training(plan, report=lambda text: print(text, flush=True)):
         print(line)

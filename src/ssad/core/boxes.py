@@ -89,28 +89,28 @@ class TrackedBoxes(WorldBoxes):
         return TrackedBoxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), (), np.zeros(0))
 
 
-def hulls(corners: F64, intrinsic: F64, size: tuple[int, int]) -> F64:
-    """What 3D boxes cover of a picture: the rectangles around their corners, cut at its border.
+def hulls(corners: F64, intrinsic: F64, image_size: tuple[int, int]) -> F64:
+    """Return the image rectangles around the corners of 3D boxes, cut at the border of the image.
 
     Args:
         corners: [N, 8, 3] in the camera's frame (x right, y down, z forward), m; those nearer than `NEAR` are moved
             there.
         intrinsic: The camera's matrix [3, 3].
-        size: Width and height of the picture, px.
+        image_size: Width and height of the image, px.
 
     Returns:
         x1, y1, x2, y2 [N, 4], px.
     """
-    local = corners.copy()
-    local[..., 2] = np.maximum(local[..., 2], NEAR)
-    homogeneous = local @ intrinsic.T
+    clipped_corners = corners.copy()
+    clipped_corners[..., 2] = np.maximum(clipped_corners[..., 2], NEAR)
+    homogeneous = clipped_corners @ intrinsic.T
     pixels = homogeneous[..., :2] / homogeneous[..., 2:]
-    return np.concatenate([np.clip(pixels.min(1), 0, size), np.clip(pixels.max(1), 0, size)], 1)
+    return np.concatenate([np.clip(pixels.min(1), 0, image_size), np.clip(pixels.max(1), 0, image_size)], 1)
 
 
-def size_columns(given: str, wanted: str) -> list[int]:
+def size_columns(source_order: str, target_order: str) -> list[int]:
     """Columns that bring sizes of one order into another: from "wlh" to "lwh" they are 1, 0, 2."""
-    return [given.index(side) for side in wanted]
+    return [source_order.index(side) for side in target_order]
 
 
 def bottom_centre(centre: Any, size_lhw: Any) -> Any:

@@ -34,7 +34,7 @@ COUNTER = "num_batches_tracked"  # BatchNorm's counter of training steps, which 
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
+class WeightsCard:
     """Description and origin of weights.
 
     Attributes:
@@ -123,44 +123,44 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
         raise FormatError(f"{path}: not a readable safetensors file: {' '.join(str(error).split())[:120]}") from None
 
 
-def _parts(place: Path) -> list[Path]:
+def _parts(path: Path) -> list[Path]:
     """The files that make up weights."""
-    if place.is_dir():
-        indices = sorted(place.glob("*.index.json"))
+    if path.is_dir():
+        indices = sorted(path.glob("*.index.json"))
         single_files = sorted(
-            candidate for candidate in place.glob("*.safetensors") if SHARD.fullmatch(candidate.name) is None
+            candidate for candidate in path.glob("*.safetensors") if SHARD.fullmatch(candidate.name) is None
         )
         shard_stems = sorted(
             {
                 shard_match["stem"]
-                for candidate in place.glob("*.safetensors")
+                for candidate in path.glob("*.safetensors")
                 if (shard_match := SHARD.fullmatch(candidate.name))
             }
         )
         if len(indices) == 1 and not single_files:
             return _indexed(indices[0])
         if len(single_files) + len(shard_stems) == 1 and not indices:
-            return single_files or _shards(place, shard_stems[0])
-        pickle_files = sorted(candidate for candidate in place.iterdir() if candidate.suffix in PICKLED)
+            return single_files or _shards(path, shard_stems[0])
+        pickle_files = sorted(candidate for candidate in path.iterdir() if candidate.suffix in PICKLED)
         if len(pickle_files) == 1 and not single_files and not shard_stems:
-            raise FormatError(f"{place}: no safetensors there; name the file: {pickle_files[0]}")
+            raise FormatError(f"{path}: no safetensors there; name the file: {pickle_files[0]}")
         raise FormatError(
-            f"{place}: {len(single_files) + len(shard_stems) or 'no'} sets of weights there; name one file"
+            f"{path}: {len(single_files) + len(shard_stems) or 'no'} sets of weights there; name one file"
         )
-    if place.name.endswith(".index.json"):
-        return _indexed(place)
-    shard = SHARD.fullmatch(place.name)
+    if path.name.endswith(".index.json"):
+        return _indexed(path)
+    shard = SHARD.fullmatch(path.name)
     if shard:
-        return _shards(place.parent, shard["stem"])
-    if place.suffix == ".safetensors":
-        if place.is_file():
-            return [place]
-        if any(SHARD.fullmatch(candidate.name) for candidate in place.parent.glob(f"{place.stem}-*.safetensors")):
-            return _shards(place.parent, place.stem)
-    if not place.exists():
-        close = difflib.get_close_matches(place.name, _names(place.parent), n=3, cutoff=0.4)
-        raise FormatError(f"{place}: no such file{f'; closest: {chr(44).join(close)}' if close else ''}")
-    raise FormatError(f"{place}: weights are .safetensors or {', '.join(PICKLED)} files")
+        return _shards(path.parent, shard["stem"])
+    if path.suffix == ".safetensors":
+        if path.is_file():
+            return [path]
+        if any(SHARD.fullmatch(candidate.name) for candidate in path.parent.glob(f"{path.stem}-*.safetensors")):
+            return _shards(path.parent, path.stem)
+    if not path.exists():
+        close_matches = difflib.get_close_matches(path.name, _names(path.parent), n=3, cutoff=0.4)
+        raise FormatError(f"{path}: no such file{f'; closest: {chr(44).join(close_matches)}' if close_matches else ''}")
+    raise FormatError(f"{path}: weights are .safetensors or {', '.join(PICKLED)} files")
 
 
 def _names(folder: Path) -> list[str]:
@@ -202,7 +202,7 @@ def _shard_names(stem: str, count: int) -> list[str]:
     return [f"{stem}-{number:05d}-of-{count:05d}.safetensors" for number in range(1, count + 1)]
 
 
-def read_card(path: str | Path) -> Card:
+def read_card(path: str | Path) -> WeightsCard:
     """Read the card of weights.
 
     Args:
@@ -224,7 +224,7 @@ def read_card(path: str | Path) -> Card:
         )
         raise FormatError(f"{source}: {reason}")
     data = read_json(card_file)
-    required_names = {card_field.name for card_field in fields(Card)}
+    required_names = {card_field.name for card_field in fields(WeightsCard)}
     types_by_name = {
         "data": str,
         "command": str,
@@ -243,10 +243,10 @@ def read_card(path: str | Path) -> Card:
     if not all(isinstance(value, int | float) for value in metrics.values()):
         raise FormatError(f"{card_file}: a metric is no number")
     converted = {"classes": tuple(data["classes"]), "metrics": metrics}
-    return Card(**{name: data[name] for name in required_names & data.keys()} | converted)
+    return WeightsCard(**{name: data[name] for name in required_names & data.keys()} | converted)
 
 
-def load_card(path: str | Path) -> tuple[Card, dict[str, Tensor]]:
+def load_card(path: str | Path) -> tuple[WeightsCard, dict[str, Tensor]]:
     """Read a card and the weights beside it, whose hash must be the card's.
 
     Raises:
@@ -265,8 +265,8 @@ def load_card(path: str | Path) -> tuple[Card, dict[str, Tensor]]:
 
 
 def save_weights(
-    path: str | Path, state: Mapping[str, Tensor], *, card: Card, half: bool = False, shard_mb: float = 15.0
-) -> Card:
+    path: str | Path, state: Mapping[str, Tensor], *, card: WeightsCard, half: bool = False, shard_mb: float = 15.0
+) -> WeightsCard:
     """Write NAME.safetensors (or its shards) and the card NAME.json; the same bytes for the same tensors.
 
     Every file is written atomically, the card last; shards of older weights of this name are removed.
@@ -314,13 +314,13 @@ def save_weights(
     return card
 
 
-def _card_text(card: Card, where: str) -> str:
+def _card_text(card: WeightsCard, origin: str) -> str:
     """Return the card as JSON; a NaN metric (a class absent from the data) becomes null."""
     try:
         metrics = {name: float(metric) if math.isfinite(metric) else None for name, metric in card.metrics.items()}
         return dump_json(asdict(card) | {"metrics": metrics}, indent=1)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"{where}: the card holds what JSON cannot: {error}") from None
+        raise ConfigError(f"{origin}: the card holds what JSON cannot: {error}") from None
 
 
 def _stored(value: Tensor, *, half: bool) -> Tensor:
@@ -370,19 +370,19 @@ def read_state(path: str | Path, key: str) -> dict[str, Any] | None:
     return state
 
 
-def check_finite(state: Mapping[str, Tensor], where: str) -> None:
+def check_finite(state: Mapping[str, Tensor], origin: str) -> None:
     """Check that no tensor holds NaN or infinite values.
 
     Raises:
-        FormatError: A tensor does; `where` names the weights in the message.
+        FormatError: A tensor does; `origin` names the weights in the message.
     """
     for name, value in state.items():
         if value.is_floating_point() and not bool(value.isfinite().all()):
             invalid_count = int((~value.isfinite()).sum())
-            raise FormatError(f"{where}: '{name}' holds {invalid_count} NaN or infinite values of {value.numel()}")
+            raise FormatError(f"{origin}: '{name}' holds {invalid_count} NaN or infinite values of {value.numel()}")
 
 
-def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str | Path) -> None:
+def fit_state(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> None:
     """Copy weights into a module of the same names and shapes; on an error the module stays unchanged.
 
     Values are cast to the module's types. Missing counters of BatchNorm's steps are accepted.
@@ -390,7 +390,7 @@ def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str | Path)
     Args:
         module: The module.
         state: Tensors by name.
-        where: Origin of the weights, for messages.
+        origin: Origin of the weights, for messages.
 
     Raises:
         FormatError: Names are missing or unknown, shapes differ, values are NaN or infinite, or weights are
@@ -403,7 +403,7 @@ def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str | Path)
     if missing or unexpected:
         problems = [_listed("missing", missing, unexpected), _listed("foreign", unexpected, missing)]
         raise FormatError(
-            f"{where}: these are not the weights of {name}: {'; '.join(problem for problem in problems if problem)} "
+            f"{origin}: these are not the weights of {name}: {'; '.join(problem for problem in problems if problem)} "
             f"(of {len(parameters)} names {sum(key in state for key in parameters)} fit)"
         )
     shape_differences = {
@@ -414,25 +414,25 @@ def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str | Path)
     for key, (source_shape, target_shape) in shape_differences.items():
         reason = _other_shapes(module, shape_differences.values())
         raise FormatError(
-            f"{where}: '{key}' has the shape {list(source_shape)}, {name} takes {list(target_shape)}: {reason}"
+            f"{origin}: '{key}' has the shape {list(source_shape)}, {name} takes {list(target_shape)}: {reason}"
         )
     for key, value in state.items():
         if parameters[key].is_floating_point() and not value.is_floating_point():
             dtype_name = str(value.dtype).removeprefix("torch.")
-            raise FormatError(f"{where}: '{key}' holds {dtype_name} numbers, {name} takes floats (quantised weights?)")
-    check_finite(state, str(where))
+            raise FormatError(f"{origin}: '{key}' holds {dtype_name} numbers, {name} takes floats (quantised weights?)")
+    check_finite(state, str(origin))
     with torch.no_grad():
         for key, value in state.items():
             parameters[key].copy_(value)
 
 
-def start_from(module: nn.Module, state: Mapping[str, Tensor], where: str | Path) -> list[str]:
+def start_from(module: nn.Module, state: Mapping[str, Tensor], origin: str | Path) -> list[str]:
     """Copy the weights that fit into a module as a start of training; layers of another shape or name stay fresh.
 
     Args:
         module: The module, with fresh weights.
         state: Tensors by name.
-        where: Origin of the weights, for messages.
+        origin: Origin of the weights, for messages.
 
     Returns:
         Names of the weights that stay fresh.
@@ -441,33 +441,33 @@ def start_from(module: nn.Module, state: Mapping[str, Tensor], where: str | Path
         FormatError: Fewer than four fifths of the module's weights are present, or values are NaN or infinite.
     """
     fresh_state = module.state_dict()
-    shared = {
+    shared_weights = {
         key: value for key, value in state.items() if key in fresh_state and fresh_state[key].shape == value.shape
     }
-    if len(shared) < 0.8 * len(fresh_state):
-        fit_state(module, state, where)  # raises an error that lists the differences
+    if len(shared_weights) < 0.8 * len(fresh_state):
+        fit_state(module, state, origin)  # raises an error that lists the differences
     else:
-        fit_state(module, {**fresh_state, **shared}, where)
-    return [key for key in fresh_state if key not in shared and not key.endswith(COUNTER)]
+        fit_state(module, {**fresh_state, **shared_weights}, origin)
+    return [key for key in fresh_state if key not in shared_weights and not key.endswith(COUNTER)]
 
 
-def _listed(what: str, keys: list[str], others: Iterable[str]) -> str:
+def _listed(relation: str, keys: list[str], other_keys: Iterable[str]) -> str:
     if not keys:
         return ""
-    close = difflib.get_close_matches(keys[0], list(others)[:2000], n=1, cutoff=0.5)
-    hint = f" (closest: {close[0]})" if close else ""
+    close_matches = difflib.get_close_matches(keys[0], list(other_keys)[:2000], n=1, cutoff=0.5)
+    hint = f" (closest: {close_matches[0]})" if close_matches else ""
     ellipsis = ", ..." if len(keys) > 3 else ""
-    return f"{len(keys)} {what}: {', '.join(keys[:3])}{ellipsis}{hint}"
+    return f"{len(keys)} {relation}: {', '.join(keys[:3])}{ellipsis}{hint}"
 
 
 Shape = tuple[int, ...]
 
 
-def _other_shapes(module: nn.Module, differ: Iterable[tuple[Shape, Shape]]) -> str:
+def _other_shapes(module: nn.Module, shape_pairs: Iterable[tuple[Shape, Shape]]) -> str:
     """A guess at why shapes (given, taken) differ: another number of classes if that explains all, or another width."""
     classes = len(getattr(module, "classes", ()))
-    guesses: set[int] | None = None
-    for source_shape, target_shape in differ:
+    possible_counts: set[int] | None = None
+    for source_shape, target_shape in shape_pairs:
         axes = [
             axis
             for axis, (source_length, target_length) in enumerate(zip(source_shape, target_shape, strict=False))
@@ -481,7 +481,7 @@ def _other_shapes(module: nn.Module, differ: Iterable[tuple[Shape, Shape]]) -> s
                 if anchors and not remainder and source_rows % anchors == 0 and source_rows // anchors > extra:
                     candidates.add(source_rows // anchors - extra)
         # Only a class count that explains every differing layer is worth naming.
-        guesses = candidates if guesses is None else guesses & candidates
-    if guesses:
-        return f"made for {' or '.join(map(str, sorted(guesses)))} classes, this detector has {classes}"
+        possible_counts = candidates if possible_counts is None else possible_counts & candidates
+    if possible_counts:
+        return f"made for {' or '.join(map(str, sorted(possible_counts)))} classes, this detector has {classes}"
     return "another width or variant of the detector"

@@ -104,7 +104,7 @@ class Detections:
         Raises:
             ConfigError: The columns are not tensors.
         """
-        flat = zip(
+        flat_columns = zip(
             *(_cpu([getattr(image, name) for image in images]) for name in ("score", "label", "box")), strict=True
         )
         solids = [image.solid for image in images if image.solid is not None]
@@ -113,7 +113,7 @@ class Detections:
         # The images that have 3D boxes take theirs in order.
         return [
             Detections(score, label, box, None if image.solid is None else Solids(*next(columns)))
-            for image, (score, label, box) in zip(images, flat, strict=True)
+            for image, (score, label, box) in zip(images, flat_columns, strict=True)
         ]
 
 
@@ -131,18 +131,18 @@ def _cpu(parts: Sequence[Tensor]) -> Sequence[Tensor]:
     return parts if all(part.device.type == "cpu" for part in parts) else together(parts, torch.Tensor.cpu)
 
 
-def together(parts: Sequence[Tensor], change: Callable[[Tensor], Tensor]) -> list[Tensor]:
+def together(parts: Sequence[Tensor], transform: Callable[[Tensor], Tensor]) -> list[Tensor]:
     """Return the changed parts [N, ...], all changed in one call where they are of a kind.
 
     Args:
         parts: At least one.
-        change: Treats each row by itself.
+        transform: Treats each row by itself.
     """
     import torch
 
     if len({(part.dtype, part.shape[1:], part.device, part.ndim) for part in parts}) > 1 or not parts[0].ndim:
-        return [change(part) for part in parts]
-    return list(torch.split(change(torch.cat(list(parts))), [len(part) for part in parts]))
+        return [transform(part) for part in parts]
+    return list(torch.split(transform(torch.cat(list(parts))), [len(part) for part in parts]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,19 +36,19 @@ class MissingExtraError(ConfigError):
     """A request needs packages of an extra that is not installed.
 
     Args:
-        subject: The requested object, such as "system 'ppo'".
+        feature: The requested object, such as "system 'ppo'".
         package: A package of `EXTRA_OF` that is missing.
     """
 
-    def __init__(self, what: str, package: str) -> None:
-        self.extra, self._given = EXTRA_OF[package], (what, package)
+    def __init__(self, feature: str, package: str) -> None:
+        self.extra, self._arguments = EXTRA_OF[package], (feature, package)
         super().__init__(
-            f"{what} needs the extra {self.extra} ({package} is not installed); {install_extra(self.extra)}"
+            f"{feature} needs the extra {self.extra} ({package} is not installed); {install_extra(self.extra)}"
         )
 
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
         """Make the error picklable, so that worker processes can raise it in the parent."""
-        return MissingExtraError, self._given
+        return MissingExtraError, self._arguments
 
 
 class MapError(SSADError):
@@ -86,20 +86,20 @@ LISTED = (
 """What `ssad list` can list, in the singular: `ssad list suites` and so on."""
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
+def unknown_name(kind: str, name: str, known_names: Iterable[str]) -> UnknownNameError:
     """Make the error for a name that does not exist: the three closest names, and all names or where to find them.
 
     Args:
         kind: What the name stands for, in the singular, such as "system".
         name: What the user typed.
-        known: All names that exist.
+        known_names: All names that exist.
 
     Returns:
         The error, to be raised.
     """
-    names = sorted(known)
-    close = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
-    hint = f"; closest: {', '.join(close)}" if close else ""
+    names = sorted(known_names)
+    close_matches = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
+    hint = f"; closest: {', '.join(close_matches)}" if close_matches else ""
     all_names = f"see: ssad list {kind}s" if kind in LISTED else f"known: {', '.join(names) or 'none'}"
     return UnknownNameError(f"unknown {kind} '{name}'{hint} ({all_names})")
 
@@ -134,15 +134,15 @@ EXTRA_OF = {"torch": "perception", "torchvision": "perception", "scenic": "sceni
 """Package that is imported where it is needed -> the extra that brings it."""
 
 
-def missing_extra(error: ModuleNotFoundError, what: str) -> MissingExtraError | None:
+def missing_extra(error: ModuleNotFoundError, feature: str) -> MissingExtraError | None:
     """Make the error for something that cannot be imported because an extra is missing.
 
     Args:
         error: What the import raised.
-        what: What was asked for, such as "system 'ppo'".
+        feature: What was asked for, such as "system 'ppo'".
 
     Returns:
         The error, to be raised; None: no extra brings what is missing.
     """
     package = (error.name or "").partition(".")[0]
-    return MissingExtraError(what, package) if package in EXTRA_OF else None
+    return MissingExtraError(feature, package) if package in EXTRA_OF else None

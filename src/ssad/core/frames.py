@@ -1,4 +1,4 @@
-"""What a camera or LiDAR delivers at one moment, and what is known about that moment.
+"""Frames of cameras and LiDAR: the data of one moment, and its metadata.
 
 Frames of reference: world (x east, y north, z up), ego (x forward, y left, z up), camera (x right, y down, z forward).
 A pose `a_to_b` is a 4 x 4 matrix that takes homogeneous points of a into b. Places in a picture count from its corner,
@@ -32,7 +32,7 @@ class Camera:
 
     @staticmethod
     def typical(width: int, height: int, *, channel: str = "CAM") -> Camera:
-        """What is assumed of an unknown camera: that of nuScenes, focal length 0.79 of the width, level, 1.5 m up."""
+        """Return a typical camera: that of nuScenes, focal length 0.79 of the width, level, 1.5 m up."""
         focal = 0.79 * width
         matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         return Camera(width, height, matrix, channel=channel)

@@ -23,13 +23,13 @@ def rotate(xy: ArrayLike, angle: ArrayLike) -> Floats:
 def cross(a: ArrayLike, b: ArrayLike) -> npt.NDArray[Any]:
     """Return cross products [..., 3] of vectors [..., 3], equal to `np.cross` to the bit, in a fifth of its time."""
     u, v = np.asarray(a), np.asarray(b)
-    product = np.empty(np.broadcast_shapes(u.shape, v.shape), np.result_type(u, v))
+    result = np.empty(np.broadcast_shapes(u.shape, v.shape), np.result_type(u, v))
     x, y, z = (u[..., axis] for axis in range(3))
-    p, q, r = (v[..., axis] for axis in range(3))
-    product[..., 0] = y * r - z * q
-    product[..., 1] = z * p - x * r
-    product[..., 2] = x * q - y * p
-    return product
+    a_axis, b_axis, c_axis = (v[..., axis] for axis in range(3))
+    result[..., 0] = y * c_axis - z * b_axis
+    result[..., 1] = z * a_axis - x * c_axis
+    result[..., 2] = x * b_axis - y * a_axis
+    return result
 
 
 def to_local(pose: ArrayLike, xy: ArrayLike) -> Floats:
@@ -73,32 +73,32 @@ def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
     two_local = to_local(first[..., None, :3], second_corners)
     one_local = to_local(second[..., None, :3], first_corners)
     half_first, half_second = 0.5 * first[..., None, 3:5], 0.5 * second[..., None, 3:5]
-    gap = np.minimum(_point_to_box(two_local, half_first), _point_to_box(one_local, half_second))
+    distance = np.minimum(_point_to_box(two_local, half_first), _point_to_box(one_local, half_second))
     is_separated = _separated(two_local, half_first) | _separated(one_local, half_second)
-    return np.where(is_separated, gap, 0.0).astype(gap.dtype)
+    return np.where(is_separated, distance, 0.0).astype(distance.dtype)
 
 
 def in_polygon(points: ArrayLike, corners: ArrayLike) -> npt.NDArray[np.bool_]:
     """Return whether points [n, 2] lie in a polygon [m, 2] (even-odd rule)."""
     x, y = np.asarray(points).T[:, :, None]
-    (ax, ay), (bx, by) = np.asarray(corners).T, np.roll(corners, -1, axis=0).T
-    crosses = (ay > y) != (by > y)
+    (start_x, start_y), (end_x, end_y) = np.asarray(corners).T, np.roll(corners, -1, axis=0).T
+    crosses = (start_y > y) != (end_y > y)
     # Level edges never count as crossed, so the 1.0 only avoids a division by 0.
-    crossing_x = ax + (y - ay) / np.where(by == ay, 1.0, by - ay) * (bx - ax)
+    crossing_x = start_x + (y - start_y) / np.where(end_y == start_y, 1.0, end_y - start_y) * (end_x - start_x)
     return np.asarray((crosses & (x < crossing_x)).sum(axis=1) % 2 == 1)
 
 
-def _point_to_box(points: Floats, half: Floats) -> Floats:
+def _point_to_box(points: Floats, half_size: Floats) -> Floats:
     """Least distance [...] of points [..., 4, 2] from the box of half extents [..., 1, 2] at the origin."""
-    outside = np.maximum(np.abs(points) - half, 0.0)
-    return np.asarray(np.hypot(outside[..., 0], outside[..., 1]).min(axis=-1))
+    excess = np.maximum(np.abs(points) - half_size, 0.0)
+    return np.asarray(np.hypot(excess[..., 0], excess[..., 1]).min(axis=-1))
 
 
-def _separated(points: Floats, half: Floats) -> npt.NDArray[np.bool_]:
+def _separated(points: Floats, half_size: Floats) -> npt.NDArray[np.bool_]:
     """Return whether an axis of the box at the origin separates it from the hull of the points."""
-    low, high = points.min(axis=-2), points.max(axis=-2)
-    extent = half[..., 0, :]
-    return np.asarray(((low > extent) | (high < -extent)).any(axis=-1))
+    lower, upper = points.min(axis=-2), points.max(axis=-2)
+    extent = half_size[..., 0, :]
+    return np.asarray(((lower > extent) | (upper < -extent)).any(axis=-1))
 
 
 def _floats(value: ArrayLike) -> Floats:

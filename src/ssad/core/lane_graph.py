@@ -151,7 +151,7 @@ class LaneGraph:
         return len(self.kind)
 
     @cached_property
-    def kept(self) -> dict[Any, Any]:
+    def cache(self) -> dict[Any, Any]:
         """Cache of results derived from these lanes."""
         return {}
 
@@ -175,31 +175,40 @@ class LaneGraph:
         """Return x, y, yaw and width at arc length s of a lane; s is clamped to the lane."""
         lane_points = self.points(lane)
         arc_lengths = self.s[lane_points]
-        point = min(max(int(arc_lengths.searchsorted(s, side="right")) - 1, 0), len(arc_lengths) - 2)
+        point_index = min(max(int(arc_lengths.searchsorted(s, side="right")) - 1, 0), len(arc_lengths) - 2)
         t = float(
-            min(max((s - arc_lengths[point]) / max(float(arc_lengths[point + 1] - arc_lengths[point]), 1e-9), 0.0), 1.0)
+            min(
+                max(
+                    (s - arc_lengths[point_index])
+                    / max(float(arc_lengths[point_index + 1] - arc_lengths[point_index]), 1e-9),
+                    0.0,
+                ),
+                1.0,
+            )
         )
-        point += lane_points.start
-        x, y = (1.0 - t) * self.xy[point] + t * self.xy[point + 1]
-        yaw_change = wrap(float(self.yaw[point + 1] - self.yaw[point]))
-        width = (1.0 - t) * float(self.width[point]) + t * float(self.width[point + 1])
-        return float(x), float(y), float(self.yaw[point]) + t * yaw_change, width
+        point_index += lane_points.start
+        x, y = (1.0 - t) * self.xy[point_index] + t * self.xy[point_index + 1]
+        yaw_change = wrap(float(self.yaw[point_index + 1] - self.yaw[point_index]))
+        width = (1.0 - t) * float(self.width[point_index]) + t * float(self.width[point_index + 1])
+        return float(x), float(y), float(self.yaw[point_index]) + t * yaw_change, width
 
     def along(self, lane: int, s: npt.ArrayLike) -> F64:
         """Return rows [n, 4] of x, y, yaw and width at arc lengths s [n] of a lane, equal to `at` to the bit."""
         lane_points = self.points(lane)
         arc_lengths = self.s[lane_points]
         positions = np.asarray(s, np.float32)
-        point = np.clip(np.searchsorted(arc_lengths, positions, side="right") - 1, 0, len(arc_lengths) - 2)
-        step = np.maximum(arc_lengths[point + 1] - arc_lengths[point], np.float32(1e-9))
-        t = np.clip((positions - arc_lengths[point]) / step, 0.0, 1.0).astype(np.float64)
-        point += lane_points.start
+        point_indices = np.clip(np.searchsorted(arc_lengths, positions, side="right") - 1, 0, len(arc_lengths) - 2)
+        spacing = np.maximum(arc_lengths[point_indices + 1] - arc_lengths[point_indices], np.float32(1e-9))
+        t = np.clip((positions - arc_lengths[point_indices]) / spacing, 0.0, 1.0).astype(np.float64)
+        point_indices += lane_points.start
         # float32 weights: `at` multiplies float32 points by Python floats, which numpy does in float32.
         start_weight, end_weight = ((1.0 - t).astype(np.float32)[:, None], t.astype(np.float32)[:, None])
-        xy = start_weight * self.xy[point] + end_weight * self.xy[point + 1]
-        yaw_change = wrap_angle((self.yaw[point + 1] - self.yaw[point]).astype(np.float64))
-        width = (1.0 - t) * self.width[point].astype(np.float64) + t * self.width[point + 1].astype(np.float64)
-        return np.column_stack([xy, self.yaw[point].astype(np.float64) + t * yaw_change, width])
+        xy = start_weight * self.xy[point_indices] + end_weight * self.xy[point_indices + 1]
+        yaw_change = wrap_angle((self.yaw[point_indices + 1] - self.yaw[point_indices]).astype(np.float64))
+        width = (1.0 - t) * self.width[point_indices].astype(np.float64) + t * self.width[point_indices + 1].astype(
+            np.float64
+        )
+        return np.column_stack([xy, self.yaw[point_indices].astype(np.float64) + t * yaw_change, width])
 
     def divided(self, lane: int) -> bool:
         """Return whether no oncoming lane lies beside those of a lane's direction: a one-way road, or a median."""
@@ -207,22 +216,22 @@ class LaneGraph:
             lane = left
         return left < 0 or self.kind[left] != LaneType.DRIVING
 
-    def same_direction(self, lane: int, other: int) -> bool:
-        """Whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
-        return bool(self.lane_id[lane] * self.lane_id[other] > 0 and self.road[lane] == self.road[other])
+    def same_direction(self, lane: int, other_lane: int) -> bool:
+        """Return whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
+        return bool(self.lane_id[lane] * self.lane_id[other_lane] > 0 and self.road[lane] == self.road[other_lane])
 
 
 def no_signals() -> dict[str, Any]:
     """Return the arrays of a `LaneGraph` without signals, stop lines and crosswalks, by name."""
-    empty = np.zeros(0, np.int32)
+    no_indices = np.zeros(0, np.int32)
     return {
         "signal_xy": np.zeros((0, 2), np.float32),
         "signal_yaw": np.zeros(0, np.float32),
-        "signal_junction": empty,
-        "signal_phase": empty,
+        "signal_junction": no_indices,
+        "signal_phase": no_indices,
         "signal_virtual": np.zeros(0, bool),
-        "stop_signal": empty,
-        "stop_lane": empty,
+        "stop_signal": no_indices,
+        "stop_lane": no_indices,
         "stop_s": np.zeros(0, np.float32),
         "crosswalk_offset": np.zeros(1, np.int32),
         "crosswalk_xy": np.zeros((0, 2), np.float32),
@@ -230,7 +239,7 @@ def no_signals() -> dict[str, Any]:
 
 
 _DTYPES = array_dtypes(LaneGraph)
-_PER = {
+_ARRAYS_BY_LENGTH = {
     "P": ("z", "yaw", "width", "s"),
     "L": ("road", "section", "lane_id", "junction", "speed_limit", "left", "right", "left_marking", "right_marking"),
     "S": ("signal_yaw", "signal_junction", "signal_phase", "signal_virtual"),
@@ -245,14 +254,14 @@ _OPTIONAL = frozenset({"sign_kind", "sign_xy", "sign_yaw", "rule_sign", "rule_la
 def _check(graph: LaneGraph) -> None:
     """Raise MapError for arrays that contradict each other; it names the first."""
 
-    def require(ok: bool, what: str) -> None:
-        if not ok:
-            raise MapError(f"town '{graph.name}': {what}; bake the map again with ssad import map")
+    def require(holds: bool, problem: str) -> None:
+        if not holds:
+            raise MapError(f"town '{graph.name}': {problem}; bake the map again with ssad import map")
 
     for array_name in ("xy", "signal_xy", "crosswalk_xy", "sign_xy"):
         value = getattr(graph, array_name)
         require(value.ndim == 2 and value.shape[1] == 2, f"{array_name} is not [n, 2]")
-    size = {
+    array_lengths = {
         "P": len(graph.xy),
         "L": len(graph.kind),
         "S": len(graph.signal_xy),
@@ -260,38 +269,38 @@ def _check(graph: LaneGraph) -> None:
         "G": len(graph.sign_xy),
         "R": len(graph.rule_sign),
     }
-    for dimension, array_names in _PER.items():
+    for dimension, array_names in _ARRAYS_BY_LENGTH.items():
         for array_name in array_names:
             require(
-                getattr(graph, array_name).shape == (size[dimension],),
-                f"{array_name} does not have {size[dimension]} rows",
+                getattr(graph, array_name).shape == (array_lengths[dimension],),
+                f"{array_name} does not have {array_lengths[dimension]} rows",
             )
     for array_name in (array_name for array_name, dtype in _DTYPES.items() if dtype == np.float32):
         require(bool(np.isfinite(getattr(graph, array_name)).all()), f"{array_name} holds a number that is not finite")
     for array_name, rows, total in (
-        ("offset", size["L"], size["P"]),
-        ("succ_offset", size["L"], len(graph.succ)),
+        ("offset", array_lengths["L"], array_lengths["P"]),
+        ("succ_offset", array_lengths["L"], len(graph.succ)),
         ("crosswalk_offset", len(graph.crosswalk_offset) - 1, len(graph.crosswalk_xy)),
     ):
         value = getattr(graph, array_name)
         is_partition = value.shape == (rows + 1,) and len(value) > 0 and value[0] == 0 and value[-1] == total
         require(bool(is_partition and (np.diff(value) >= 0).all()), f"{array_name} does not partition its rows")
-    require(size["L"] > 0, "it has no lane")
+    require(array_lengths["L"] > 0, "it has no lane")
     require(bool((np.diff(graph.offset) >= 2).all()), "a lane has fewer than two points")
     for array_name, low, high in (
-        ("left", -1, size["L"]),
-        ("right", -1, size["L"]),
-        ("succ", 0, size["L"]),
-        ("stop_lane", 0, size["L"]),
-        ("stop_signal", 0, size["S"]),
+        ("left", -1, array_lengths["L"]),
+        ("right", -1, array_lengths["L"]),
+        ("succ", 0, array_lengths["L"]),
+        ("stop_lane", 0, array_lengths["L"]),
+        ("stop_signal", 0, array_lengths["S"]),
         ("kind", 0, len(LaneType)),
         ("sign_kind", 0, len(SignKind)),
-        ("rule_sign", 0, size["G"]),
-        ("rule_lane", 0, size["L"]),
+        ("rule_sign", 0, array_lengths["G"]),
+        ("rule_lane", 0, array_lengths["L"]),
     ):
         value = getattr(graph, array_name)
         require(bool(((value >= low) & (value < high)).all()), f"{array_name} points outside the table")
-    within_lane = np.ones(size["P"] - 1, bool)
+    within_lane = np.ones(array_lengths["P"] - 1, bool)
     # Arc length restarts at each lane, so steps between lanes do not count.
     within_lane[graph.offset[1:-1] - 1] = False
     require(bool((np.diff(graph.s)[within_lane] > 0).all()), "s does not grow along a lane")
@@ -338,10 +347,10 @@ def load_graph(path: Path | str) -> LaneGraph:
     return LaneGraph(name=str(header[1]), **arrays)
 
 
-def equal(a: LaneGraph, b: LaneGraph) -> bool:
-    """Whether two graphs hold the same numbers."""
-    return a.name == b.name and all(
-        np.array_equal(getattr(a, graph_field.name), getattr(b, graph_field.name))
+def equal(first: LaneGraph, second: LaneGraph) -> bool:
+    """Return whether two graphs hold the same numbers."""
+    return first.name == second.name and all(
+        np.array_equal(getattr(first, graph_field.name), getattr(second, graph_field.name))
         for graph_field in fields(LaneGraph)
         if graph_field.name != "name"
     )

@@ -55,7 +55,7 @@ def strips(graph: LaneGraph) -> list[Strip]:
     return sorted(lane_strips, key=lambda strip: strip.layer)
 
 
-def junction_areas(graph: LaneGraph, drawn: Sequence[Strip], *, scale: float = 5.0) -> list[F64]:
+def junction_areas(graph: LaneGraph, lane_strips: Sequence[Strip], *, scale: float = 5.0) -> list[F64]:
     """Outlines [N, 2] m of the junctions' road surface: connecting lanes together, without the holes between them.
 
     The union is taken on a raster of `scale` pixels a metre, slits under 1 m closed.
@@ -64,17 +64,19 @@ def junction_areas(graph: LaneGraph, drawn: Sequence[Strip], *, scale: float = 5
     # An odd size, so that the kernel has a central pixel.
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(scale) | 1, int(scale) | 1))
     for junction in np.unique(graph.junction[graph.junction >= 0]):
-        rings = [
+        outlines = [
             strip.ring
-            for strip in drawn
+            for strip in lane_strips
             if graph.junction[strip.lane] == junction and strip.layer == LAYERS[LaneType.DRIVING]
         ]
-        if not rings:
+        if not outlines:
             continue
-        origin = np.min([outline.min(axis=0) for outline in rings], axis=0) - 2.0
-        size = np.ceil((np.max([outline.max(axis=0) for outline in rings], axis=0) + 2.0 - origin) * scale).astype(int)
+        origin = np.min([outline.min(axis=0) for outline in outlines], axis=0) - 2.0
+        size = np.ceil((np.max([outline.max(axis=0) for outline in outlines], axis=0) + 2.0 - origin) * scale).astype(
+            int
+        )
         mask = np.zeros((size[1], size[0]), np.uint8)
-        for ring in rings:
+        for ring in outlines:
             cv2.fillPoly(mask, [np.round((ring - origin) * scale).astype(np.int32)], 1)
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

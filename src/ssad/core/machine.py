@@ -57,19 +57,19 @@ def keep_memory(size: int = 1 << 30) -> None:
         library.mallopt(-1, size)  # M_TRIM_THRESHOLD
 
 
-def pick_device(wanted: str) -> str:
+def pick_device(requested: str) -> str:
     """auto, cpu or cuda as a device of the world. ConfigError when it is not there."""
-    if wanted == "cpu":
+    if requested == "cpu":
         return "cpu"
-    if wanted not in ("auto", "cuda"):
-        raise ConfigError(f"--device {wanted}: expected auto, cpu or cuda")
+    if requested not in ("auto", "cuda"):
+        raise ConfigError(f"--device {requested}: expected auto, cpu or cuda")
     if cuda_driver():
         import warp
 
         quiet_warp()
         if warp.is_cuda_available():
             return "cuda"
-    if wanted == "cuda":
+    if requested == "cuda":
         raise ConfigError("--device cuda: no CUDA device is usable here (see: ssad doctor); use --device cpu")
     return "cpu"
 

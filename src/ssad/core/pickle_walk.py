@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 from pickletools import genops, markobject, opcodes
 
-MOST_STEPS = 5_000_000  # a tensor of a checkpoint takes about 40
+MAX_STEPS = 5_000_000  # a tensor of a checkpoint takes about 40
 
-_TAKES = {  # of each opcode: values popped, whether also all down to a mark, values pushed
+_STACK_EFFECTS = {  # of each opcode: values popped, whether also all down to a mark, values pushed
     op.name: (
         op.stack_before.index(markobject) if markobject in op.stack_before else len(op.stack_before),
         markobject in op.stack_before,
@@ -15,9 +15,11 @@ _TAKES = {  # of each opcode: values popped, whether also all down to a mark, va
     )
     for op in opcodes
 }
-_FILLS = frozenset({"APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"})  # and put back what they fill
-_KEEPS = frozenset({"PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"})
-_BRINGS = frozenset({"GET", "BINGET", "LONG_BINGET"})
+_FILLING_OPCODES = frozenset(
+    {"APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"}
+)  # and put back what they fill
+_MEMO_WRITES = frozenset({"PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"})
+_MEMO_READS = frozenset({"GET", "BINGET", "LONG_BINGET"})
 
 
 class RefusedError(Exception):
@@ -28,7 +30,7 @@ class Steps:
     """Budget of work that a file may still request."""
 
     def __init__(self) -> None:
-        self.left = MOST_STEPS
+        self.remaining = MAX_STEPS
 
     def take(self, count: int) -> None:
         """Subtract steps from the budget.
@@ -36,12 +38,12 @@ class Steps:
         Raises:
             RefusedError: The budget is exhausted.
         """
-        self.left -= count
-        if self.left < 0:
-            raise RefusedError(f"its pickle takes more than {MOST_STEPS:,} steps to read, far more than weights do")
+        self.remaining -= count
+        if self.remaining < 0:
+            raise RefusedError(f"its pickle takes more than {MAX_STEPS:,} steps to read, far more than weights do")
 
 
-def walk(file: io.BytesIO, part: str, steps: Steps) -> None:
+def walk(file: io.BytesIO, file_name: str, steps: Steps) -> None:
     """Follow the pickle that starts here, and restore the position of the file.
 
     A value costs one step plus the steps of all its parts, so shared parts count each time: small tuples of
@@ -53,7 +55,7 @@ def walk(file: io.BytesIO, part: str, steps: Steps) -> None:
 
     Args:
         file: Positioned at the start of a pickle.
-        part: Name of the file in an error.
+        file_name: Name of the file in an error.
         steps: Budget from which the steps of this pickle are taken.
 
     Raises:
@@ -65,29 +67,29 @@ def walk(file: io.BytesIO, part: str, steps: Steps) -> None:
     memo_costs: dict[int, int] = {}
     for opcode, argument, opcode_position in genops(file):
         try:
-            if opcode.name in _KEEPS:
+            if opcode.name in _MEMO_WRITES:
                 memo_index = len(memo_costs) if argument is None else int(argument)
                 if memo_index > (opcode_position or 0) - start_position:
                     raise RefusedError(
-                        f"byte {opcode_position} of {part} keeps a value as number "
+                        f"byte {opcode_position} of {file_name} keeps a value as number "
                         f"{memo_index:,}, which no pickle of this size needs"
                     )
                 memo_costs[memo_index] = stack_costs[-1]
                 continue
-            pop_count, pops_to_mark, push_count = _TAKES[opcode.name]
+            pop_count, pops_to_mark, push_count = _STACK_EFFECTS[opcode.name]
             cost = 1
             while pops_to_mark and (value_cost := stack_costs.pop()):
                 cost += value_cost
             for _ in range(pop_count):
                 cost += stack_costs.pop()
         except IndexError:
-            raise ValueError(f"byte {opcode_position} of {part} takes a value that is not there") from None
+            raise ValueError(f"byte {opcode_position} of {file_name} takes a value that is not there") from None
         steps.take(cost)
         if opcode.name == "MARK":
             stack_costs.append(0)
-        elif opcode.name in _BRINGS:
+        elif opcode.name in _MEMO_READS:
             # A shared value counts again at each use, since hashing unfolds it.
             stack_costs.append(memo_costs.get(int(argument or 0), 1))
         else:
-            stack_costs += [1 if opcode.name in _FILLS else cost] * push_count
+            stack_costs += [1 if opcode.name in _FILLING_OPCODES else cost] * push_count
     file.seek(start_position)

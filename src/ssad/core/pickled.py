@@ -32,8 +32,8 @@ MAX_PICKLE = 256 * MIB
 MAGIC = 0x1950A86A20F9469CFC6C  # the first number of the older stream
 STREAM = 1001
 DEEPEST = 60
-MOST = 200_000
-MOST_TIMES = 16  # limit of the tensors' total size, in sizes of the file; tensors may share storage
+MAX_STATE_ENTRIES = 200_000
+MAX_EXPANSION = 16  # limit of the tensors' total size, in sizes of the file; tensors may share storage
 CONVERT = "convert it where it was made: safetensors.torch.save_file(model.state_dict(), 'weights.safetensors')"
 NESTS = ("ema", "average", "state_dict", "model_state_dict", "model", "module", "net", "weights")
 
@@ -65,7 +65,7 @@ class _Storage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Strided:
-    """A tensor to be: a window of a storage. Nothing in it is trusted before `_Numbers.tensor`."""
+    """A tensor to be: a window of a storage. Nothing in it is trusted before `_TensorReader.tensor`."""
 
     storage: Any
     offset: Any
@@ -115,14 +115,14 @@ class _Table(dict[Any, Any]):
 class _Maker:
     """A function that the file may call but not change; the items it copies count as steps."""
 
-    __slots__ = ("_make", "_steps")
+    __slots__ = ("_factory", "_steps")
 
-    def __init__(self, make: Callable[..., Any], steps: Steps) -> None:
-        self._make, self._steps = make, steps
+    def __init__(self, factory: Callable[..., Any], steps: Steps) -> None:
+        self._factory, self._steps = factory, steps
 
     def __call__(self, *args: Any) -> Any:
         self._steps.take(sum(len(value) for value in args if isinstance(value, Sized)))
-        return self._make(*args)
+        return self._factory(*args)
 
     def __setstate__(self, state: Any) -> None:
         raise pickle.UnpicklingError("it changes a function")
@@ -158,9 +158,9 @@ _MAKERS: dict[str, Callable[..., Any]] = {
 class _Reader(pickle.Unpickler):
     """An unpickler that builds only tensor specifications, plain containers and inert records."""
 
-    def __init__(self, file: io.BytesIO, part: str = "the file") -> None:
+    def __init__(self, file: io.BytesIO, file_name: str = "the file") -> None:
         self.steps = Steps()
-        walk(file, part, self.steps)
+        walk(file, file_name, self.steps)
         super().__init__(file, encoding="utf-8")
         self.names: set[str] = set()
         self.classes: dict[str, type] = {}
@@ -198,24 +198,26 @@ class _Reader(pickle.Unpickler):
         return _Storage(pid[1], str(pid[2]), pid[4])
 
 
-class _Numbers:
+class _TensorReader:
     """Reads tensors once the pickle is loaded."""
 
-    def __init__(self, read: Callable[[str], bytes], size: int) -> None:
-        self.read = read
-        self.held: dict[str, Tensor] = {}
-        self.left = min(MOST_TIMES * size, MAX_BYTES)
+    def __init__(self, read_storage: Callable[[str], bytes], size: int) -> None:
+        self.read_storage = read_storage
+        self.storages: dict[str, Tensor] = {}
+        self.remaining_bytes = min(MAX_EXPANSION * size, MAX_BYTES)
 
-    def tensor(self, at: _Strided) -> Tensor:
+    def tensor(self, view: _Strided) -> Tensor:
         """The tensor, with storage of its own. ValueError: it does not lie within its storage."""
-        storage = at.storage
+        storage = view.storage
         if not isinstance(storage, _Storage) or not isinstance(storage.kind, torch.dtype):
             raise ValueError("a tensor without storage")
-        kind = at.kind if isinstance(at.kind, torch.dtype) else storage.kind
-        if storage.key not in self.held:
-            self.held[storage.key] = torch.frombuffer(bytearray(self.read(storage.key) or b"\0"), dtype=torch.uint8)
-        storage_bytes = self.held[storage.key]
-        size, stride, offset = at.size, at.stride, at.offset
+        kind = view.kind if isinstance(view.kind, torch.dtype) else storage.kind
+        if storage.key not in self.storages:
+            self.storages[storage.key] = torch.frombuffer(
+                bytearray(self.read_storage(storage.key) or b"\0"), dtype=torch.uint8
+            )
+        storage_bytes = self.storages[storage.key]
+        size, stride, offset = view.size, view.stride, view.offset
         is_whole = all(type(number) is int and number >= 0 for number in (offset, *size, *stride))
         if not is_whole or len(size) != len(stride) or len(size) > 16:
             raise ValueError("a tensor of no shape")
@@ -225,14 +227,14 @@ class _Numbers:
         if element_count == 0:
             return torch.empty(size, dtype=kind)
         last_index = offset + sum((length - 1) * step for length, step in zip(size, stride, strict=True))
-        available = len(storage_bytes) // kind.itemsize
-        if last_index >= available or element_count > available:
+        element_limit = len(storage_bytes) // kind.itemsize
+        if last_index >= element_limit or element_count > element_limit:
             raise ValueError("a tensor larger than its storage")
-        self.left -= element_count * kind.itemsize
-        if self.left < 0:
-            raise RefusedError(f"its tensors take more than {MOST_TIMES} times its size or {MAX_BYTES // MIB} MiB")
+        self.remaining_bytes -= element_count * kind.itemsize
+        if self.remaining_bytes < 0:
+            raise RefusedError(f"its tensors take more than {MAX_EXPANSION} times its size or {MAX_BYTES // MIB} MiB")
         # A clone: tensors of the file may overlap, and safetensors refuses shared memory.
-        return storage_bytes[: available * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
+        return storage_bytes[: element_limit * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
 
 
 def read_pickled(path: str | Path) -> dict[str, Tensor]:
@@ -272,7 +274,7 @@ def read_pickled(path: str | Path) -> dict[str, Tensor]:
         raise FormatError(f"{path}: not a readable PyTorch checkpoint: {reason}; {CONVERT}") from None
 
 
-def _read_zip(path: str | Path, files: ExitStack) -> tuple[Any, _Numbers, set[str]]:
+def _read_zip(path: str | Path, files: ExitStack) -> tuple[Any, _TensorReader, set[str]]:
     archive = files.enter_context(zipfile.ZipFile(path))
     members = {member.filename: member for member in archive.infolist()}
     if any(name.endswith("/constants.pkl") for name in members):
@@ -292,10 +294,10 @@ def _read_zip(path: str | Path, files: ExitStack) -> tuple[Any, _Numbers, set[st
     if f"{root}byteorder" in members and archive.read(f"{root}byteorder") != b"little":
         raise FormatError(f"{path}: written by a big-endian machine; {CONVERT}")
     reader = _Reader(io.BytesIO(archive.read(pickle_names[0])), pickle_names[0])
-    return reader.load(), _Numbers(lambda key: archive.read(f"{root}data/{key}"), size), reader.names
+    return reader.load(), _TensorReader(lambda key: archive.read(f"{root}data/{key}"), size), reader.names
 
 
-def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
+def _read_stream(path: str | Path) -> tuple[Any, _TensorReader, set[str]]:
     content = read_bytes(path, limit=MAX_BYTES)
     if content[:1] != b"\x80":
         raise FormatError(f"{path}: no PyTorch checkpoint; {CONVERT}")
@@ -316,7 +318,7 @@ def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
             raise ValueError(f"storage {key} is cut short or unknown")
         spans[str(key)] = (file.tell(), file.tell() + count * kind.itemsize)
         file.seek(spans[str(key)][1])
-    return tree, _Numbers(lambda key: content[slice(*spans[key])], len(content)), reader.names
+    return tree, _TensorReader(lambda key: content[slice(*spans[key])], len(content)), reader.names
 
 
 def _storages(tree: Any) -> Iterator[_Storage]:
@@ -380,7 +382,7 @@ def _module(root: _Inert) -> list[tuple[str, _Strided]]:
     while stack:
         prefix, module, depth = stack.pop()
         module_count += 1
-        if depth > DEEPEST or module_count > MOST:
+        if depth > DEEPEST or module_count > MAX_STATE_ENTRIES:
             raise ValueError("a module nested without end")
         state = module.state if isinstance(module, _Inert) and isinstance(module.state, dict) else {}
         for attribute in ("_parameters", "_buffers"):

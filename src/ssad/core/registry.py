@@ -22,7 +22,7 @@ from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, mi
 
 @dataclass(frozen=True)
 class Reference:
-    """What a suite or a command says of a system or a detector: NAME, NAME?KEY=VALUE&KEY=VALUE, NAME@LABEL, or both.
+    """Reference to a system or a detector: NAME, NAME?KEY=VALUE&KEY=VALUE, NAME@LABEL, or both.
 
     Attributes:
         name: A name that `resolve` understands; for some systems with a file behind a colon.
@@ -99,40 +99,45 @@ def split_weights(text: str) -> tuple[str, str]:
 
 
 def check_arguments(
-    kind: str, text: str, found: Any, *, made: bool = False, more: Mapping[str, Any] | None = None
+    kind: str,
+    reference: str,
+    target: Any,
+    *,
+    is_instantiated: bool = False,
+    extra_arguments: Mapping[str, Any] | None = None,
 ) -> None:
     """Check that what a reference names takes its arguments, without calling it.
 
     Args:
         kind: Singular noun for messages.
-        text: The reference.
-        found: What `resolve` found for it.
-        made: Whether a class is called with these arguments alone, so that it must need no others.
-        more: Arguments beside those of the reference.
+        reference: The reference.
+        target: What `resolve` found for it.
+        is_instantiated: Whether a class is called with these arguments alone, so that it must need no others.
+        extra_arguments: Arguments beside those of the reference.
 
     Raises:
         ConfigError: It takes no such arguments, or needs more.
     """
-    options = {**Reference.of(text).options, **(more or {})}
-    if not options and not (made and isinstance(found, type)):
+    options = {**Reference.of(reference).options, **(extra_arguments or {})}
+    if not options and not (is_instantiated and isinstance(target, type)):
         return
-    if not callable(found):
-        raise ConfigError(f"{kind} '{text}': it is an object, which takes no arguments; name its class instead")
+    if not callable(target):
+        raise ConfigError(f"{kind} '{reference}': it is an object, which takes no arguments; name its class instead")
     try:
-        inspect.signature(found).bind(**options)
+        inspect.signature(target).bind(**options)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"{kind} '{text}': {error}") from None
+        raise ConfigError(f"{kind} '{reference}': {error}") from None
 
 
-def make(kind: str, name: str, found: Any, options: Mapping[str, Any], needs: Sequence[str]) -> Any:
+def make(kind: str, name: str, target: Any, options: Mapping[str, Any], required_members: Sequence[str]) -> Any:
     """Make what a user's module offers, and check that it has what it is needed for.
 
     Args:
         kind: Singular noun for messages.
         name: What the user calls it.
-        found: What `resolve` found for it: a class or function that makes it, or the object itself.
+        target: What `resolve` found for it: a class or function that makes it, or the object itself.
         options: Arguments of the class or function.
-        needs: Attributes and methods that it must have.
+        required_members: Attributes and methods that it must have.
 
     Returns:
         The object.
@@ -141,16 +146,16 @@ def make(kind: str, name: str, found: Any, options: Mapping[str, Any], needs: Se
         ConfigError: Its maker raises, or it lacks an attribute or a method.
     """
     try:
-        product = found(**options) if callable(found) else found
+        instance = target(**options) if callable(target) else target
     except SSADError:
         raise
     except Exception as error:
         raise ConfigError(f"{kind} '{name}': making it failed: {describe(error)}") from error
-    missing = [member for member in needs if not hasattr(product, member)]
+    missing = [member for member in required_members if not hasattr(instance, member)]
     if missing:
-        problem = f"of type {type(product).__name__}, lacks {', '.join(missing)}"
-        raise ConfigError(f"{kind} '{name}', {problem}; it needs {', '.join(needs)}")
-    return product
+        problem = f"of type {type(instance).__name__}, lacks {', '.join(missing)}"
+        raise ConfigError(f"{kind} '{name}', {problem}; it needs {', '.join(required_members)}")
+    return instance
 
 
 def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
@@ -197,7 +202,7 @@ def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
         Name -> "module:object", built-in ones first.
     """
     plugins = {point.name: point.value for point in entry_points(group=f"ssad.{kind}s")}
-    return dict(table) | {name: where for name, where in plugins.items() if name not in table}
+    return dict(table) | {name: origin for name, origin in plugins.items() if name not in table}
 
 
 def _import(kind: str, name: str, target: str) -> Any:
@@ -218,10 +223,10 @@ def _import(kind: str, name: str, target: str) -> Any:
         try:
             value = getattr(value, part)
         except AttributeError:
-            close = difflib.get_close_matches(
+            close_matches = difflib.get_close_matches(
                 part, [member for member in dir(value) if member[0] != "_"], n=3, cutoff=0.3
             )
-            hint = f"; closest: {', '.join(close)}" if close else ""
+            hint = f"; closest: {', '.join(close_matches)}" if close_matches else ""
             raise ConfigError(f"{kind} '{name}': {module_name} has no '{part}'{hint}") from None
     return value
 
@@ -245,14 +250,14 @@ def describe(error: BaseException) -> str:
     user_frames = [
         frame_summary for frame_summary in frames if frame_summary.filename not in (__file__, importlib.__file__)
     ]
-    where = f" ({user_frames[-1].filename}:{user_frames[-1].lineno})" if user_frames else ""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}{f': {text}' if text else ''}{where}"
+    position = f" ({user_frames[-1].filename}:{user_frames[-1].lineno})" if user_frames else ""
+    message = " ".join(str(error).split())
+    return f"{type(error).__name__}{f': {message}' if message else ''}{position}"
 
 
-def _hint(error: BaseException, module: str, here: str) -> str:
+def _hint(error: BaseException, module: str, folder: str) -> str:
     if isinstance(error, ModuleNotFoundError) and error.name == module.split(".", maxsplit=1)[0]:
-        return f"; looked in {here} and the installed packages"
+        return f"; looked in {folder} and the installed packages"
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRA_OF:
         return f"; {install_extra(EXTRA_OF[error.name])}"
     return ""

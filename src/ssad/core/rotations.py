@@ -75,7 +75,7 @@ def quaternion_product(first: npt.ArrayLike, second: npt.ArrayLike) -> F64:
     )
 
 
-def slerp(start: F64, end: F64, share: float) -> F64:
+def slerp(start: F64, end: F64, fraction: float) -> F64:
     """Rotations [N, 4] between two quaternions [N, 4] along the shorter arc; share 0 is start, 1 is end.
 
     Nearly equal ones (cosine of half the angle over 0.9995) are interpolated linearly, as in pyquaternion.
@@ -88,9 +88,9 @@ def slerp(start: F64, end: F64, share: float) -> F64:
     cosine = np.abs(cosine)
     angle = np.arccos(np.minimum(cosine, 0.9995))
     sine = np.sin(angle)
-    arc = np.sin((1.0 - share) * angle) / sine * first + np.sin(share * angle) / sine * last
-    between = np.where(cosine > 0.9995, first + share * (last - first), arc)
-    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
+    spherical = np.sin((1.0 - fraction) * angle) / sine * first + np.sin(fraction * angle) / sine * last
+    interpolated = np.where(cosine > 0.9995, first + fraction * (last - first), spherical)
+    return np.asarray(interpolated / np.linalg.norm(interpolated, axis=1, keepdims=True))
 
 
 def pose_matrix(translation: npt.ArrayLike, quaternion: npt.ArrayLike) -> F64:

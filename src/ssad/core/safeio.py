@@ -120,10 +120,10 @@ class Document:
 
 def dotted(location: Location) -> str:
     """Return ("a", 0, "b") as `a[0].b`."""
-    text = ""
+    dotted_path = ""
     for part in location:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
+        dotted_path += f"[{part}]" if isinstance(part, int) else f".{part}" if dotted_path else str(part)
+    return dotted_path
 
 
 class _Builder:
@@ -132,39 +132,39 @@ class _Builder:
     def __init__(self, name: str) -> None:
         self.name = name
         self.lines: dict[tuple[str | int, ...], int] = {}
-        self.seen: set[int] = set()
-        self.open: set[int] = set()
+        self.visited_ids: set[int] = set()
+        self.open_ids: set[int] = set()
         self.aliased = 0
 
     def fail(self, node: Any, message: str) -> FormatError:
         return FormatError(f"{self.name}:{node.start_mark.line + 1}: {message}")
 
-    def build(self, node: Any, place: tuple[str | int, ...], repeated: bool) -> Any:
-        repeated = repeated or id(node) in self.seen
+    def build(self, node: Any, location: tuple[str | int, ...], repeated: bool) -> Any:
+        repeated = repeated or id(node) in self.visited_ids
         if repeated:
             # Nodes behind aliases are counted, because each use expands them again.
             self.aliased += 1
             if self.aliased > MAX_ALIASED_NODES:
                 raise self.fail(node, f"aliases expand to more than {MAX_ALIASED_NODES} values (a YAML bomb?)")
-        if id(node) in self.open:
+        if id(node) in self.open_ids:
             raise self.fail(node, "an alias refers to the value that contains it")
-        if len(place) > MAX_DEPTH:
+        if len(location) > MAX_DEPTH:
             raise self.fail(node, f"nested deeper than {MAX_DEPTH} levels")
-        self.seen.add(id(node))
-        self.lines.setdefault(place, node.start_mark.line + 1)
+        self.visited_ids.add(id(node))
+        self.lines.setdefault(location, node.start_mark.line + 1)
         if node.id == "scalar":
             return self.scalar(node)
-        self.open.add(id(node))
+        self.open_ids.add(id(node))
         try:
             if node.id == "sequence":
                 if node.tag != "tag:yaml.org,2002:seq":
                     raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
-                return [self.build(child, (*place, index), repeated) for index, child in enumerate(node.value)]
-            return self.mapping(node, place, repeated)
+                return [self.build(child, (*location, index), repeated) for index, child in enumerate(node.value)]
+            return self.mapping(node, location, repeated)
         finally:
-            self.open.discard(id(node))
+            self.open_ids.discard(id(node))
 
-    def mapping(self, node: Any, place: tuple[str | int, ...], repeated: bool) -> dict[str, Any]:
+    def mapping(self, node: Any, location: tuple[str | int, ...], repeated: bool) -> dict[str, Any]:
         if node.tag != "tag:yaml.org,2002:map":
             raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
         entries: dict[str, Any] = {}
@@ -176,8 +176,8 @@ class _Builder:
             key = str(key_node.value)
             if key in entries:
                 raise self.fail(key_node, f"key '{key}' appears twice")
-            self.lines.setdefault((*place, key), key_node.start_mark.line + 1)
-            entries[key] = self.build(value_node, (*place, key), repeated)
+            self.lines.setdefault((*location, key), key_node.start_mark.line + 1)
+            entries[key] = self.build(value_node, (*location, key), repeated)
         return entries
 
     def scalar(self, node: Any) -> Any:
@@ -226,8 +226,8 @@ def parse_yaml_document(text: str, name: str = "<text>") -> Document:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark if error.problem_mark is not None else error.context_mark
         line = None if mark is None else mark.line
-        where = name if line is None else f"{name}:{line + 1}"
-        raise FormatError(f"{where}: not valid YAML: {error.problem or error.context}") from None
+        position = name if line is None else f"{name}:{line + 1}"
+        raise FormatError(f"{position}: not valid YAML: {error.problem or error.context}") from None
     except (yaml.YAMLError, ValueError) as error:
         raise FormatError(f"{name}: not valid YAML: {error}") from None
     if node is None:

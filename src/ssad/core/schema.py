@@ -43,29 +43,34 @@ Span = Annotated[tuple[T, T], Field(strict=False), AfterValidator(_in_order)]
 
 
 def checked(
-    make: Callable[..., T], values: Mapping[str, Any], *, what: str, kind: type | None = None, fixed: str = "name"
+    factory: Callable[..., T],
+    values: Mapping[str, Any],
+    *,
+    subject: str,
+    kind: type | None = None,
+    name_field: str = "name",
 ) -> T:
     """A dataclass of pydantic with values that a user wrote.
 
     Args:
-        make: The dataclass, or what makes one.
+        factory: The dataclass, or what makes one.
         values: By field.
-        what: What messages call it, such as "attack das".
-        kind: The dataclass, if `make` is not.
-        fixed: The field that is no value: what it is called.
+        subject: What messages call it, such as "attack das".
+        kind: The dataclass, if `factory` is not.
+        name_field: The field that is no value: what it is called.
 
     Raises:
         ConfigError: One line: what, which key, and what is wrong with its value.
     """
-    settings = [setting.name for setting in fields(kind or make) if setting.init and setting.name != fixed]  # type: ignore[arg-type]
+    settings = [setting.name for setting in fields(kind or factory) if setting.init and setting.name != name_field]  # type: ignore[arg-type]
     for key in values:
         if key not in settings:
-            raise ConfigError(f"{what}: there is no setting '{key}'; it has {', '.join(settings)}")
+            raise ConfigError(f"{subject}: there is no setting '{key}'; it has {', '.join(settings)}")
     try:
-        return make(**values)
+        return factory(**values)
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        key, input_text = ".".join(map(str, problem["loc"])), repr(problem["input"])
-        text = problem["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it stands in a suite
+        first_error = error.errors(include_url=False)[0]
+        key, input_text = ".".join(map(str, first_error["loc"])), repr(first_error["input"])
+        reason = first_error["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it stands in a suite
         shortened = input_text if len(input_text) < 60 else input_text[:57] + "..."
-        raise ConfigError(f"{what}: " + (f"{key}={shortened}: {text}" if key else text)) from None
+        raise ConfigError(f"{subject}: " + (f"{key}={shortened}: {reason}" if key else reason)) from None

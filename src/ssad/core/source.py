@@ -20,13 +20,13 @@ _BRACKET = re.compile(r"from\b[\s.\w\\]+\bimport[\s\\]*\((?:[^)#]|#[^\n]*+)*+$")
 _STRING = re.compile(r"""["'](\w+(?:\.\w+)+)(?::\w+)?["']""")  # "package.module:object", as tables of names have it
 
 
-def source_version(module: str, *, without: Sequence[str] = ()) -> str:
+def source_version(module: str, *, excluded_modules: Sequence[str] = ()) -> str:
     """Return 12 hex digits over the source files that a module depends on; see `source_files`."""
-    files = source_files(module, without=without)
+    files = source_files(module, excluded_modules=excluded_modules)
     return digest("source", *[part for name, path in sorted(files.items()) for part in (name, _scan(path)[0])])[:12]
 
 
-def source_files(module: str, *, without: Sequence[str] = ()) -> dict[str, Path]:
+def source_files(module: str, *, excluded_modules: Sequence[str] = ()) -> dict[str, Path]:
     """Return the files of a module and of its dependencies, by module name.
 
     Imports are followed wherever they stand, and so are strings that name a module (for a package, all its
@@ -35,7 +35,7 @@ def source_files(module: str, *, without: Sequence[str] = ()) -> dict[str, Path]
 
     Args:
         module: Full name. Nothing is imported.
-        without: Modules and packages that are not followed, by their full names.
+        excluded_modules: Modules and packages that are not followed, by their full names.
 
     Returns:
         Module name -> its file; empty where the module has no source.
@@ -50,7 +50,7 @@ def source_files(module: str, *, without: Sequence[str] = ()) -> dict[str, Path]
     while queue:
         name = queue.pop()
         path = _file(base, name)
-        skipped = any(name == excluded or name.startswith(f"{excluded}.") for excluded in without)
+        skipped = any(name == excluded or name.startswith(f"{excluded}.") for excluded in excluded_modules)
         if skipped or name in files_by_module or path is None:
             continue
         files_by_module[name] = path

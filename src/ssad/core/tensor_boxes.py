@@ -25,9 +25,9 @@ def rectangle_corners(centre: Tensor, size: Tensor, yaw: Tensor) -> Tensor:
         size: Length and width [..., 2].
         yaw: Heading [...], rad.
     """
-    along = 0.5 * size[..., :1] * size.new_tensor([1.0, -1.0, -1.0, 1.0])
-    across = 0.5 * size[..., 1:] * size.new_tensor([1.0, 1.0, -1.0, -1.0])
-    return rotate(torch.stack([along, across], -1), yaw[..., None]) + centre[..., None, :]
+    forward_offsets = 0.5 * size[..., :1] * size.new_tensor([1.0, -1.0, -1.0, 1.0])
+    lateral_offsets = 0.5 * size[..., 1:] * size.new_tensor([1.0, 1.0, -1.0, -1.0])
+    return rotate(torch.stack([forward_offsets, lateral_offsets], -1), yaw[..., None]) + centre[..., None, :]
 
 
 def solid_corners(centre: Tensor, size_lhw: Tensor, yaw: Tensor) -> Tensor:
@@ -43,11 +43,11 @@ def solid_corners(centre: Tensor, size_lhw: Tensor, yaw: Tensor) -> Tensor:
         dtype=size_lhw.dtype,
         device=size_lhw.device,
     )
-    local = signs * size_lhw[..., None, :]
+    local_corners = signs * size_lhw[..., None, :]
     cos, sin = yaw.cos()[..., None], yaw.sin()[..., None]
-    x = cos * local[..., 0] + sin * local[..., 2]
-    z = -sin * local[..., 0] + cos * local[..., 2]
-    return torch.stack([x, local[..., 1], z], -1) + centre[..., None, :]
+    x = cos * local_corners[..., 0] + sin * local_corners[..., 2]
+    z = -sin * local_corners[..., 0] + cos * local_corners[..., 2]
+    return torch.stack([x, local_corners[..., 1], z], -1) + centre[..., None, :]
 
 
 def area(box: Tensor) -> Tensor:
@@ -61,13 +61,13 @@ def intersection(first: Tensor, second: Tensor) -> Tensor:
     return (upper - lower).clamp_min(0.0).prod(-1)
 
 
-def iou(first: Tensor, second: Tensor, *, least: float = 1e-9) -> Tensor:
+def iou(first: Tensor, second: Tensor, *, min_union: float = 1e-9) -> Tensor:
     """Return the intersection over union [...] of boxes [..., 4], broadcast against each other.
 
     Args:
         first: x1, y1, x2, y2.
         second: Boxes of the same kind.
-        least: Lower bound of the union, which avoids 0 / 0 for boxes without an area.
+        min_union: Lower bound of the union, which avoids 0 / 0 for boxes without an area.
     """
-    common = intersection(first, second)
-    return common / (area(first) + area(second) - common).clamp_min(least)
+    overlap = intersection(first, second)
+    return overlap / (area(first) + area(second) - overlap).clamp_min(min_union)

@@ -15,15 +15,15 @@ from ssad.core.lane_strips import LAYERS, junction_areas, strips
 from ssad.core.types import AgentKind, Bool, LaneType
 
 Frame = npt.NDArray[np.uint8]
-GROUND, ROAD, WALK, EDGE = (231, 236, 226), (82, 86, 96), (196, 198, 194), (236, 236, 236)
-EGO, CRASH, ROUTE = (37, 99, 235), (220, 38, 38), (96, 165, 250)
+GROUND, ROAD, SIDEWALK, EDGE = (231, 236, 226), (82, 86, 96), (196, 198, 194), (236, 236, 236)
+EGO, CONTACT, ROUTE = (37, 99, 235), (220, 38, 38), (96, 165, 250)
 BODY = {
     AgentKind.WALKER: (219, 39, 119),
     AgentKind.BICYCLE: (5, 150, 105),
     AgentKind.MOTORCYCLE: (5, 150, 105),
     AgentKind.PROP: (120, 113, 108),
 }
-OTHER = (234, 138, 30)
+VEHICLE = (234, 138, 30)
 LAMP = {1: (220, 38, 38), 2: (234, 179, 8), 3: (34, 197, 94)}
 _SHIFT = 4  # OpenCV draws at 1/16 pixel
 
@@ -59,15 +59,18 @@ class _Canvas:
             _SHIFT,
         )
 
-    def text(self, place: tuple[int, int], words: str, size: float = 0.5) -> None:
-        (width, height), baseline = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-        corner, opposite = (place[0] - 5, place[1] - height - 5), (place[0] + width + 5, place[1] + baseline + 3)
+    def text(self, position: tuple[int, int], caption: str, size: float = 0.5) -> None:
+        (width, height), baseline = cv2.getTextSize(caption, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+        corner, opposite = (
+            (position[0] - 5, position[1] - height - 5),
+            (position[0] + width + 5, position[1] + baseline + 3),
+        )
         cv2.rectangle(self.image, corner, opposite, (255, 255, 255), -1)
-        cv2.putText(self.image, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, (30, 41, 59), 1, cv2.LINE_AA)
+        cv2.putText(self.image, caption, position, cv2.FONT_HERSHEY_SIMPLEX, size, (30, 41, 59), 1, cv2.LINE_AA)
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class TopViewScene:
     """Content of one top view; agent 0 is the ego.
 
     Attributes:
@@ -99,57 +102,57 @@ class TopView:
     Args:
         graph: The town.
         size: Width and height of a frame, pixels.
-        across: Width of the visible area, m.
+        visible_width: Width of the visible area, m.
     """
 
-    def __init__(self, graph: LaneGraph, *, size: tuple[int, int] = (960, 540), across: float = 90.0) -> None:
+    def __init__(self, graph: LaneGraph, *, size: tuple[int, int] = (960, 540), visible_width: float = 90.0) -> None:
         self.lanes = strips(graph)
         self.areas = junction_areas(graph, self.lanes)
-        self.size, self.scale = size, size[0] / across
+        self.size, self.scale = size, size[0] / visible_width
 
-    def draw(self, moment: Moment) -> Frame:
+    def draw(self, scene: TopViewScene) -> Frame:
         """Return an RGB image [H, W, 3] around the ego, north up."""
-        centre = (float(moment.pose[0, 0]), float(moment.pose[0, 1]))
+        centre = (float(scene.pose[0, 0]), float(scene.pose[0, 1]))
         canvas = _Canvas(self.size, self.scale, centre)
-        reach = 0.6 * max(self.size) / self.scale
+        view_radius = 0.6 * max(self.size) / self.scale
         for area in self.areas:
             canvas.fill(area, ROAD)
         for lane in self.lanes:
             ring = lane.ring
-            low, high = ring.min(axis=0), ring.max(axis=0)
-            if (low > np.add(centre, reach)).any() or (high < np.subtract(centre, reach)).any():
+            lower, upper = ring.min(axis=0), ring.max(axis=0)
+            if (lower > np.add(centre, view_radius)).any() or (upper < np.subtract(centre, view_radius)).any():
                 continue
-            canvas.fill(ring, WALK if lane.layer == 0 else ROAD)
+            canvas.fill(ring, SIDEWALK if lane.layer == 0 else ROAD)
             if lane.layer == LAYERS[LaneType.DRIVING] and not lane.junction:
                 canvas.line(lane.left, EDGE, 1)
                 canvas.line(lane.right, EDGE, 1)
-        if len(moment.route) > 1:
-            canvas.line(moment.route, ROUTE, 2)
-        for x, y, state in moment.lamps:
+        if len(scene.route) > 1:
+            canvas.line(scene.route, ROUTE, 2)
+        for x, y, state in scene.lamps:
             if state in LAMP:
                 canvas.disc(x, y, 0.9, (30, 30, 30))
                 canvas.disc(x, y, 0.65, LAMP[state])
         # In reverse, so that the ego is drawn last, above all others.
-        for agent in reversed(range(len(moment.kind))):
-            if moment.active[agent]:
-                _agent(canvas, moment, agent)
-        if moment.hit is not None:
-            canvas.disc(*centre, 4.0 + 0.3 * min(moment.hit, 6), CRASH, 3)
-        for line, words in enumerate(moment.words):
-            canvas.text((14, 28 + 28 * line), words, 0.6)
+        for agent in reversed(range(len(scene.kind))):
+            if scene.active[agent]:
+                _agent(canvas, scene, agent)
+        if scene.hit is not None:
+            canvas.disc(*centre, 4.0 + 0.3 * min(scene.hit, 6), CONTACT, 3)
+        for line, caption in enumerate(scene.words):
+            canvas.text((14, 28 + 28 * line), caption, 0.6)
         return canvas.image
 
 
-def _agent(canvas: _Canvas, moment: Moment, agent: int) -> None:
-    kind = AgentKind(int(moment.kind[agent]))
-    x, y, yaw = (float(coordinate) for coordinate in moment.pose[agent])
-    length, width = (float(coordinate) for coordinate in moment.size[agent])
-    if agent == 0 and len(moment.past) > 1:
-        canvas.line(moment.past, EGO, 3)
+def _agent(canvas: _Canvas, scene: TopViewScene, agent: int) -> None:
+    kind = AgentKind(int(scene.kind[agent]))
+    x, y, yaw = (float(coordinate) for coordinate in scene.pose[agent])
+    length, width = (float(coordinate) for coordinate in scene.size[agent])
+    if agent == 0 and len(scene.past) > 1:
+        canvas.line(scene.past, EGO, 3)
     body = corners(x, y, yaw, length, width)
-    canvas.fill(body, EGO if agent == 0 else BODY.get(kind, OTHER))
+    canvas.fill(body, EGO if agent == 0 else BODY.get(kind, VEHICLE))
     canvas.line(body, (255, 255, 255), 1, closed=True)
     if kind not in (AgentKind.WALKER, AgentKind.PROP):
-        ahead = 0.28 * length
-        tip = corners(x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw, 0.12 * length, 0.8 * width)
-        canvas.fill(tip, (226, 232, 240))
+        nose_offset = 0.28 * length
+        nose = corners(x + nose_offset * np.cos(yaw), y + nose_offset * np.sin(yaw), yaw, 0.12 * length, 0.8 * width)
+        canvas.fill(nose, (226, 232, 240))

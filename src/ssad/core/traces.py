@@ -81,12 +81,12 @@ def motion_hash(trace: EpisodeTrace) -> str:
     return hasher.hexdigest()[:32]
 
 
-def first_difference(a: EpisodeTrace, b: EpisodeTrace) -> str | None:
+def first_difference(first: EpisodeTrace, second: EpisodeTrace) -> str | None:
     """None when equal to the bit, else one line: which array differs first, at which step."""
     for name in _META:
-        if _meta(a)[name] != _meta(b)[name]:
-            return f"{name}: {_meta(a)[name]!r} against {_meta(b)[name]!r}"
-    left_arrays, right_arrays = _arrays(a), _arrays(b)
+        if _meta(first)[name] != _meta(second)[name]:
+            return f"{name}: {_meta(first)[name]!r} against {_meta(second)[name]!r}"
+    left_arrays, right_arrays = _arrays(first), _arrays(second)
     differences: list[tuple[int, str]] = []
     for name in _ARRAYS:
         left_array, right_array = left_arrays[name], right_arrays[name]
@@ -100,11 +100,11 @@ def first_difference(a: EpisodeTrace, b: EpisodeTrace) -> str | None:
             continue
         # Bytes, since NaN is unequal to itself and 0.0 equals -0.0.
         if left_array.tobytes() != right_array.tobytes():
-            step = next(
+            first_step = next(
                 row for row in range(len(left_array)) if left_array[row].tobytes() != right_array[row].tobytes()
             )
-            differences.append((step, f"{name}: {left_array[step]} against {right_array[step]}"))
+            differences.append((first_step, f"{name}: {left_array[first_step]} against {right_array[first_step]}"))
     if not differences:
         return None
-    step, text = min(differences)
-    return " ".join(f"step {step}: {text}".split())
+    first_step, description = min(differences)
+    return " ".join(f"step {first_step}: {description}".split())

@@ -147,8 +147,8 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Condition:
-    """What starts a phase.
+class PhaseTrigger:
+    """Condition that starts a phase.
 
     kind `ego_distance`: centre distance between the ego and actor number `actor` falls below `value` metres;
     `ego_speed`: the ego drives faster than `value` m/s; `travelled`: the actor itself has moved more than `value`
@@ -166,7 +166,7 @@ class Phase:
     """One piece of a scripted behaviour: once `when` holds (latched, in order), drive at `speed` m/s."""
 
     speed: float
-    when: Condition = field(default_factory=Condition)
+    when: PhaseTrigger = field(default_factory=PhaseTrigger)
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ class TrafficPlan:
 
 
 @dataclass(frozen=True)
-class Limits:
+class EpisodeLimits:
     """Conditions that end an episode besides the end of the route.
 
     contact: effect of a contact of the ego: `end` the episode, only `count`, or `remove` the other agent and go
@@ -268,7 +268,7 @@ class Scenario:
     actors: tuple[Actor, ...] = ()
     signals: SignalPlan = field(default_factory=SignalPlan)
     traffic: TrafficPlan | None = None
-    limits: Limits = field(default_factory=Limits)
+    limits: EpisodeLimits = field(default_factory=EpisodeLimits)
     target_speed: float = 8.0
     seed: int = 0
     group: str = ""
@@ -331,7 +331,7 @@ class EpisodeAgent:
 class Episode:
     """A scenario made concrete on a lane graph: everything a world needs to run it. Agent 0 is the ego.
 
-    `Condition.actor` counts the agents after the ego, in order: actor 0 is agent 1.
+    `PhaseTrigger.actor` counts the agents after the ego, in order: actor 0 is agent 1.
 
     Attributes:
         key: Key of the episode.
@@ -350,7 +350,7 @@ class Episode:
     agents: tuple[EpisodeAgent, ...]
     signal_override: Mapping[int, SignalState] = field(default_factory=dict)
     override_until: float = 60.0
-    limits: Limits = field(default_factory=Limits)
+    limits: EpisodeLimits = field(default_factory=EpisodeLimits)
     seed: int = 0
 
 

@@ -24,10 +24,14 @@ from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 
-WIDTH, REACH, SIDE = 640, 50.0, 640  # width of a picture, pixels; range of the view from above, m, and its size, pixels
+WIDTH, VIEW_RANGE, VIEW_SIZE = (
+    640,
+    50.0,
+    640,
+)  # width of a picture, pixels; range of the view from above, m, and its size, pixels
 BOX, GROUND, EGO = (255, 170, 30), (15, 19, 26), (96, 165, 250)
 ORDER = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
-LOW, HIGH = -0.5, 3.0  # m above the road: the ends of the colours of LiDAR points
+MIN_HEIGHT, MAX_HEIGHT = -0.5, 3.0  # m above the road: the ends of the colours of LiDAR points
 
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -61,7 +65,7 @@ def write_page(
     *,
     scenes: Sequence[str] = (),
     moments: int = 3,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda completed, total: None,
 ) -> Path:
     """Write OUT/index.html and its pictures.
 
@@ -95,8 +99,8 @@ def write_page(
             total=len(data.scenes()),
             scenes=scene_entries,
             per=moments,
-            side=SIDE,
-            reach=f"{REACH:.0f}",
+            side=VIEW_SIZE,
+            reach=f"{VIEW_RANGE:.0f}",
         )
     )
     write_atomic(out / "index.html", page)
@@ -138,7 +142,7 @@ def _scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str
     return {"name": scene.record.name, "about": summary, "counts": counts.most_common(), "moments": moment_entries}
 
 
-def _camera(root: Path, frame: SensorFrame, found: Annotations, path: Path) -> dict[str, Any]:
+def _camera(root: Path, frame: SensorFrame, annotations: Annotations, path: Path) -> dict[str, Any]:
     """A picture with its boxes; one that cannot be read says why."""
     title = frame.channel
     try:
@@ -147,41 +151,41 @@ def _camera(root: Path, frame: SensorFrame, found: Annotations, path: Path) -> d
         image, title = np.zeros((WIDTH * 9 // 16, WIDTH, 3), np.uint8), f"{title}: {error}"
     scale = WIDTH / image.shape[1]
     canvas: U8 = np.asarray(cv2.resize(image, (WIDTH, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA))
-    rows, _, world_to_camera = boxes_in_picture(frame, found, hit=False)
-    corners = found.take(rows).corners() @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    rows, _, world_to_camera = boxes_in_picture(frame, annotations, require_points=False)
+    corners = annotations.take(rows).corners() @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     draw_edges(canvas, corners, np.asarray(frame.intrinsic, np.float64), scale, colour=BOX, width=1)
     save_picture(path, canvas)
     return {"file": path.name, "title": title, "size": (canvas.shape[1], canvas.shape[0])}
 
 
-def from_above(root: Path, lidar: SensorFrame, found: Annotations) -> U8:
+def from_above(root: Path, lidar: SensorFrame, annotations: Annotations) -> U8:
     """LiDAR points and boxes around the ego, which looks up; points are coloured by their height.
 
     Args:
         root: The nuScenes root.
         lidar: A sweep.
-        found: Boxes of its sample.
+        annotations: Boxes of its sample.
 
     Returns:
-        Picture [SIDE, SIDE, 3], RGB.
+        Picture [VIEW_SIZE, VIEW_SIZE, 3], RGB.
     """
-    canvas: U8 = np.full((SIDE, SIDE, 3), GROUND, np.uint8)
+    canvas: U8 = np.full((VIEW_SIZE, VIEW_SIZE, 3), GROUND, np.uint8)
     try:
         sensor_points = read_points(root / lidar.filename)[:, :3].astype(np.float64)
     except SSADError:
         sensor_points = np.zeros((0, 3))
     points = sensor_points @ lidar.sensor_to_ego[:3, :3].T + lidar.sensor_to_ego[:3, 3]
-    points = points[(np.abs(points[:, :2]) < REACH).all(1)]
-    height_levels = np.clip((points[:, 2] - LOW) / (HIGH - LOW), 0, 1) * 255
+    points = points[(np.abs(points[:, :2]) < VIEW_RANGE).all(1)]
+    height_levels = np.clip((points[:, 2] - MIN_HEIGHT) / (MAX_HEIGHT - MIN_HEIGHT), 0, 1) * 255
     if len(points):
-        pixels = np.clip(_pixels(points), 0, SIDE - 1).astype(int)
+        pixels = np.clip(_pixels(points), 0, VIEW_SIZE - 1).astype(int)
         colours = cv2.applyColorMap(height_levels.astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
         canvas[pixels[:, 1], pixels[:, 0]] = colours[:, 0, ::-1]
     world_to_ego = np.linalg.inv(lidar.ego_to_world)
-    if len(found):
-        axes = world_to_ego[:3, :3] @ quaternion_to_matrix(found.rotation)
-        centres = found.centre @ world_to_ego[:3, :3].T + world_to_ego[:3, 3]
-        half_size = 0.5 * found.size_lwh
+    if len(annotations):
+        axes = world_to_ego[:3, :3] @ quaternion_to_matrix(annotations.rotation)
+        centres = annotations.centre @ world_to_ego[:3, :3].T + world_to_ego[:3, 3]
+        half_size = 0.5 * annotations.size_lwh
         corner_signs = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
         corners = centres[:, None] + np.einsum("nij,nkj->nki", axes, corner_signs * half_size[:, None])
         front = centres + np.einsum("nij,nj->ni", axes, half_size * (1, 0, 0))
@@ -192,13 +196,13 @@ def from_above(root: Path, lidar: SensorFrame, found: Annotations) -> U8:
                 tuple(int(coordinate) for coordinate in np.round(pixel * 16)) for pixel in (centre_pixel, front_pixel)
             ]
             cv2.line(canvas, endpoints[0], endpoints[1], BOX, 1, cv2.LINE_AA, 4)
-    cv2.drawMarker(canvas, (SIDE // 2, SIDE // 2), EGO, cv2.MARKER_TRIANGLE_UP, 14, 2)
+    cv2.drawMarker(canvas, (VIEW_SIZE // 2, VIEW_SIZE // 2), EGO, cv2.MARKER_TRIANGLE_UP, 14, 2)
     return canvas
 
 
 def _pixels(points: F64) -> F64:
     """Convert points of the ego frame (x forward, y left) to pixels (x forward is up)."""
-    pixels = SIDE / 2 - np.asarray(points)[..., :2] * (SIDE / 2 / REACH)
+    pixels = VIEW_SIZE / 2 - np.asarray(points)[..., :2] * (VIEW_SIZE / 2 / VIEW_RANGE)
     return np.asarray(pixels[..., ::-1], np.float64)
 
 

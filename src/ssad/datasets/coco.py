@@ -13,7 +13,7 @@ from ssad.core import safeio
 from ssad.core.errors import FormatError
 from ssad.core.types import F64, I32, Bool
 
-LARGEST: Final = 1 << 30  # size limit of an annotation file
+MAX_FILE_BYTES: Final = 1 << 30  # size limit of an annotation file
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
     Raises:
         FormatError: A part is missing, malformed, or refers to an image or category that does not exist.
     """
-    content = safeio.read_json(path, limit=LARGEST)
+    content = safeio.read_json(path, limit=MAX_FILE_BYTES)
     required_lists = ("images", "annotations", "categories")
     if not isinstance(content, dict) or any(not isinstance(content.get(key), list) for key in required_lists):
         raise FormatError(f"{path}: no COCO annotations (lists `images`, `annotations` and `categories`)")
@@ -128,7 +128,7 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
 
 
 def _image(
-    row: Mapping[str, Any], own: Sequence[Mapping[str, Any]], label_of: Mapping[int, int], folder: Path
+    row: Mapping[str, Any], image_annotations: Sequence[Mapping[str, Any]], label_of: Mapping[int, int], folder: Path
 ) -> CocoImage:
     """One picture with its annotations. ValueError, KeyError or TypeError: broken."""
     image_name, file_name = f"image {row['id']}", str(row["file_name"])
@@ -137,8 +137,8 @@ def _image(
         raise ValueError(f"{image_name}: {width} x {height} pixels")
     if Path(file_name).is_absolute() or ".." in Path(file_name).parts or not file_name:
         raise ValueError(f"{image_name}: file name '{file_name}' points out of the folder of images")
-    box = np.zeros((len(own), 4))
-    for index, annotation in enumerate(own):
+    box = np.zeros((len(image_annotations), 4))
+    for index, annotation in enumerate(image_annotations):
         if not isinstance(annotation["bbox"], list) or len(annotation["bbox"]) != 4:
             raise ValueError(f"{image_name}: a bbox that is no list of four numbers")
         x, y, box_width, box_height = (float(value) for value in annotation["bbox"])
@@ -152,7 +152,7 @@ def _image(
         height,
         extra,
         box,
-        np.array([label_of[entry["category_id"]] for entry in own], np.int32),
-        np.array([bool(entry.get("iscrowd", 0)) for entry in own], bool),
-        np.array([bool(entry.get("target", False)) for entry in own], bool),
+        np.array([label_of[entry["category_id"]] for entry in image_annotations], np.int32),
+        np.array([bool(entry.get("iscrowd", 0)) for entry in image_annotations], bool),
+        np.array([bool(entry.get("target", False)) for entry in image_annotations], bool),
     )

@@ -47,7 +47,7 @@ def make_detector(
     """
     reference = Reference.of(name)
     builder = resolve("detector", DETECTORS, reference.name)
-    check_arguments("detector", name, builder, more=options)
+    check_arguments("detector", name, builder, extra_arguments=options)
     name, options = reference.name, {**reference.options, **options}
     if name not in DETECTORS:
         detector = make("detector", name, builder, options, ("task", "classes", "predict"))

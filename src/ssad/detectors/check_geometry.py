@@ -200,7 +200,7 @@ def _mean_overlap(trial: CheckCase, batch_detections: list[Detections], reading:
         hulls = hull(project(solid_corners(solid.centre, solid.size_lhw, solid.yaw), intrinsic[0].to(solid.centre)))
         box, hulls = _clip(detections.box[:MAX_COMPARED], trial.size), _clip(hulls[:MAX_COMPARED], trial.size)
         is_visible = area(box) > 4
-        image_overlaps.append(iou(box[is_visible], hulls[is_visible], least=1e-6))
+        image_overlaps.append(iou(box[is_visible], hulls[is_visible], min_union=1e-6))
     overlap = torch.cat(image_overlaps) if image_overlaps else torch.zeros(0)
     return float(overlap.double().mean()) if len(overlap) else 0.0
 

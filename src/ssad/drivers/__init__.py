@@ -59,7 +59,7 @@ def find_system(name: str) -> Any:
 
         return Leaderboard(weights)
     resolved = resolve("system", SYSTEMS, name)
-    check_arguments("system", full_name, resolved, made=True)
+    check_arguments("system", full_name, resolved, is_instantiated=True)
     return resolved
 
 

@@ -16,17 +16,17 @@ from typing import Any
 
 from ssad.core.errors import ConfigError, SSADError, StoreError, install_extra
 from ssad.engine.local import LocalProcesses, Start
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
 LOST_NODES = 5  # repeats of a task whose node was lost
-AHEAD = 2  # more than one, so that no CPU idles until the next task arrives
+TASKS_PER_CPU = 2  # more than one, so that no CPU idles until the next task arrives
 
 _BACKENDS: dict[str, LocalProcesses] = {}  # backends of this Ray worker, by the representation of their start
 
 
-def _on_node(parts: tuple[Any, Any, float], start: Start | None) -> Any:
+def _on_node(call: tuple[Any, Any, float], start: Start | None) -> Any:
     """Run a task of a Ray worker in its child process and return the fields of the outcome."""
-    function, argument, timeout_s = parts
+    function, argument, timeout_s = call
     start_key = repr(start)
     # A child process is bound to its start, so another start needs another process.
     if start_key not in _BACKENDS:
@@ -34,10 +34,10 @@ def _on_node(parts: tuple[Any, Any, float], start: Start | None) -> Any:
             other.close()
         _BACKENDS.clear()
         _BACKENDS[start_key] = LocalProcesses(1, start=start)
-    backend = _BACKENDS[start_key]
-    backend.submit(Task(function, argument, timeout_s))
+    node_backend = _BACKENDS[start_key]
+    node_backend.submit(Task(function, argument, timeout_s))
     while True:
-        for outcome in backend.wait(1.0):
+        for outcome in node_backend.wait(1.0):
             return outcome.status, outcome.value, outcome.reason, outcome.error, outcome.seconds
 
 
@@ -66,14 +66,14 @@ class RayCluster:
         except ImportError:
             raise ConfigError(f"--ray needs the package ray; {install_extra('ray')}") from None
         self._ray = ray
-        self._own = not ray.is_initialized()
+        self._owns_ray = not ray.is_initialized()
         try:
             _check_address(address)
-            if self._own:
+            if self._owns_ray:
                 ray.init(address=address, log_to_driver=False, logging_level="ERROR")
         except Exception as error:
-            text = " ".join(str(error).split())
-            raise ConfigError(f"no Ray cluster at '{address}': {text}") from None
+            reason = " ".join(str(error).split())
+            raise ConfigError(f"no Ray cluster at '{address}': {reason}") from None
         import_path = [entry or os.getcwd() for entry in sys.path]
         environment = {name: os.environ[name] for name in os.environ if name.startswith("SSAD_")}
         environment["PYTHONPATH"] = os.pathsep.join(
@@ -89,7 +89,7 @@ class RayCluster:
     @property
     def capacity(self) -> int:
         """Number of tasks that the backend accepts at a time; follows the size of the cluster."""
-        return AHEAD * max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+        return TASKS_PER_CPU * max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     @property
     def busy(self) -> int:
@@ -100,7 +100,7 @@ class RayCluster:
         """Submit a task; call only while `busy` is below `capacity`."""
         self._tasks[self._remote.remote((task.function, task.argument, task.timeout_s), self._start)] = task
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:
@@ -122,7 +122,7 @@ class RayCluster:
             except self._ray.exceptions.RayError as ray_error:
                 message = f"the cluster lost its node {LOST_NODES + 1} times: {' '.join(str(ray_error).split())[:200]}"
                 status, value, reason, error, elapsed_s = "crashed", None, message, None, 0.0
-            outcomes.append(Outcome(task, status, value, reason, error, elapsed_s))
+            outcomes.append(TaskOutcome(task, status, value, reason, error, elapsed_s))
         return outcomes
 
     def close(self) -> None:
@@ -131,5 +131,5 @@ class RayCluster:
             with contextlib.suppress(self._ray.exceptions.RayError):
                 self._ray.cancel(reference, force=True)
         self._tasks = {}
-        if self._own:
+        if self._owns_ray:
             self._ray.shutdown()

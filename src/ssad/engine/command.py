@@ -18,23 +18,23 @@ def command_of(suite: SuiteBase, device: str | None = None) -> str:
     values, set_values = suite.model_dump(mode="json"), suite.model_dump(mode="json", exclude_defaults=True)
     origin = suite._origin or suite.name
     defaults = values if suite._stock is None else suite._stock  # made without a file: nothing to compare with
-    words = ["ssad", "run", origin] + (["--device", device] if device else [])
+    arguments = ["ssad", "run", origin] + (["--device", device] if device else [])
     for key, value in values.items():
         if value != defaults.get(key):
-            words += ["--set", f"{key}={_flow(set_values.get(key, value))}"]
-    return shlex.join(words)
+            arguments += ["--set", f"{key}={_flow(set_values.get(key, value))}"]
+    return shlex.join(arguments)
 
 
 def _flow(value: Any) -> str:
     """Return a value as YAML in one line; keys without a value are left out of mappings in lists."""
     if isinstance(value, list):
-        return f"[{','.join(_flow(_given(entry)) for entry in value)}]"
+        return f"[{','.join(_flow(_without_empty(entry)) for entry in value)}]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_flow(entry)}" for key, entry in value.items()) + "}"
     return "null" if value is None else str(value)
 
 
-def _given(value: Any) -> Any:
+def _without_empty(value: Any) -> Any:
     return (
         {key: entry for key, entry in value.items() if entry not in (None, {}, [])}
         if isinstance(value, dict)

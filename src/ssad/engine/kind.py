@@ -232,21 +232,21 @@ class Kind(ABC):
         """
         return {}
 
-    def workers(self, plan: Plan, asked: int | None) -> int | None:
+    def workers(self, plan: Plan, requested: int | None) -> int | None:
         """Return the number of workers that may run at once.
 
         Args:
             plan: The cells of the run.
-            asked: Number that the user wants; None: as many as the machine allows.
+            requested: Number that the user wants; None: as many as the machine allows.
 
         Returns:
             The same, or less.
         """
-        return asked
+        return requested
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Return cells in batches for `execute`: of one system, alike, and fewer where workers would idle."""
-        return grouped(cells, plan.suite.chunk, workers=workers, by=self.alike)
+        return grouped(cells, plan.suite.chunk, workers=workers, group_key=self.alike)
 
     def alike(self, cell: Cell) -> Hashable:
         """Return a value that is equal for cells that can run as one batch; they share a system."""
@@ -310,7 +310,7 @@ class Kind(ABC):
     @cached_property
     def code(self) -> str:
         """12 hex digits over the source that results depend on, as it was on first use."""
-        return source_version(type(self).__module__, without=self.presentation())
+        return source_version(type(self).__module__, excluded_modules=self.presentation())
 
     @classmethod
     def presentation(cls) -> tuple[str, ...]:
@@ -348,31 +348,33 @@ def check_distinct(suite: SuiteBase, key: str, names: Sequence[object]) -> None:
     raise ConfigError(f"suite {suite.name}: {key}: a name appears twice{hint}")
 
 
-def grouped(cells: Sequence[Cell], chunk: int, *, workers: int, by: Callable[[Cell], Hashable]) -> list[list[Cell]]:
+def grouped(
+    cells: Sequence[Cell], chunk: int, *, workers: int, group_key: Callable[[Cell], Hashable]
+) -> list[list[Cell]]:
     """Batches of cells with a value in common, of `chunk` at most, and smaller where cells are few for the workers."""
     batch_size = max(1, min(chunk, -(-len(cells) // workers)))
     groups: dict[Hashable, list[Cell]] = {}
     for cell in cells:
-        groups.setdefault(by(cell), []).append(cell)
+        groups.setdefault(group_key(cell), []).append(cell)
     return [
         group[start : start + batch_size] for group in groups.values() for start in range(0, len(group), batch_size)
     ]
 
 
-def find_cell(cells: Sequence[Cell], text: str) -> Cell:
-    """Return the one cell whose key begins with `text`, or whose name is `text` ("blind/StraightObstacle/00").
+def find_cell(cells: Sequence[Cell], name_or_key: str) -> Cell:
+    """Return the one cell of this name ("blind/StraightObstacle/00"), or whose key begins with `name_or_key`.
 
     Raises:
         ConfigError: There is none, or more than one.
     """
     # An exact name wins over a prefix of a key.
-    matches = [cell for cell in cells if cell.name == text] or [
-        cell for cell in cells if text and cell.key.startswith(text)
+    matches = [cell for cell in cells if cell.name == name_or_key] or [
+        cell for cell in cells if name_or_key and cell.key.startswith(name_or_key)
     ]
     if len(matches) == 1:
         return matches[0]
     if matches:
         examples = ", ".join(f"{cell.key} ({cell.name})" for cell in matches[:3])
-        raise ConfigError(f"'{text}' means {len(matches)} cells: {examples} ...; give more of the key")
-    suggestions = difflib.get_close_matches(text, [cell.name for cell in cells], n=3, cutoff=0.0)
-    raise ConfigError(f"no cell '{text}' in this run; closest: {', '.join(suggestions)}")
+        raise ConfigError(f"'{name_or_key}' means {len(matches)} cells: {examples} ...; give more of the key")
+    suggestions = difflib.get_close_matches(name_or_key, [cell.name for cell in cells], n=3, cutoff=0.0)
+    raise ConfigError(f"no cell '{name_or_key}' in this run; closest: {', '.join(suggestions)}")

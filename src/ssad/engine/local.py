@@ -16,7 +16,7 @@ from typing import Any
 
 from ssad.core.errors import SSADError
 from ssad.core.registry import describe
-from ssad.engine.task import Outcome, Status, Task
+from ssad.engine.task import Status, Task, TaskOutcome
 
 START_S = 600.0  # a worker may compile kernels when it starts
 SCARCE = 0.04  # share of the memory; if less remains
@@ -48,7 +48,7 @@ class Worker:
         os.close(child_input)
         os.close(child_output)
         self.answers = Connection(answer_pipe)
-        self._orders = Connection(request_pipe)
+        self._requests = Connection(request_pipe)
         self.ready = False
         self.task: Task | None = None
         self.began = time.monotonic()
@@ -66,9 +66,9 @@ class Worker:
 
     def _send(self, message: Any) -> None:
         with contextlib.suppress(OSError):  # a dead worker is noticed by the end of its answers
-            self._orders.send(message)
+            self._requests.send(message)
 
-    def give(self, task: Task) -> Outcome | None:
+    def give(self, task: Task) -> TaskOutcome | None:
         """Start a task; return an outcome if the task cannot even be sent."""
         self.task, self.began = task, time.monotonic()
         try:
@@ -79,13 +79,13 @@ class Worker:
 
     def outcome(
         self, status: Status, reason: str = "", *, value: Any = None, error: Exception | None = None
-    ) -> Outcome:
+    ) -> TaskOutcome:
         """Return the outcome of the current task, and clear the task."""
         assert self.task is not None
         task, self.task = self.task, None
-        return Outcome(task, status, value, reason, error, time.monotonic() - self.began)
+        return TaskOutcome(task, status, value, reason, error, time.monotonic() - self.began)
 
-    def hear(self) -> Outcome | None:
+    def hear(self) -> TaskOutcome | None:
         """Read an answer: the worker is ready, or its task has an outcome.
 
         Returns:
@@ -109,7 +109,7 @@ class Worker:
             return self.outcome("ok", value=value)
         return self.outcome("failed", str(value), error=value if isinstance(value, SSADError) else None)
 
-    def overdue(self) -> Outcome:
+    def overdue(self) -> TaskOutcome:
         """Return the outcome of a task that timed out.
 
         Raises:
@@ -154,7 +154,7 @@ class Worker:
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
-        for connection in (self.answers, self._orders):
+        for connection in (self.answers, self._requests):
             with contextlib.suppress(OSError):
                 connection.close()
         self._log.close()
@@ -178,7 +178,7 @@ class LocalProcesses:
         self._start, self._gpus, self._threads = start, tuple(gpus), threads
         self._workers: list[Worker] = []
         self._waiting: list[Task] = []
-        self._unsent: list[Outcome] = []
+        self._failed_outcomes: list[TaskOutcome] = []
         self._started = 0
         self._looked = time.monotonic()
         self._plenty = (0, time.monotonic())  # total memory, and the last time at which enough was free
@@ -186,36 +186,38 @@ class LocalProcesses:
     @property
     def busy(self) -> int:
         """Number of submitted tasks without an outcome."""
-        return len(self._waiting) + len(self._unsent) + sum(worker.task is not None for worker in self._workers)
+        return (
+            len(self._waiting) + len(self._failed_outcomes) + sum(worker.task is not None for worker in self._workers)
+        )
 
     def submit(self, task: Task) -> None:
         """Submit a task; call only while `busy` is below `capacity`."""
         self._waiting.append(task)
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:
             SSADError: No worker can start.
         """
         self._hand_out()
-        outcomes, self._unsent = self._unsent, []
-        pause = min(
+        outcomes, self._failed_outcomes = self._failed_outcomes, []
+        wait_seconds = min(
             [seconds, LOOK_S, *(max(0.0, candidate.deadline - time.monotonic()) for candidate in self._workers)]
         )
-        for answers in wait([candidate.answers for candidate in self._workers], 0.0 if outcomes else pause):
-            worker = next(candidate for candidate in self._workers if candidate.answers is answers)
+        for connection in wait([candidate.answers for candidate in self._workers], 0.0 if outcomes else wait_seconds):
+            worker = next(candidate for candidate in self._workers if candidate.answers is connection)
             outcome = worker.hear()
             if outcome is not None:
                 outcomes.append(outcome)
             if worker.process.poll() is not None or (outcome is not None and outcome.status == "crashed"):
                 self._remove(worker)
-        now = time.monotonic()
-        for worker in [candidate for candidate in self._workers if now > candidate.deadline]:
+        current_time = time.monotonic()
+        for worker in [candidate for candidate in self._workers if current_time > candidate.deadline]:
             outcomes.append(worker.overdue())
             self._remove(worker)
-        if now - self._looked > LOOK_S:
-            self._looked = now
+        if current_time - self._looked > LOOK_S:
+            self._looked = current_time
             outcomes += self._guard_memory()
         self._hand_out()
         return outcomes
@@ -224,9 +226,9 @@ class LocalProcesses:
         """Assign tasks to idle workers, and start workers while tasks outnumber them."""
         for worker in self._workers:
             if worker.ready and worker.task is None and self._waiting:
-                unsent = worker.give(self._waiting.pop(0))
-                if unsent is not None:
-                    self._unsent.append(unsent)
+                failed_outcome = worker.give(self._waiting.pop(0))
+                if failed_outcome is not None:
+                    self._failed_outcomes.append(failed_outcome)
         idle = sum(worker.task is None for worker in self._workers)
         while len(self._workers) < self.capacity and idle < len(self._waiting):
             if self._start is not None and self._workers and not any(worker.ready for worker in self._workers):
@@ -239,21 +241,23 @@ class LocalProcesses:
             self._started += 1
             idle += 1
 
-    def _guard_memory(self) -> list[Outcome]:
+    def _guard_memory(self) -> list[TaskOutcome]:
         """Kill workers above the memory limit, and the largest worker before the machine runs out of memory."""
-        working = [(worker.memory(), worker) for worker in self._workers if worker.task is not None]
+        workers_by_memory = [(worker.memory(), worker) for worker in self._workers if worker.task is not None]
         memory_limit = int(os.environ.get(WORKER_MEMORY) or 0)
-        too_large = [(memory, candidate) for memory, candidate in working if memory_limit and memory > memory_limit]
+        too_large = [
+            (memory, candidate) for memory, candidate in workers_by_memory if memory_limit and memory > memory_limit
+        ]
         total_memory, free_memory = memory_left()
-        now = time.monotonic()
+        current_time = time.monotonic()
         if (
             free_memory >= SCARCE * total_memory or total_memory != self._plenty[0]
         ):  # a virtual machine may grow with its use
-            self._plenty = total_memory, now
+            self._plenty = total_memory, current_time
         # A short dip does not kill: the shortage must last. One worker is killed at a time.
-        elif working and not too_large and now - self._plenty[1] > SCARCE_S:
-            too_large = [max(working, key=lambda entry: entry[0])]
-            self._plenty = total_memory, now
+        elif workers_by_memory and not too_large and current_time - self._plenty[1] > SCARCE_S:
+            too_large = [max(workers_by_memory, key=lambda entry: entry[0])]
+            self._plenty = total_memory, current_time
         outcomes = []
         for memory, worker in too_large:
             cause = (
@@ -315,7 +319,7 @@ class ThisProcess:
         """Submit a task."""
         self._waiting.append(task)
 
-    def wait(self, seconds: float) -> list[Outcome]:
+    def wait(self, seconds: float) -> list[TaskOutcome]:
         """Run all submitted tasks."""
         if self._start is not None:
             self._start[0](self._start[1])
@@ -326,9 +330,9 @@ class ThisProcess:
             try:
                 value = task.function(task.argument)
             except SSADError as error:
-                outcomes.append(Outcome(task, "failed", None, str(error), error, time.monotonic() - started_at))
+                outcomes.append(TaskOutcome(task, "failed", None, str(error), error, time.monotonic() - started_at))
                 continue
-            outcomes.append(Outcome(task, "ok", value, seconds=time.monotonic() - started_at))
+            outcomes.append(TaskOutcome(task, "ok", value, seconds=time.monotonic() - started_at))
         return outcomes
 
     def close(self) -> None:

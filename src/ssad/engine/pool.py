@@ -11,7 +11,7 @@ from ssad.core.errors import StoreError
 from ssad.core.machine import default_workers, gpu_workers, visible_gpus
 from ssad.engine.cluster import RayCluster
 from ssad.engine.local import LocalProcesses, Start, ThisProcess
-from ssad.engine.task import Backend, Outcome, Task
+from ssad.engine.task import Backend, Task, TaskOutcome
 
 TICK_S = 0.2
 
@@ -19,7 +19,7 @@ TICK_S = 0.2
 class Pool:
     """A queue of tasks before a backend; a context.
 
-    Tasks may be added while outcomes are read. No task costs more than itself: see `Outcome.status`.
+    Tasks may be added while outcomes are read. No task costs more than itself: see `TaskOutcome.status`.
 
     Args:
         backend: where the tasks run; see `open_pool`.
@@ -39,15 +39,15 @@ class Pool:
         """
         (self._urgent if first else self._queue).append(task)
 
-    def drop(self, unwanted: Callable[[Task], bool]) -> list[Task]:
-        """Remove the waiting tasks that `unwanted` selects, and return them."""
-        dropped = [task for task in (*self._urgent, *self._queue) if unwanted(task)]
-        self._urgent = deque(task for task in self._urgent if not unwanted(task))
-        self._queue = deque(task for task in self._queue if not unwanted(task))
+    def drop(self, is_unwanted: Callable[[Task], bool]) -> list[Task]:
+        """Remove the waiting tasks that `is_unwanted` selects, and return them."""
+        dropped = [task for task in (*self._urgent, *self._queue) if is_unwanted(task)]
+        self._urgent = deque(task for task in self._urgent if not is_unwanted(task))
+        self._queue = deque(task for task in self._queue if not is_unwanted(task))
         return dropped
 
-    def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[Outcome]:
-        """How each task ended, as they end, until nothing is left to do; `tick` is called several times a second.
+    def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[TaskOutcome]:
+        """Yield the outcomes of all tasks as they end; `tick` is called several times a second.
 
         Raises:
             SSADError: no worker can start.
@@ -106,7 +106,7 @@ def run_all(
     arguments: Sequence[Any],
     *,
     timeout_s: float = float("inf"),
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda completed, total: None,
 ) -> list[Any]:
     """Call a function on each argument, for work whose parts are useful only together.
 
@@ -127,10 +127,10 @@ def run_all(
     results: list[Any] = [None] * len(arguments)
     failures: list[str] = []
     with pool:
-        for number, argument in enumerate(arguments):
-            pool.add(Task(function, argument, timeout_s, label=number))
-        for done, outcome in enumerate(pool.outcomes(), 1):
-            progress(done, len(arguments))
+        for index, argument in enumerate(arguments):
+            pool.add(Task(function, argument, timeout_s, label=index))
+        for finished_count, outcome in enumerate(pool.outcomes(), 1):
+            progress(finished_count, len(arguments))
             results[outcome.task.label] = outcome.value
             if outcome.error is not None:
                 raise outcome.error

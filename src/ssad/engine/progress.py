@@ -15,52 +15,52 @@ EVERY_S = 10.0  # between plain lines
 class Live:
     """Context manager: a Rich progress bar on a terminal, else a line every ten seconds."""
 
-    def __init__(self, title: str, total: int, done: int, *, console: Console, unit: str = "cells") -> None:
-        self.total, self.done, self.failed, self.first = total, done, 0, done
+    def __init__(self, title: str, total: int, completed: int, *, console: Console, unit: str = "cells") -> None:
+        self.total, self.completed, self.failed, self.resumed_count = total, completed, 0, completed
         self.title, self.console, self.unit = title, console, unit
-        self.began = self.said = time.monotonic()
+        self.start_time = self.last_line_time = time.monotonic()
         self.bar: Progress | None = None
         if console.is_terminal:
             columns = (TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn())
-            tail = (TextColumn("{task.fields[note]}"), TimeElapsedColumn())
-            self.bar = Progress(*columns, *tail, console=console, transient=True)
-            self.task = self.bar.add_task(title, total=total, completed=done, note="")
+            status_columns = (TextColumn("{task.fields[note]}"), TimeElapsedColumn())
+            self.bar = Progress(*columns, *status_columns, console=console, transient=True)
+            self.task = self.bar.add_task(title, total=total, completed=completed, note="")
 
-    def left(self) -> str:
+    def remaining_time(self) -> str:
         """Return the remaining time, from the cells finished by this process."""
         # Cells of an earlier, resumed run took no time in this process.
-        finished = self.done - self.first
-        if not finished or self.done >= self.total:
+        finished_count = self.completed - self.resumed_count
+        if not finished_count or self.completed >= self.total:
             return "eta --:--"
-        seconds = round((time.monotonic() - self.began) / finished * (self.total - self.done))
+        seconds = round((time.monotonic() - self.start_time) / finished_count * (self.total - self.completed))
         return f"eta {seconds // 60:02d}:{seconds % 60:02d}"
 
     def note(self) -> str:
         """Return the number of failures and the remaining time."""
         failed = f"{self.failed} failed  " if self.failed else ""
-        return failed + self.left()
+        return failed + self.remaining_time()
 
-    def advance(self, ok: bool) -> None:
+    def advance(self, succeeded: bool) -> None:
         """Count one more finished cell."""
-        self.done += 1
-        self.failed += not ok
+        self.completed += 1
+        self.failed += not succeeded
 
-    def show(self, done: int, of: int) -> None:
-        """So many are done, of so many."""
-        self.done, self.total = done, of
+    def show(self, completed: int, total: int) -> None:
+        """Show how many units are completed, of how many."""
+        self.completed, self.total = completed, total
         self.tick()
 
     def tick(self) -> None:
         """Update the display."""
         if self.bar:
-            self.bar.update(self.task, completed=self.done, total=self.total, note=self.note())
-        elif time.monotonic() - self.said >= EVERY_S:
-            self.said = time.monotonic()
+            self.bar.update(self.task, completed=self.completed, total=self.total, note=self.note())
+        elif time.monotonic() - self.last_line_time >= EVERY_S:
+            self.last_line_time = time.monotonic()
             self.line()
 
     def line(self) -> None:
         """Print one plain line."""
-        self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}")
+        self.console.print(f"{self.title}: {self.completed}/{self.total} {self.unit}  {self.note()}")
 
     def __enter__(self) -> Self:
         if self.bar:
@@ -72,5 +72,7 @@ class Live:
     ) -> None:
         if self.bar:
             self.bar.stop()
-        elif kind is None or self.done > self.first:  # an error before the first finished cell stands alone
+        elif (
+            kind is None or self.completed > self.resumed_count
+        ):  # an error before the first finished cell stands alone
             self.line()

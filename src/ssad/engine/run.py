@@ -19,9 +19,9 @@ from ssad.engine.kind import Cell, CellError, Job, Kind, Plan, Resources
 from ssad.engine.pool import Pool, open_pool
 from ssad.engine.progress import Live
 from ssad.engine.store import Store
-from ssad.engine.task import Outcome, Task
+from ssad.engine.task import Task, TaskOutcome
 
-MOST = 1 << 30  # bytes of an artefact that is hashed
+MAX_HASHED_BYTES = 1 << 30  # bytes of an artefact that is hashed
 
 
 def run(
@@ -87,7 +87,7 @@ def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
 
 
 def run_json(plan: Plan) -> dict[str, Any]:
-    """What run.json says. `identity` covers all that results depend on, so a folder holds one run only."""
+    """Return the content of run.json. `identity` covers all that results depend on: a folder holds one run."""
     kind = plan.kind
     return {
         "identity": digest("run", plan.device, *[cell.key for cell in plan.cells])[:16],
@@ -112,27 +112,27 @@ class _Schedule:
         self.plan, self.kind, self.job, self.store = plan, plan.kind, job, store
         self.versions, self.resources = versions, resources
         self.timeout: float = plan.suite.timeout_s
-        self.left: dict[str, set[str]] = {}  # cell key -> pieces that it waits for
-        self.users: dict[tuple[str, str], list[Cell]] = {}  # piece and system -> cells that wait for it
+        self.waiting_pieces: dict[str, set[str]] = {}  # cell key -> pieces that it waits for
+        self.waiting_cells: dict[tuple[str, str], list[Cell]] = {}  # piece and system -> cells that wait for it
         self.sharing: dict[str, dict[str, None]] = {}  # piece -> systems that wait for it, in order
         self.data: dict[str, Any] = {}
-        self.shared: dict[str, float] = {}  # cell key -> its part of the seconds of its pieces
-        self.alone: set[str] = set()  # systems that share no pieces any more
-        self.trouble: Counter[str] = Counter()  # system -> its crashes and time-outs
-        self.given_up: dict[str, Outcome] = {}
+        self.shared_seconds: dict[str, float] = {}  # cell key -> its part of the seconds of its pieces
+        self.unshared_systems: set[str] = set()  # systems that share no pieces any more
+        self.failure_counts: Counter[str] = Counter()  # system -> its crashes and time-outs
+        self.given_up: dict[str, TaskOutcome] = {}
         self.pool: Pool
-        self.live: Live
+        self.progress: Live
 
     def work(self, missing: Sequence[Cell]) -> None:
         """Run cells until each has a record."""
         for cell in missing:
             pieces = self.kind.pieces(cell, self.job)
             self.data |= pieces
-            self.left[cell.key] = set(pieces)
+            self.waiting_pieces[cell.key] = set(pieces)
             for name in pieces:
-                self.users.setdefault((name, cell.system), []).append(cell)
+                self.waiting_cells.setdefault((name, cell.system), []).append(cell)
                 self.sharing.setdefault(name, {})[cell.system] = None
-        ready_cells = [cell for cell in missing if not self.left[cell.key]]
+        ready_cells = [cell for cell in missing if not self.waiting_pieces[cell.key]]
         task_count = len(self.data) + len(missing)
         resources = self.resources
         workers = self.kind.workers(self.plan, resources.workers)
@@ -143,13 +143,13 @@ class _Schedule:
             open_pool(
                 task_count, workers=workers, ray=resources.ray, device=self.plan.device, start=initialiser
             ) as self.pool,
-            Live(self.plan.suite.name, total, finished_count, console=resources.console) as self.live,
+            Live(self.plan.suite.name, total, finished_count, console=resources.console) as self.progress,
         ):
             for batch in self.kind.batches(self.plan, ready_cells, min(task_count, workers or default_workers())):
                 self._add(batch)
             for name in self.data:
                 self._add_piece(name, list(self.sharing[name]))
-            for outcome in self.pool.outcomes(self.live.tick):
+            for outcome in self.pool.outcomes(self.progress.tick):
                 if isinstance(outcome.task.label, list):
                     self._batch_ended(outcome.task.label, outcome)
                 else:
@@ -165,11 +165,11 @@ class _Schedule:
         argument = (self.kind, name, self.data[name], tuple(systems), self.job)
         self.pool.add(Task(_make, argument, self.timeout, label=(name, tuple(systems))), first=first)
 
-    def _piece_ended(self, name: str, systems: Sequence[str], outcome: Outcome) -> None:
+    def _piece_ended(self, name: str, systems: Sequence[str], outcome: TaskOutcome) -> None:
         """Release the cells that waited; a piece that failed for several systems is done again for each alone."""
         if outcome.status != "ok" and len(systems) > 1:
             for system in systems:
-                if system in self.alone:
+                if system in self.unshared_systems:
                     self._release(name, system)
                 else:
                     self._add_piece(name, [system], first=True)
@@ -177,30 +177,30 @@ class _Schedule:
         for system in systems:
             self._release(name, system, outcome.seconds / len(systems))
         if outcome.status != "ok":
-            self._share_no_more(systems[0])
+            self._stop_sharing(systems[0])
             self._blame(systems[0], outcome)
 
     def _release(self, name: str, system: str, seconds: float = 0.0) -> None:
-        waiting_cells = self.users.pop((name, system), [])
+        waiting_cells = self.waiting_cells.pop((name, system), [])
         self.sharing[name].pop(system, None)
         if not self.sharing[name]:
-            self.live.advance(True)
+            self.progress.advance(True)
         # The cells that used a shared piece carry its seconds in equal parts.
         for cell in waiting_cells:
-            self.shared[cell.key] = self.shared.get(cell.key, 0.0) + seconds / len(waiting_cells)
-            self.left[cell.key].discard(name)
-            if self.left[cell.key]:
+            self.shared_seconds[cell.key] = self.shared_seconds.get(cell.key, 0.0) + seconds / len(waiting_cells)
+            self.waiting_pieces[cell.key].discard(name)
+            if self.waiting_pieces[cell.key]:
                 continue
             if cell.system in self.given_up:
                 self._give_up(cell)
             else:
                 self._add([cell], first=True)
 
-    def _batch_ended(self, batch: list[Cell], outcome: Outcome) -> None:
+    def _batch_ended(self, batch: list[Cell], outcome: TaskOutcome) -> None:
         if outcome.status == "ok":
             for cell in batch:
                 result = dict(outcome.value[cell.key])
-                seconds = result.pop("wall_s", outcome.seconds / len(batch)) + self.shared.get(cell.key, 0.0)
+                seconds = result.pop("wall_s", outcome.seconds / len(batch)) + self.shared_seconds.get(cell.key, 0.0)
                 self._record(cell, "ok", "", result, seconds)
         elif len(batch) > 1:
             for cell in batch:
@@ -209,27 +209,29 @@ class _Schedule:
             reason = outcome.reason
             if outcome.status == "timeout":
                 reason = f"took longer than {self.timeout:g} s"
-            self._record(batch[0], outcome.status, reason, {}, outcome.seconds + self.shared.get(batch[0].key, 0.0))
+            self._record(
+                batch[0], outcome.status, reason, {}, outcome.seconds + self.shared_seconds.get(batch[0].key, 0.0)
+            )
             self._blame(batch[0].system, outcome)
 
-    def _share_no_more(self, system: str) -> None:
+    def _stop_sharing(self, system: str) -> None:
         """Exclude a system that failed alone from shared pieces: its cells do without them from now on."""
-        if system in self.alone:
+        if system in self.unshared_systems:
             return
-        self.alone.add(system)
+        self.unshared_systems.add(system)
         for task in self.pool.drop(lambda task: isinstance(task.label, tuple) and system in task.label[1]):
             name, systems = task.label
-            remaining_systems = [other for other in systems if other != system]
+            remaining_systems = [candidate for candidate in systems if candidate != system]
             if remaining_systems:
                 self._add_piece(name, remaining_systems)
             self._release(name, system)
 
-    def _blame(self, system: str, outcome: Outcome) -> None:
+    def _blame(self, system: str, outcome: TaskOutcome) -> None:
         """Count a system's time-outs and crashes; after `patience` of them, give it up."""
         if self.kind.patience is None or outcome.status not in ("timeout", "crashed"):
             return
-        self.trouble[system] += 1
-        if self.trouble[system] == self.kind.patience:
+        self.failure_counts[system] += 1
+        if self.failure_counts[system] == self.kind.patience:
             self.given_up[system] = outcome
             for task in self.pool.drop(lambda task: isinstance(task.label, list) and task.label[0].system == system):
                 for cell in task.label:
@@ -264,7 +266,7 @@ class _Schedule:
             | result
         )
         self.store.append(record, None if episode is None else shared_fields | episode)
-        self.live.advance(status == "ok")
+        self.progress.advance(status == "ok")
 
 
 def _start(argument: tuple[Kind, Job]) -> None:
@@ -304,7 +306,7 @@ def hash_artefacts(folder: Path, paths: Iterable[str]) -> dict[str, str]:
     for path in (folder / name for name in paths):
         for artefact in sorted(path.rglob("*")) if path.is_dir() else [path]:
             if artefact.is_file():
-                content = safeio.read_bytes(artefact, limit=MOST)
+                content = safeio.read_bytes(artefact, limit=MAX_HASHED_BYTES)
                 name = os.path.relpath(artefact, folder)
                 hashes[name] = hashlib.blake2b(content, digest_size=16).hexdigest()
     return hashes

@@ -46,24 +46,26 @@ class Store:
         self.retried: frozenset[str] = frozenset()
 
     @classmethod
-    def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: Retry = False, what: str = "ssad run") -> Self:
+    def open(
+        cls, folder: str | Path, run: Mapping[str, Any], *, retry: Retry = False, command: str = "ssad run"
+    ) -> Self:
         """Take the folder for this run: a new one, or one of the same run that is resumed.
 
         Args:
             folder: The folder.
             run: What run.json shall say; its "identity" must equal that of a run already there.
             retry: Whether cells that failed, or those of these keys, are treated as if they had never run.
-            what: The command, for messages.
+            command: The command, for messages.
 
         Raises:
             StoreError: The folder cannot be written, is in use, or belongs to another run; nothing is changed then.
         """
         path = Path(folder)
-        _check_content(path, run, what)
+        _check_content(path, run, command)
         safeio.make_folder(path)
-        store = cls(path, _lock(path, what))
+        store = cls(path, _lock(path, command))
         try:
-            _check_content(path, run, what)  # again: another process may have begun meanwhile
+            _check_content(path, run, command)  # again: another process may have begun meanwhile
             store._begin(run, retry=retry)
         except BaseException:
             store.close()
@@ -75,7 +77,7 @@ class Store:
             safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
         results, ends = scan_lines(self.folder / RESULTS)
         # A kill may leave half a line, and the next line would be appended to it.
-        _cut(self.folder / RESULTS, ends[-1] if ends else 0)
+        _truncate(self.folder / RESULTS, ends[-1] if ends else 0)
         for record in results:
             if record["key"] in self.results:
                 raise StoreError(f"{self.folder / RESULTS}: the cell {record['key']} is there twice")
@@ -90,7 +92,7 @@ class Store:
         while episodes and episodes[-1]["key"] not in self.results:  # its result was never written
             episodes.pop()
             ends.pop()
-        _cut(self.folder / EPISODES, ends[-1] if ends else 0)
+        _truncate(self.folder / EPISODES, ends[-1] if ends else 0)
         for name in (RESULTS, EPISODES):
             self._files[name] = _open_append(self.folder / name)
 
@@ -143,7 +145,7 @@ def _failed(record: Mapping[str, Any]) -> bool:
     return bool(record.get("status", "ok") != "ok")
 
 
-def _check_content(folder: Path, run: Mapping[str, Any], what: str) -> None:
+def _check_content(folder: Path, run: Mapping[str, Any], command: str) -> None:
     """Refuse a folder that belongs to something else."""
     if folder.exists() and not folder.is_dir():
         raise StoreError(f"{folder}: is a file; choose a folder with --out")
@@ -155,16 +157,16 @@ def _check_content(folder: Path, run: Mapping[str, Any], what: str) -> None:
     if existing["identity"] == run["identity"]:
         return
     old_suite, new_suite = existing.get("suite", {}), run.get("suite", {})
-    changed = sorted(key for key in {*old_suite, *new_suite} if old_suite.get(key) != new_suite.get(key)) or [
+    changed_keys = sorted(key for key in {*old_suite, *new_suite} if old_suite.get(key) != new_suite.get(key)) or [
         "the code, a system or a town"
     ]
     raise StoreError(
-        f"{folder}: holds another run (suite {old_suite.get('name')}; differs in {', '.join(changed)}); "
-        f"choose another folder{' with --out' if what == 'ssad run' else ''} or remove this one"
+        f"{folder}: holds another run (suite {old_suite.get('name')}; differs in {', '.join(changed_keys)}); "
+        f"choose another folder{' with --out' if command == 'ssad run' else ''} or remove this one"
     )
 
 
-def _lock(folder: Path, what: str = "ssad run") -> int:
+def _lock(folder: Path, command: str = "ssad run") -> int:
     """The descriptor of a lock file that only one process may hold. StoreError: another one does."""
     path = folder / LOCK
     try:
@@ -176,7 +178,7 @@ def _lock(folder: Path, what: str = "ssad run") -> int:
     except BlockingIOError:
         os.close(descriptor)
         raise StoreError(
-            f"{folder}: another {what} is writing there; wait for its end or choose another folder"
+            f"{folder}: another {command} is writing there; wait for its end or choose another folder"
         ) from None
     except OSError as error:
         os.close(descriptor)
@@ -185,26 +187,26 @@ def _lock(folder: Path, what: str = "ssad run") -> int:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, what: str) -> Iterator[None]:
+def locked(folder: Path, command: str) -> Iterator[None]:
     """The folder, made if need be, for this process alone while the block lasts.
 
     Args:
         folder: to be written.
-        what: the command, for the message.
+        command: the command, for the message.
 
     Raises:
         StoreError: another process has it.
     """
-    descriptor = _lock(safeio.make_folder(folder), what)
+    descriptor = _lock(safeio.make_folder(folder), command)
     try:
         yield
     finally:
         os.close(descriptor)
 
 
-def _cut(path: Path, size: int) -> None:
+def _truncate(path: Path, length: int) -> None:
     if path.exists():
-        os.truncate(path, size)
+        os.truncate(path, length)
 
 
 def _open_append(path: Path) -> int:

@@ -27,7 +27,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TaskOutcome:
     """Outcome of a task.
 
     Attributes:
@@ -62,7 +62,7 @@ class Backend(Protocol):
     def submit(self, task: Task) -> None:
         """Submit a task; call only while `busy` is below `capacity`."""
 
-    def wait(self, seconds: float) -> Sequence[Outcome]:
+    def wait(self, seconds: float) -> Sequence[TaskOutcome]:
         """Return the outcomes of finished tasks, after at most `seconds`.
 
         Raises:

@@ -28,41 +28,41 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
-def _read(orders: Connection, received: queue.SimpleQueue[Any]) -> None:
+def _read(requests: Connection, messages: queue.SimpleQueue[Any]) -> None:
     """Hand over what comes in; end the process with the input, even in the middle of a task."""
     while True:
         try:
-            received.put(orders.recv())
+            messages.put(requests.recv())
         except (EOFError, OSError):
             os._exit(0)
         except Exception as error:  # the message cannot be unpickled here, such as for a missing module
-            received.put((_raise, describe(error)))
+            messages.put((_raise, describe(error)))
 
 
-def _raise(text: str) -> None:
-    raise ImportError(text)
+def _raise(message: str) -> None:
+    raise ImportError(message)
 
 
-def main(orders: int, answers: int) -> None:
+def main(request_descriptor: int, answer_descriptor: int) -> None:
     """Serve until the input ends."""
     _die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    reader, writer = Connection(orders), Connection(answers)
+    reader, writer = Connection(request_descriptor), Connection(answer_descriptor)
     import_path, has_start = reader.recv()
     sys.path[:] = list(dict.fromkeys([*import_path, *sys.path]))
-    received: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     # A thread of its own notices the end of the input while a task runs.
-    threading.Thread(target=_read, args=(reader, received), daemon=True).start()
+    threading.Thread(target=_read, args=(reader, messages), daemon=True).start()
     if has_start:
         try:
-            function, argument = received.get()
+            function, argument = messages.get()
             function(argument)
         except Exception as error:
             writer.send(("fatal", str(error) if isinstance(error, SSADError) else describe(error)))
             return
     writer.send(("ready", None))
     while True:
-        function, argument = received.get()
+        function, argument = messages.get()
         try:
             message: tuple[str, Any] = ("value", function(argument))
         except SSADError as error:

@@ -42,10 +42,12 @@ class ScenarioSuite(SuiteBase):
     def beside(self, path: Path) -> Self:
         """Return the suite with its scenario files resolved: in the working folder, then beside the suite."""
 
-        def find(ref: str) -> str:
-            sibling = path.parent / ref
+        def find(reference: str) -> str:
+            sibling = path.parent / reference
             return (
-                str(sibling) if ref.endswith((".yaml", ".yml")) and not Path(ref).exists() and sibling.exists() else ref
+                str(sibling)
+                if reference.endswith((".yaml", ".yml")) and not Path(reference).exists() and sibling.exists()
+                else reference
             )
 
         return self.model_copy(update={"scenarios": [find(ref) for ref in self.scenarios]})
@@ -66,7 +68,7 @@ class ScenarioKind(Kind):
     def scenario_cell(
         self,
         suite: ScenarioSuite,
-        one: Described,
+        described_scenario: Described,
         *inputs: object,
         title: str,
         system: str,
@@ -78,7 +80,7 @@ class ScenarioKind(Kind):
 
         Args:
             suite: Suite of the cell.
-            one: The scenario.
+            described_scenario: The scenario.
             inputs: Inputs of the result besides the scenario and the cell's own description.
             title: Name of the cell.
             system: Name of the system.
@@ -87,12 +89,12 @@ class ScenarioKind(Kind):
             spec: Data for the worker besides scenario and system.
         """
         kind, *seed_parts = chance
-        seed = seed32(kind, suite.seed, safeio.dump_json(one.data), *seed_parts)
-        scenario = one.scenario
+        seed = seed32(kind, suite.seed, safeio.dump_json(described_scenario.data), *seed_parts)
+        scenario = described_scenario.scenario
         identification = {"system": system, "group": scenario.group or scenario.type, "cluster": scenario.name}
-        cell_spec = {"scenario": one.data, "system": system, **spec}
+        cell_spec = {"scenario": described_scenario.data, "system": system, **spec}
         return self.make_cell(
-            title, system, seed, {**identification, **(fields or {})}, cell_spec, *one.versions, *inputs
+            title, system, seed, {**identification, **(fields or {})}, cell_spec, *described_scenario.versions, *inputs
         )
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
@@ -162,15 +164,15 @@ def suite_scenarios(suite: ScenarioSuite) -> tuple[Scenario, ...]:
     from ssad.simulators.highway_env import highway_scenarios
 
     scenarios_by_name: dict[str, Scenario] = {}
-    for ref in suite.scenarios:
+    for reference in suite.scenarios:
         try:
-            loaded = highway_scenarios() if ref == HIGHWAY else load_scenarios(ref)
+            scenarios = highway_scenarios() if reference == HIGHWAY else load_scenarios(reference)
         except UnknownNameError as error:
             raise UnknownNameError(f"suite {suite.name}: {error}") from None
-        for scenario in loaded:
+        for scenario in scenarios:
             if scenarios_by_name.setdefault(scenario.name, scenario) != scenario:
                 raise ConfigError(
-                    f"suite {suite.name}: two different scenarios are named '{scenario.name}' (one from {ref}); "
+                    f"suite {suite.name}: two different scenarios are named '{scenario.name}' (one from {reference}); "
                     "rename one"
                 )
     return tuple(scenarios_by_name.values())

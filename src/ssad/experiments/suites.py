@@ -63,18 +63,18 @@ def suite_files() -> dict[str, Path]:
     return files
 
 
-def load_suite(ref: str, settings: Sequence[str] = ()) -> Any:
+def load_suite(reference: str, settings: Sequence[str] = ()) -> Any:
     """Return the suite of that name or YAML file, with `--set key=value` settings applied.
 
     Its key `kind` selects the schema. ConfigError and FormatError name file, line and key; UnknownNameError lists the
     closest names.
     """
     files = suite_files()
-    path = files.get(ref)
+    path = files.get(reference)
     if path is None:
-        if not ref.endswith((".yaml", ".yml")) and not Path(ref).is_file():
-            raise unknown_name("suite", ref, files)
-        path = Path(ref)
+        if not reference.endswith((".yaml", ".yml")) and not Path(reference).is_file():
+            raise unknown_name("suite", reference, files)
+        path = Path(reference)
     document = read_yaml_document(path)
     if not isinstance(document.data, dict):
         raise document.error((), "a suite is a mapping with the keys kind, name and those of its kind")
@@ -92,7 +92,7 @@ def load_suite(ref: str, settings: Sequence[str] = ()) -> Any:
         suite = schema.model_validate(data).beside(path)
     except ValidationError as error:
         raise _explain(error, document, setting_of_key, list(schema.model_fields)) from None
-    suite._origin = ref
+    suite._origin = reference
     try:
         suite._stock = schema.model_validate(document.data).beside(path).model_dump(mode="json")
     except ValidationError:  # the file is incomplete without the settings
@@ -128,29 +128,31 @@ def _is_list(schema: type[SuiteBase], key: str) -> bool:
     return typing.get_origin(schema.model_fields[key].annotation) is list
 
 
-def _unknown_key(key: str, known: Sequence[str]) -> str:
-    suggestions = difflib.get_close_matches(key, known, n=3, cutoff=0.0)
+def _unknown_key(key: str, known_keys: Sequence[str]) -> str:
+    suggestions = difflib.get_close_matches(key, known_keys, n=3, cutoff=0.0)
     return f"unknown key '{key}'; closest: {', '.join(suggestions)}"
 
 
 UNION = re.compile(r"constrained-\w+|literal\[.*\]")  # how pydantic names the members of a union in a location
 
 
-def _explain(error: ValidationError, document: Document, changed: dict[str, str], known: Sequence[str]) -> ConfigError:
+def _explain(
+    error: ValidationError, document: Document, changed_keys: dict[str, str], known_keys: Sequence[str]
+) -> ConfigError:
     """Return the first problem as one line with file, line and key, or with the setting that caused it."""
-    problem = error.errors(include_url=False)[0]
-    location = tuple(part for part in problem["loc"] if not UNION.fullmatch(str(part)))
-    if problem["type"] == "extra_forbidden":
-        text = _unknown_key(str(location[-1]), known)
+    first_error = error.errors(include_url=False)[0]
+    location = tuple(part for part in first_error["loc"] if not UNION.fullmatch(str(part)))
+    if first_error["type"] == "extra_forbidden":
+        text = _unknown_key(str(location[-1]), known_keys)
         location = (*location[:-1], str(location[-1]))
-    elif problem["type"] == "missing":
+    elif first_error["type"] == "missing":
         text = f"the key '{location[-1]}' is missing"
         location = location[:-1]
-    elif problem["type"] == "value_error":  # a validator of SSAD, whose message is complete
-        text = problem["msg"].removeprefix("Value error, ")
+    elif first_error["type"] == "value_error":  # a validator of SSAD, whose message is complete
+        text = first_error["msg"].removeprefix("Value error, ")
     else:
-        input_text = repr(problem["input"])
-        text = f"{problem['msg']}, not {input_text if len(input_text) < 60 else input_text[:57] + '...'}"
-    if location and location[0] in changed:
-        return ConfigError(f"--set {changed[str(location[0])]}: {dotted(location)}: {text}")
+        input_text = repr(first_error["input"])
+        text = f"{first_error['msg']}, not {input_text if len(input_text) < 60 else input_text[:57] + '...'}"
+    if location and location[0] in changed_keys:
+        return ConfigError(f"--set {changed_keys[str(location[0])]}: {dotted(location)}: {text}")
     return document.error(location, text)

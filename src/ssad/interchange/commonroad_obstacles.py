@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ssad.core.rotations import wrap_angle
-from ssad.core.types import Actor, AgentKind, Limits, Pose
+from ssad.core.types import Actor, AgentKind, EpisodeLimits, Pose
 from ssad.interchange.commonroad_xml import KINDS_OF, STEP, Texts
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
@@ -28,7 +28,7 @@ class Obstacles:
     def __init__(self, texts: Texts, lost: Counter[str], dt: float) -> None:
         self.texts, self.lost, self.dt = texts, lost, dt
 
-    def read(self, root: Element, start: Pose, limits: Limits) -> tuple[Actor, ...]:
+    def read(self, root: Element, start: Pose, limits: EpisodeLimits) -> tuple[Actor, ...]:
         """Return the actors in the order of their ids.
 
         Args:

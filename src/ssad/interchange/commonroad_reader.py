@@ -19,7 +19,7 @@ from ssad.core.errors import ConfigError, FormatError, MapError, RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import MIB, read_xml
-from ssad.core.types import F64, LaneType, Limits, Pose, Route, Scenario, SignalPlan
+from ssad.core.types import F64, EpisodeLimits, LaneType, Pose, Route, Scenario, SignalPlan
 from ssad.interchange.commonroad_lanelets import ReadLanes, read_lanes
 from ssad.interchange.commonroad_obstacles import Obstacles
 from ssad.interchange.commonroad_writer import benchmark_map
@@ -148,7 +148,7 @@ class _Reader:
             self.lost[f"the cycles of {lanes.cycles} traffic lights: they run this program's own"] += 1
         return lanes, lanes.graph, False, town
 
-    def _signals(self, lanes: ReadLanes, graph: LaneGraph, line: Route, limits: Limits) -> SignalPlan:
+    def _signals(self, lanes: ReadLanes, graph: LaneGraph, line: Route, limits: EpisodeLimits) -> SignalPlan:
         """The plan that forces just the lights that always show the same."""
         if not lanes.states:
             return SignalPlan()
@@ -190,7 +190,7 @@ class _Reader:
             self.lost["the step at which the planning problem begins: it is step 0"] += 1
         return pose, min(speed, MAX_SPEED)
 
-    def _goal(self, problem: Element, lanes: ReadLanes, speed: float) -> tuple[Limits, Pose | None, float]:
+    def _goal(self, problem: Element, lanes: ReadLanes, speed: float) -> tuple[EpisodeLimits, Pose | None, float]:
         """Return the limits, the goal pose, and the target speed."""
         goals = problem.findall("goalState")
         if not goals:
@@ -206,7 +206,7 @@ class _Reader:
             self.lost["the earliest time of the goal"] += 1
         if goal.find("orientation") is not None:
             self.lost["the orientation of the goal"] += 1
-        limits = Limits(max_steps=steps, max_time=max(Limits().max_time, steps * STEP))
+        limits = EpisodeLimits(max_steps=steps, max_time=max(EpisodeLimits().max_time, steps * STEP))
         if self.own.get("contact") in ("end", "count", "remove"):
             limits = replace(limits, contact=self.own["contact"])  # type: ignore[arg-type]
         if "max_distance" in self.own:

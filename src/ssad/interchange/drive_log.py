@@ -17,7 +17,7 @@ import numpy as np
 from ssad.core.errors import ConfigError, RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import quaternion_to_yaw, wrap_angle
-from ssad.core.types import F64, Actor, Limits, Pose, Scenario, SignalPlan
+from ssad.core.types import F64, Actor, EpisodeLimits, Pose, Scenario, SignalPlan
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
 from ssad.interchange.ego_start import start_parameters
@@ -270,7 +270,7 @@ def _scenario(  # noqa: PLR0917
         parameters=parameters,
         actors=tuple(_actor(track) for track in tracks),
         signals=SignalPlan("green", "red", until=steps * STEP),  # a log does not record the states of signals
-        limits=Limits(max_steps=steps, max_time=round(steps * STEP, 1)),
+        limits=EpisodeLimits(max_steps=steps, max_time=round(steps * STEP, 1)),
         target_speed=round(float(np.clip(_fastest(path), 3.0, 60.0)), 2),
         group="log",
         source=f"nuScenes schema {version}, {scene.record.name}{location}",

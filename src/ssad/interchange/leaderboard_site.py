@@ -12,7 +12,7 @@ import numpy as np
 from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
-from ssad.core.types import F64, Actor, Condition, LaneType, Limits, Phase, Pose, Route, Scenario, SignalPlan
+from ssad.core.types import F64, Actor, EpisodeLimits, LaneType, Phase, PhaseTrigger, Pose, Route, Scenario, SignalPlan
 from ssad.scenarios.dynamic.knowledge._meeting import time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
     LanePosition,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 SPEED: Final = 8.0  # m/s, assumed speed of the ego where the leaderboard measures seconds to a place
 PICK_UP: Final = 2.5  # m/s^2, assumed acceleration of the ego at the start
-LIMITS: Final = Limits(max_steps=900, max_time=90.0)
+LIMITS: Final = EpisodeLimits(max_steps=900, max_time=90.0)
 FLOW: Final = 45.0  # s during which a flow adds cars
 LONGEST: Final = 600.0  # m, largest length of a flow's path
 CARS: Final = ("compact", "coupe", "suv", "car")
@@ -247,15 +247,15 @@ class Site:
 
     # ------------------------------------------------------------ when
 
-    def reaches(self, index: int, actor: Pose) -> Condition:
+    def reaches(self, index: int, actor: Pose) -> PhaseTrigger:
         """Return the condition that the ego reaches a route point.
 
         It is expressed as a distance from the next actor to be added, which waits at `actor`.
         """
         position = self.route.xy[min(max(index, 0), len(self.route.xy) - 1)].tolist()
-        return Condition("ego_distance", math.dist(position, (actor.x, actor.y)), len(self.actors))
+        return PhaseTrigger("ego_distance", math.dist(position, (actor.x, actor.y)), len(self.actors))
 
-    def seconds_before(self, index: int, seconds: float, min_distance: float, actor: Pose) -> Condition:
+    def seconds_before(self, index: int, seconds: float, min_distance: float, actor: Pose) -> PhaseTrigger:
         """Return the condition that the ego is so many seconds or metres before a route point; see `reaches`."""
         return self.reaches(index - round(max(seconds * SPEED, min_distance) / self.route.spacing), actor)
 

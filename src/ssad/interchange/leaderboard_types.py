@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from ssad.core.types import Condition, LaneType, Phase, Pose, SignalPlan
+from ssad.core.types import LaneType, Phase, PhaseTrigger, Pose, SignalPlan
 from ssad.interchange.leaderboard_site import CARS, SPEED, Site
 from ssad.scenarios.dynamic.knowledge._meeting import meeting_place, time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import behind, beside, lane_path, pose_at
@@ -85,7 +85,7 @@ def bicycles(site: Site, *, two_ways: bool) -> None:
         index = site.point(distance + offset)
         lateral_offset = 0.275 * site.width(index)
         pose = site.pose(index, lateral_offset)
-        phases = (Phase(speed, site.reaches(site.start, pose)), Phase(0.0, Condition("travelled", ride_distance)))
+        phases = (Phase(speed, site.reaches(site.start, pose)), Phase(0.0, PhaseTrigger("travelled", ride_distance)))
         site.add(
             f"cyclist {cyclist_index}", "bicycle", pose, phases, site.along(index, ride_distance + 10.0, lateral_offset)
         )
@@ -108,7 +108,7 @@ def blocked(site: Site) -> None:
         "stopped car",
         site.car(),
         pose,
-        (Phase(0.0, arrival), Phase(SPEED, Condition("after", 10.0))),
+        (Phase(0.0, arrival), Phase(SPEED, PhaseTrigger("after", 10.0))),
         lane_path(site.graph, site.place(index), 120.0),
     )
 
@@ -117,8 +117,8 @@ def hard_brake(site: Site) -> None:
     """Add a car ahead that drives like the ego, brakes hard as the ego passes the trigger, and leaves after 10 s."""
     index = min(14, len(site.route.xy) - 3)
     brake_distance = max(10.0, site.start * site.route.spacing)
-    stop, restart = Phase(0.0, Condition("travelled", brake_distance)), Phase(SPEED, Condition("after", 10.0))
-    phases = (Phase(SPEED, Condition("ego_speed", 0.5)), stop, restart)
+    stop, restart = Phase(0.0, PhaseTrigger("travelled", brake_distance)), Phase(SPEED, PhaseTrigger("after", 10.0))
+    phases = (Phase(SPEED, PhaseTrigger("ego_speed", 0.5)), stop, restart)
     site.add("car ahead", site.car(), site.pose(index), phases, site.along(index, 1000.0, 0.0))
 
 
@@ -141,9 +141,11 @@ def _crossing(
     """Somebody who goes straight across `delay` s after the ego is near route point `index`; stops behind the road."""
     trigger, final_stop = (
         site.seconds_before(index, seconds, min_distance, pose),
-        Phase(0.0, Condition("travelled", way)),
+        Phase(0.0, PhaseTrigger("travelled", way)),
     )
-    start_phases = (Phase(0.0, trigger), Phase(speed, Condition("after", delay))) if delay else (Phase(speed, trigger),)
+    start_phases = (
+        (Phase(0.0, trigger), Phase(speed, PhaseTrigger("after", delay))) if delay else (Phase(speed, trigger),)
+    )
     site.add(name, model, pose, (*start_phases, final_stop))
 
 
@@ -287,8 +289,8 @@ def highway_cut_in(site: Site) -> None:
         - round(SPEED * time_to_cover(change_start, approach_speed, car_model.max_accel))
     )
     pose = pose_at(site.graph, start)
-    start_condition = site.reaches(waiting_point, pose) if waiting_point > 10 else Condition("ego_speed", 0.5)
-    phases = (Phase(round(approach_speed, 3), start_condition), Phase(speed, Condition("travelled", change_start)))
+    start_condition = site.reaches(waiting_point, pose) if waiting_point > 10 else PhaseTrigger("ego_speed", 0.5)
+    phases = (Phase(round(approach_speed, 3), start_condition), Phase(speed, PhaseTrigger("travelled", change_start)))
     site.add("car from the ramp", car_model.name, pose, phases, car_path)
 
 
@@ -385,7 +387,7 @@ def taking_priority(site: Site, *, signals: SignalPlan) -> None:
         site.graph, site.scenario, site.route, sides=(side,), trigger_distance=35.0, speed=speed, body="coupe"
     )
     site.signals = signals
-    start_condition = Condition("ego_distance", 35.0, len(site.actors))
+    start_condition = PhaseTrigger("ego_distance", 35.0, len(site.actors))
     car_path = lane_path(site.graph, place, 150.0)
     site.add("emergency car", "coupe", pose_at(site.graph, place), (Phase(speed, start_condition),), car_path)
 

@@ -21,7 +21,7 @@ import numpy as np
 from ssad.core.errors import FormatError, RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import MIB, read_xml
-from ssad.core.types import Actor, Condition, Limits, Phase, Pose, Route, Scenario, SignalPlan, SignalState
+from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Route, Scenario, SignalPlan, SignalState
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_entities import Entity, read_entities
 from ssad.interchange.openscenario_places import PositionReader, Values
@@ -312,7 +312,7 @@ class _Reader:
             if conditions is None and entity.phases:
                 self.lost[f"event '{label}': when it begins is not known"] += 1
                 return
-            *waiting_conditions, final_condition = conditions or (Condition("always"),)
+            *waiting_conditions, final_condition = conditions or (PhaseTrigger("always"),)
             previous_speed = (
                 entity.phases[-1].speed if entity.phases else min(entity.speed, MODELS[entity.model].max_speed)
             )
@@ -332,12 +332,12 @@ class _Reader:
         else:
             self._lose(f"in event '{label}'", action)
 
-    def _when(self, event: Element, entity: Entity, label: str) -> Condition | None:
+    def _when(self, event: Element, entity: Entity, label: str) -> PhaseTrigger | None:
         """Return the single condition of a trigger; None also if it is a sequence."""
         conditions = self.triggers.conditions(event, entity, label)
         return conditions[0] if conditions is not None and len(conditions) == 1 else None
 
-    def _lane_change(self, entity: Entity, action: Element, start_condition: Condition | None, label: str) -> None:
+    def _lane_change(self, entity: Entity, action: Element, start_condition: PhaseTrigger | None, label: str) -> None:
         """A lane change whose place is known becomes part of the path; else it is lost."""
         target = action.find("LaneChangeAction/LaneChangeTarget/RelativeTargetLane")
         speed = entity.phases[-1].speed if entity.phases else entity.speed
@@ -367,14 +367,14 @@ class _Reader:
                 waiting_phases = (
                     Phase(min(entity.speed, 60.0), condition)
                     for condition in conditions
-                    if condition != Condition("always")
+                    if condition != PhaseTrigger("always")
                 )
                 entity.phases = (*waiting_phases, *entity.phases)
 
     # ------------------------------------------------------------ parts of the scenario
 
-    def _limits(self) -> Limits:
-        limits = Limits()
+    def _limits(self) -> EpisodeLimits:
+        limits = EpisodeLimits()
         trigger = self.root.find("Storyboard/StopTrigger")
         conditions = [] if trigger is None else trigger.findall("ConditionGroup/Condition")
         times: list[float] = []
@@ -422,7 +422,7 @@ class _Reader:
             Pose(x, y, heading) for (x, y), heading in zip(key_points.tolist(), headings.tolist(), strict=True)
         )
 
-    def _actors(self, limits: Limits) -> list[Actor]:
+    def _actors(self, limits: EpisodeLimits) -> list[Actor]:
         end_time = min(limits.max_steps * STEP, limits.max_time)
         return [self._actor(entity, end_time) for entity in self.entities.values() if entity.placed and not entity.ego]
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from ssad.core.types import Condition
+from ssad.core.types import PhaseTrigger
 from ssad.interchange.openscenario_entities import Entity
 from ssad.interchange.openscenario_places import PositionReader
 from ssad.world.models import MODELS
@@ -36,14 +36,14 @@ class Triggers:
             raise self.values.fail(element, f"there is no entity '{name}'")
         return self.entities[name]
 
-    def conditions(self, event: Element, entity: Entity, label: str) -> tuple[Condition, ...] | None:
+    def conditions(self, event: Element, entity: Entity, label: str) -> tuple[PhaseTrigger, ...] | None:
         """Return the sequence of conditions that the trigger of an event or act waits for.
 
         Returns:
             The conditions, in their order; None if no part of the trigger has a counterpart.
         """
-        alternatives: list[tuple[Condition, ...]] = []
-        delays: list[Condition] = []  # delays since the previous event
+        alternatives: list[tuple[PhaseTrigger, ...]] = []
+        delays: list[PhaseTrigger] = []  # delays since the previous event
         unread, completed = list[str](), 0
         for condition in event.iterfind("StartTrigger/ConditionGroup/Condition"):
             condition_type = next(
@@ -64,7 +64,7 @@ class Triggers:
                 elif delay and self.values.text(condition_type, "storyboardElementRef") != entity.event:
                     self.lost[f"the delay of the trigger of '{label}' after another event than the one before"] += 1
                 elif delay:
-                    delays.append(Condition("after", delay))
+                    delays.append(PhaseTrigger("after", delay))
                     completed += state == "completeState"
                 continue  # phases follow each other in any case
             converted = self._convert_condition(condition, condition_type, entity)
@@ -72,14 +72,14 @@ class Triggers:
                 unread.append(condition_type.tag)
                 continue
             if converted.kind in ("always", "time") and delay:
-                converted, delay = Condition("time", converted.value + delay), 0.0
-            sequence = (converted, Condition("after", delay)) if delay else (converted,)
+                converted, delay = PhaseTrigger("time", converted.value + delay), 0.0
+            sequence = (converted, PhaseTrigger("after", delay)) if delay else (converted,)
             if sequence not in alternatives:
                 alternatives.append(sequence)
         # Our writer gives each delay for a running and for a completed event; other files may have only the latter.
         if delays and completed == len(delays):
             self.lost[f"the delay of the trigger of '{label}' is counted from where the event before begins"] += 1
-        required = [sequence for sequence in alternatives if sequence != (Condition("always"),)] or (
+        required = [sequence for sequence in alternatives if sequence != (PhaseTrigger("always"),)] or (
             [] if delays else alternatives
         )
         for unread_tag in unread:
@@ -88,20 +88,20 @@ class Triggers:
             self.lost[f"all but the first of the {len(required)} conditions of the trigger of '{label}'"] += 1
         if required or delays:
             return (*delays[:1], *(required[0] if required else ()))
-        return None if unread else (Condition("always"),)
+        return None if unread else (PhaseTrigger("always"),)
 
-    def _convert_condition(self, condition: Element, condition_type: Element, entity: Entity) -> Condition | None:
+    def _convert_condition(self, condition: Element, condition_type: Element, entity: Entity) -> PhaseTrigger | None:
         rule = self.values.text(condition_type, "rule", "")
         triggering = [
             self.referenced_entity(reference) for reference in condition.iterfind(".//TriggeringEntities/EntityRef")
         ]
         value = self.values.number(condition_type, "value", 0.0)
         if condition_type.tag == "SimulationTimeCondition" and rule in _GREATER:
-            return Condition("time", value) if value > 0.0 else Condition("always")
+            return PhaseTrigger("time", value) if value > 0.0 else PhaseTrigger("always")
         if condition_type.tag == "TraveledDistanceCondition" and triggering == [entity]:
-            return Condition("travelled", value)
+            return PhaseTrigger("travelled", value)
         if condition_type.tag == "SpeedCondition" and triggering == [self.ego] and rule in _GREATER:
-            return Condition("ego_speed", value)
+            return PhaseTrigger("ego_speed", value)
         if condition_type.tag == "RelativeDistanceCondition" and rule in _LESS and len(triggering) == 1:
             entities = [triggering[0], self.referenced_entity(condition_type)]
             other_entities = [entity_of_pair for entity_of_pair in entities if entity_of_pair is not self.ego]
@@ -117,7 +117,7 @@ class Triggers:
                 self.lost["distances along the road are taken as straight ones"] += 1
             if other_entities[0].name not in self._order:
                 return None
-            return Condition("ego_distance", value, self._order.index(other_entities[0].name))
+            return PhaseTrigger("ego_distance", value, self._order.index(other_entities[0].name))
         is_reach = condition_type.tag == "ReachPositionCondition" or (
             condition_type.tag == "DistanceCondition" and rule in _LESS
         )
@@ -131,5 +131,5 @@ class Triggers:
             tolerance = self.values.number(condition_type, "tolerance", value)
             self.lost[f"a place that the ego reaches is taken as its distance from '{entity.name}'"] += 1
             gap = math.dist((target.x, target.y), (start.x, start.y))
-            return Condition("ego_distance", gap + tolerance, self._order.index(entity.name))
+            return PhaseTrigger("ego_distance", gap + tolerance, self._order.index(entity.name))
         return None

@@ -17,12 +17,12 @@ import numpy as np
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import (
     AgentKind,
-    Condition,
     Controller,
     Episode,
     EpisodeAgent,
-    Limits,
+    EpisodeLimits,
     Model,
+    PhaseTrigger,
     Pose,
     SignalState,
 )
@@ -326,7 +326,7 @@ class _Writer:
             _position(vertex, pose)
         return follow_action
 
-    def _condition(self, group: Element, label: str, name: str, condition: Condition) -> None:
+    def _condition(self, group: Element, label: str, name: str, condition: PhaseTrigger) -> None:
         if condition.kind in ("always", "time"):
             _by_time(group, label, condition.value if condition.kind == "time" else 0.0)
             return
@@ -350,12 +350,12 @@ class _Writer:
             )
 
     def _stop(self, trigger: Element) -> None:
-        limits: Limits = self.episode.limits
+        limits: EpisodeLimits = self.episode.limits
         _by_time(_node(trigger, "ConditionGroup"), "max_steps", limits.max_steps * self.dt)
         if math.isfinite(limits.max_time):
             _by_time(_node(trigger, "ConditionGroup"), "max_time", limits.max_time)
         ego = self.names[0]
-        if limits.max_distance < Limits().max_distance:
+        if limits.max_distance < EpisodeLimits().max_distance:
             entity_condition = _by_entity(_node(trigger, "ConditionGroup"), "max_distance", ego)
             _node(entity_condition, "TraveledDistanceCondition", value=float(limits.max_distance))
         if limits.contact == "end":

@@ -26,7 +26,7 @@ from ssad.core.registry import describe
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import home, make_folder, read_text, write_atomic
 from ssad.core.seeding import digest
-from ssad.core.types import F64, Actor, LaneType, Limits, Pose, Scenario
+from ssad.core.types import F64, Actor, EpisodeLimits, LaneType, Pose, Scenario
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import scenario_name
 from ssad.scenarios.dynamic import build_episode
@@ -266,7 +266,7 @@ def _scenario(program: Program, drive: Any, name: str, seed: int) -> Sampled:
         route=key_points,
         parameters=start_parameters(ego_route, start_pose, max(speed, 0.0), digits=6),
         actors=tuple(_actor(drive, rows, index, end_time) for index in range(1, rows.shape[1])),
-        limits=Limits(max_steps=len(rows) + 100),
+        limits=EpisodeLimits(max_steps=len(rows) + 100),
         target_speed=round(top_speed, 2) if top_speed >= 1.0 else 8.0,
         group=scenario_name(program.path.stem),
         source=f"Scenic {program.path.name}, seed {seed}",

@@ -19,7 +19,7 @@ from scenic.domains.driving.simulators import DrivingSimulation, DrivingSimulato
 
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
-from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, Limits, Model, Pose, Route, Scenario
+from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, EpisodeLimits, Model, Pose, Route, Scenario
 from ssad.simulators.carla.blueprints import nearest_model
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
@@ -109,7 +109,7 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
             )
             for index, body in enumerate(bodies)
         ]
-        limits = Limits(max_steps=100_000, max_time=1e9, contact="count")
+        limits = EpisodeLimits(max_steps=100_000, max_time=1e9, contact="count")
         town = self.graph.name
         scenario = Scenario("scenic", "Custom", town, (bodies[0].pose, bodies[0].pose))
         episode = Episode("scenic", scenario, town, tuple(agents), limits=limits)

@@ -2,9 +2,9 @@
 
 from ssad.metrics.aggregate import FAMILIES as FAMILIES
 from ssad.metrics.aggregate import METRICS as METRICS
+from ssad.metrics.aggregate import EpisodeOutcome as EpisodeOutcome
 from ssad.metrics.aggregate import GroupRow as GroupRow
 from ssad.metrics.aggregate import Metric as Metric
-from ssad.metrics.aggregate import Outcome as Outcome
 from ssad.metrics.aggregate import aggregate as aggregate
 from ssad.metrics.aggregate import aggregate_groups as aggregate_groups
 from ssad.metrics.driving import EpisodeMetrics as EpisodeMetrics

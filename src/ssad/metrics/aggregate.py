@@ -87,7 +87,7 @@ METRICS: dict[str, Metric] = {
 
 
 @dataclass(frozen=True)
-class Outcome:
+class EpisodeOutcome:
     """Result of one episode, with the keys that group it.
 
     Attributes:
@@ -105,7 +105,7 @@ class Outcome:
     family: str = "other"
 
     @classmethod
-    def from_record(cls, line: Mapping[str, Any], trace_hash: str = "") -> Outcome:
+    def from_record(cls, line: Mapping[str, Any], trace_hash: str = "") -> EpisodeOutcome:
         """From a line of results.jsonl; `trace_hash` stands in for the case where the line names none.
 
         Runs from before lines named their case wrote 0 stop signs without a world that has any: not measured.
@@ -134,7 +134,7 @@ class GroupRow:
     values: dict[str, Estimate]
 
 
-def aggregate(outcomes: Sequence[Outcome]) -> dict[str, Estimate]:
+def aggregate(outcomes: Sequence[EpisodeOutcome]) -> dict[str, Estimate]:
     """Return estimates of all metrics of one system, by symbol; the order of the outcomes does not matter.
 
     Within one group, the estimate is the mean over its distinct episodes; over several groups, the unweighted
@@ -150,16 +150,16 @@ def aggregate(outcomes: Sequence[Outcome]) -> dict[str, Estimate]:
     for symbol, metric in METRICS.items():
         if metric.field:
             values = [_value(outcome, metric) for outcome in outcomes]
-            estimates[symbol] = estimate(values, metric.kind, scale=metric.scale, least=0.0)
+            estimates[symbol] = estimate(values, metric.kind, scale=metric.scale, min_value=0.0)
     return {symbol: estimates.get(symbol) or _overall(outcomes) for symbol in METRICS}
 
 
-def aggregate_groups(outcomes: Iterable[tuple[str, Outcome]]) -> list[GroupRow]:
+def aggregate_groups(outcomes: Iterable[tuple[str, EpisodeOutcome]]) -> list[GroupRow]:
     """Rows for (system, outcome) pairs: each system's groups as they come, then the averages of their families.
 
     A family other than the paper's has an average only if it has several groups.
     """
-    outcomes_by_system: dict[str, list[Outcome]] = {}
+    outcomes_by_system: dict[str, list[EpisodeOutcome]] = {}
     for system, outcome in outcomes:
         outcomes_by_system.setdefault(system, []).append(outcome)
     rows = []
@@ -176,7 +176,7 @@ def aggregate_groups(outcomes: Iterable[tuple[str, Outcome]]) -> list[GroupRow]:
     return rows
 
 
-def _value(outcome: Outcome, metric: Metric) -> CaseValue:
+def _value(outcome: EpisodeOutcome, metric: Metric) -> CaseValue:
     """Return the value that an episode contributes to a metric."""
     number = None if outcome.metrics is None else getattr(outcome.metrics, metric.field)
     if outcome.metrics is None:
@@ -187,13 +187,13 @@ def _value(outcome: Outcome, metric: Metric) -> CaseValue:
     return CaseValue(value, outcome.cluster, outcome.case, outcome.group, outcome.metrics is None)
 
 
-def _overall(outcomes: Sequence[Outcome]) -> Estimate:
+def _overall(outcomes: Sequence[EpisodeOutcome]) -> Estimate:
     """Return SafeBench's score of the means, averaged over the groups, with the interval of the unrounded score.
 
     The score is a weighted sum of means, so an episode has one too: from its collision, distances, incomplete
     route and time. For a failed episode, distances and time are the group's means, and the collision is unknown.
     """
-    groups: dict[str, list[Outcome]] = {}
+    groups: dict[str, list[EpisodeOutcome]] = {}
     for outcome in outcomes:
         groups.setdefault(outcome.group, []).append(outcome)
     scores: list[float] = []
@@ -219,5 +219,5 @@ def _overall(outcomes: Sequence[Outcome]) -> Estimate:
     if not scores:
         return replace(NOTHING, failed=sum(outcome.metrics is None for outcome in outcomes))
     mean = math.fsum(scores) / len(scores)
-    lower_estimate, upper_estimate = estimate(optimistic, "mean", least=0.0), estimate(pessimistic, "mean")
+    lower_estimate, upper_estimate = estimate(optimistic, "mean", min_value=0.0), estimate(pessimistic, "mean")
     return replace(lower_estimate, mean=mean, low=min(lower_estimate.low, mean), high=max(upper_estimate.high, mean))

@@ -17,9 +17,9 @@ LEFT = 0.05  # share of the clean score under which the detector counts as defea
 RESTARTS = 0.05  # share of the clean score that restarts may gain without a finding
 GRADIENT = 0.25  # relative error of a gradient; that of losses with a detached target is up to a fifth
 COUPLED = 0.01  # relative change of an image's loss by another image of the batch
-USED = 0.25  # minimum share of the budget that an attack uses, unless the detector is defeated
-MANY = 5  # steps from which an attack is expected to beat a single step on any loss
-WHOLE = frozenset({"full", "classification", "vanish", "margin"})  # losses about all that a detector finds
+MIN_BUDGET_SHARE = 0.25  # minimum share of the budget that an attack uses, unless the detector is defeated
+MIN_STEPS = 5  # steps from which an attack is expected to beat a single step on any loss
+WHOLE_LOSSES = frozenset({"full", "classification", "vanish", "margin"})  # losses about all that a detector finds
 UNBOUNDED = 64.0  # code values from which an L-infinity budget hides any picture
 
 
@@ -88,7 +88,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class AuditFault:
     """An objection against an attack: the violated rule, the detector, a sentence."""
 
     rule: str
@@ -106,7 +106,7 @@ class Verdict:
     """
 
     compared: Mapping[str, int]
-    faults: tuple[Fault, ...]
+    faults: tuple[AuditFault, ...]
 
     @property
     def passed(self) -> bool:
@@ -152,83 +152,88 @@ def audit(attempts: Iterable[Attempt]) -> Verdict:
             for finding in rule(detector_attempts):
                 compared[rule_name] += 1
                 if finding is not None:
-                    faults.append(Fault(rule_name, detector, finding))
+                    faults.append(AuditFault(rule_name, detector, finding))
     return Verdict(compared, tuple(faults))
 
 
-def weaker(one: Attempt, other: Attempt) -> bool:
-    """Whether one attempt leaves a higher score than another, beyond noise.
+def weaker(attempt: Attempt, other_attempt: Attempt) -> bool:
+    """Return whether an attempt leaves a higher score than another, beyond noise.
 
     The margin for noise is a share (`NOISE`) of the clean score or two standard errors of the paired difference,
     whichever is larger.
 
     Args:
-        one: The attempt that may be the weaker attack.
-        other: The attempt to compare it with.
+        attempt: The attempt that may be the weaker attack.
+        other_attempt: The attempt to compare it with.
 
     Returns:
-        True if `one` is the weaker attack.
+        True if `attempt` is the weaker attack.
     """
-    margin = NOISE * max(one.clean, 0.0)
-    if len(one.draws) == len(other.draws) > 1:
-        score_pairs = zip(one.draws, other.draws, strict=True)
+    margin = NOISE * max(attempt.clean, 0.0)
+    if len(attempt.draws) == len(other_attempt.draws) > 1:
+        score_pairs = zip(attempt.draws, other_attempt.draws, strict=True)
         differences = [first_score - second_score for first_score, second_score in score_pairs]
         mean = math.fsum(differences) / len(differences)
         variance = math.fsum((difference - mean) ** 2 for difference in differences) / (len(differences) - 1)
         margin = max(margin, 2.0 * math.sqrt(variance))
-    return one.score > other.score + margin
+    return attempt.score > other_attempt.score + margin
 
 
-def _pair(one: Attempt, other: Attempt, why: str) -> Finding:
-    """The sentence if `one`, which should be the stronger, is weaker."""
-    if not weaker(one, other):
+def _pair(stronger: Attempt, weaker_attempt: Attempt, reason: str) -> Finding:
+    """Return a sentence if `stronger`, which should be the stronger attack, is weaker."""
+    if not weaker(stronger, weaker_attempt):
         return None
-    return f"{one.title} leaves {_percent(one.score)}, {other.title} {_percent(other.score)}: {why}"
+    return (
+        f"{stronger.title} leaves {_percent(stronger.score)}, "
+        f"{weaker_attempt.title} {_percent(weaker_attempt.score)}: {reason}"
+    )
 
 
 def _percent(score: float) -> str:
     return f"{100 * score:.2f} mAP"
 
 
-def _own(attempts: Sequence[Attempt]) -> list[Attempt]:
+def _direct_attempts(attempts: Sequence[Attempt]) -> list[Attempt]:
     """Return the attacks that were made against the evaluated detector, without noise."""
     return [attempt for attempt in attempts if attempt.attack != "noise" and not attempt.source]
 
 
-def _along(attempts: Sequence[Attempt], what: str) -> Iterator[tuple[Attempt, Attempt]]:
+def _along(attempts: Sequence[Attempt], field: str) -> Iterator[tuple[Attempt, Attempt]]:
     """Neighbours, smaller and larger, that differ in one attribute only."""
     names = [
         setting_name
         for setting_name in ("attack", "loss", "norm", "radius", "steps", "options")
-        if setting_name != what
+        if setting_name != field
     ]
     groups: dict[tuple[object, ...], list[Attempt]] = {}
-    for attempt in _own(attempts):
+    for attempt in _direct_attempts(attempts):
         groups.setdefault(tuple(getattr(attempt, key_name) for key_name in names), []).append(attempt)
     for group in groups.values():
-        ordered = sorted(group, key=lambda attempt: float(getattr(attempt, what)))
+        ordered = sorted(group, key=lambda attempt: float(getattr(attempt, field)))
         yield from (
-            (smaller, larger) for smaller, larger in pairwise(ordered) if getattr(smaller, what) < getattr(larger, what)
+            (smaller, larger)
+            for smaller, larger in pairwise(ordered)
+            if getattr(smaller, field) < getattr(larger, field)
         )
 
 
-def _method(one: Attempt) -> tuple[object, ...]:
+def _method(attempt: Attempt) -> tuple[object, ...]:
     """An attack but for its steps."""
-    return one.attack, one.loss, one.norm, one.radius, one.options
+    return attempt.attack, attempt.loss, attempt.norm, attempt.radius, attempt.options
 
 
 def _steps(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for fewer, more in _along(attempts, "steps"):
-        yield _pair(more, fewer, "more steps made it weaker, so its steps are mis-tuned")
+    for shorter, longer in _along(attempts, "steps"):
+        yield _pair(longer, shorter, "more steps made it weaker, so its steps are mis-tuned")
 
 
 def _radius(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for small, large in _along(attempts, "radius"):
-        yield _pair(large, small, "a larger budget made it weaker, so it does not use its budget")
+    for smaller, larger in _along(attempts, "radius"):
+        yield _pair(larger, smaller, "a larger budget made it weaker, so it does not use its budget")
 
 
 def _iterated(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    white_box = [attempt for attempt in _own(attempts) if attempt.access == "white-box"]
+    white_box = [attempt for attempt in _direct_attempts(attempts) if attempt.access == "white-box"]
     for single_step in white_box:
         for iterated in white_box:
             is_comparable = (single_step.loss, single_step.norm, single_step.radius) == (
@@ -252,19 +257,24 @@ def _losses(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     need more or fewer steps to take effect, so each attack is judged by its largest number of steps: the start of
     a curve over steps says nothing about its end.
     """
-    white_box = [attempt for attempt in _own(attempts) if attempt.access == "white-box"]
-    longest = [
+    white_box = [attempt for attempt in _direct_attempts(attempts) if attempt.access == "white-box"]
+    longest_attempts = [
         attempt
         for attempt in white_box
         if not any(attempt.steps < longer.steps and _method(attempt) == _method(longer) for longer in white_box)
     ]
     for single_step in white_box:
-        for iterated in longest:
+        for iterated in longest_attempts:
             is_comparable = (single_step.norm, single_step.radius) == (
                 iterated.norm,
                 iterated.radius,
             ) and single_step.loss != iterated.loss
-            if is_comparable and single_step.steps == 1 and iterated.steps >= MANY and iterated.loss in WHOLE:
+            if (
+                is_comparable
+                and single_step.steps == 1
+                and iterated.steps >= MIN_STEPS
+                and iterated.loss in WHOLE_LOSSES
+            ):
                 yield _pair(iterated, single_step, "many steps weaker than one, even on another loss, are mis-tuned")
 
 
@@ -279,31 +289,38 @@ def _access(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _transfer(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    def method(one: Attempt) -> tuple[object, ...]:
-        settings = [setting for setting in one.options.split() if not setting.startswith("draws=")]
-        return one.attack, one.loss, one.norm, one.radius, one.steps, settings
+    def method(attempt: Attempt) -> tuple[object, ...]:
+        settings = [setting for setting in attempt.options.split() if not setting.startswith("draws=")]
+        return attempt.attack, attempt.loss, attempt.norm, attempt.radius, attempt.steps, settings
 
     for transferred in (attempt for attempt in attempts if attempt.source):
-        for direct in _own(attempts):
-            if method(direct) == method(transferred):
+        for direct_attempt in _direct_attempts(attempts):
+            if method(direct_attempt) == method(transferred):
                 yield _pair(
-                    direct, transferred, "what was made against something else hurts more, so the gradient is masked"
+                    direct_attempt,
+                    transferred,
+                    "what was made against something else hurts more, so the gradient is masked",
                 )
 
 
 def _restarts(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for first, second in combinations(_own(attempts), 2):
-        fewer, more = sorted((first, second), key=lambda attempt: attempt.restarts)
+    for first, second in combinations(_direct_attempts(attempts), 2):
+        fewer_restarts, more_restarts = sorted((first, second), key=lambda attempt: attempt.restarts)
         is_comparable = all(
-            getattr(fewer, name) == getattr(more, name) for name in ("attack", "loss", "norm", "radius", "steps")
+            getattr(fewer_restarts, name) == getattr(more_restarts, name)
+            for name in ("attack", "loss", "norm", "radius", "steps")
         )
-        if not is_comparable or fewer.restarts == more.restarts:
+        if not is_comparable or fewer_restarts.restarts == more_restarts.restarts:
             continue
-        finding = _pair(more, fewer, "restarts made it weaker, so the best start is not kept")
-        if finding is None and fewer.score - more.score > RESTARTS * fewer.clean and weaker(fewer, more):
+        finding = _pair(more_restarts, fewer_restarts, "restarts made it weaker, so the best start is not kept")
+        if (
+            finding is None
+            and fewer_restarts.score - more_restarts.score > RESTARTS * fewer_restarts.clean
+            and weaker(fewer_restarts, more_restarts)
+        ):
             finding = (
-                f"{fewer.title} leaves {_percent(fewer.score)}, {more.title} "
-                f"{_percent(more.score)}: restarts gain much, "
+                f"{fewer_restarts.title} leaves {_percent(fewer_restarts.score)}, {more_restarts.title} "
+                f"{_percent(more_restarts.score)}: restarts gain much, "
                 "so one start ends far from the best"
             )
         yield finding
@@ -321,13 +338,13 @@ def _above_noise(attempts: Sequence[Attempt]) -> Iterator[Finding]:
         for attempt in group
         if noise is not None and noise.score > LEFT * noise.clean
     ]
-    largest: dict[tuple[object, ...], float] = {}
+    largest_drop: dict[tuple[object, ...], float] = {}
     for _, attempt in pairs:
         settings = attempt.attack, attempt.loss, attempt.norm, attempt.steps, attempt.options
-        largest[settings] = max(attempt.radius, largest.get(settings, 0.0))
+        largest_drop[settings] = max(attempt.radius, largest_drop.get(settings, 0.0))
     for noise, attempt in pairs:
         is_largest = (
-            attempt.radius == largest[attempt.attack, attempt.loss, attempt.norm, attempt.steps, attempt.options]
+            attempt.radius == largest_drop[attempt.attack, attempt.loss, attempt.norm, attempt.steps, attempt.options]
         )
         is_beaten = weaker(attempt, noise) or (is_largest and attempt.score >= noise.score)
         yield (
@@ -347,11 +364,11 @@ def _sizes(attempts: Sequence[Attempt]) -> Iterator[tuple[Attempt | None, list[A
     for attempt in attempts:
         groups.setdefault((attempt.norm, attempt.radius), []).append(attempt)
     for group in groups.values():
-        yield next((attempt for attempt in group if attempt.attack == "noise"), None), _own(group)
+        yield next((attempt for attempt in group if attempt.attack == "noise"), None), _direct_attempts(group)
 
 
 def _unbounded(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for attempt in _own(attempts):
+    for attempt in _direct_attempts(attempts):
         if attempt.norm == "linf" and attempt.radius >= UNBOUNDED and attempt.steps > 1:
             yield (
                 None
@@ -365,12 +382,12 @@ def _unbounded(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _rises(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for attempt in _own(attempts):
+    for attempt in _direct_attempts(attempts):
         if attempt.before is not None and attempt.after is not None:
-            rise = attempt.after - attempt.before
-            if rise > 0 or (rise == 0 and attempt.score <= LEFT * attempt.clean):
+            loss_rise = attempt.after - attempt.before
+            if loss_rise > 0 or (loss_rise == 0 and attempt.score <= LEFT * attempt.clean):
                 yield None
-            elif rise < 0:
+            elif loss_rise < 0:
                 yield (
                     f"{attempt.title}: the loss it ascends fell from {attempt.before:.4g} to "
                     f"{attempt.after:.4g}: a wrong sign"
@@ -383,7 +400,7 @@ def _rises(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _gradient(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for attempt in _own(attempts):
+    for attempt in _direct_attempts(attempts):
         if attempt.gradient_error is not None:
             yield (
                 None
@@ -397,7 +414,7 @@ def _gradient(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _coupling(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for attempt in _own(attempts):
+    for attempt in _direct_attempts(attempts):
         if attempt.coupling is not None:
             yield (
                 None
@@ -425,11 +442,11 @@ def _budget(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _used(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for attempt in _own(attempts):
+    for attempt in _direct_attempts(attempts):
         if attempt.used is not None and attempt.score > LEFT * attempt.clean:
             yield (
                 None
-                if attempt.used >= USED
+                if attempt.used >= MIN_BUDGET_SHARE
                 else (
                     f"{attempt.title} uses {attempt.used:.0%} of its budget and leaves "
                     f"{_percent(attempt.score)}: its steps are "
@@ -442,7 +459,10 @@ RULES: Mapping[str, tuple[str, Rule]] = {
     "steps": ("more steps are never weaker", _steps),
     "radius": ("a larger budget is never weaker", _radius),
     "iterated": ("iterated attacks are at least as strong as a single step", _iterated),
-    "losses": (f"the most steps that ran, if {MANY} or more, are at least as strong as one on another loss", _losses),
+    "losses": (
+        f"the most steps that ran, if {MIN_STEPS} or more, are at least as strong as one on another loss",
+        _losses,
+    ),
     "access": ("white-box attacks are at least as strong as black-box ones", _access),
     "transfer": ("pictures made against another detector, or without its defence, are no stronger", _transfer),
     "restarts": ("restarts gain little", _restarts),

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ssad.core.geometry import obb_distance
 from ssad.core.types import F64, Bool, EpisodeTrace
 
-CAP = 10.0
+DEFAULT_CAP = 10.0
 """Largest TTC and PET, s: nothing later counts as a conflict (the cap of FREA's PET)."""
 
 
@@ -79,7 +79,7 @@ def ttc(trace: EpisodeTrace) -> F64:
     return np.where(_present(trace), collision_time, np.inf)
 
 
-def min_ttc(trace: EpisodeTrace, *, cap: float = CAP) -> float:
+def min_ttc(trace: EpisodeTrace, *, cap: float = DEFAULT_CAP) -> float:
     """Return the minimum time to collision over steps and agents, s, at most `cap`."""
     return min(float(ttc(trace).min(initial=np.inf)), cap)
 
@@ -94,7 +94,7 @@ def min_distance(trace: EpisodeTrace) -> float:
     return float(obb_distance(body_boxes[step, 0], body_boxes[step, agent + 1]).min())
 
 
-def post_encroachment_time(trace: EpisodeTrace, *, cap: float = CAP) -> float:
+def post_encroachment_time(trace: EpisodeTrace, *, cap: float = DEFAULT_CAP) -> float:
     """Return the minimum post-encroachment time, s, at most `cap`; 0 if the ego touched another agent.
 
     At a point of the plane it is the time from when the first of two bodies leaves the point until the other
@@ -108,13 +108,13 @@ def post_encroachment_time(trace: EpisodeTrace, *, cap: float = CAP) -> float:
     radius = 0.5 * np.hypot(trace.length, trace.width).astype(np.float64)
     # Lags ascend, so the first overlap is the minimum.
     for lag in range(min(round(cap / trace.dt), steps - 1) + 1):
-        early, late = slice(0, steps - lag), slice(lag, steps)
-        for ego, other in ((early, late), (late, early)):
-            offset = body_boxes[other, 1:, :2] - body_boxes[ego, :1, :2]
+        early_steps, late_steps = slice(0, steps - lag), slice(lag, steps)
+        for ego, other_steps in ((early_steps, late_steps), (late_steps, early_steps)):
+            offset = body_boxes[other_steps, 1:, :2] - body_boxes[ego, :1, :2]
             # Circles around the bodies rule out most pairs before the exact test.
             is_near = np.hypot(offset[..., 0], offset[..., 1]) <= radius[0] + radius[1:]
-            step, agent = np.nonzero(is_near & active[other, 1:] & active[ego, :1])
-            if len(step) and _overlap(body_boxes[ego, 0][step], body_boxes[other, 1:][step, agent]).any():
+            step, agent = np.nonzero(is_near & active[other_steps, 1:] & active[ego, :1])
+            if len(step) and _overlap(body_boxes[ego, 0][step], body_boxes[other_steps, 1:][step, agent]).any():
                 return min(lag * float(trace.dt), cap)
     return cap
 
@@ -131,5 +131,5 @@ def _shadow(box: F64, yaw: F64) -> F64:
     )
 
 
-def _overlap(a: F64, b: F64) -> Bool:
-    return np.asarray(obb_distance(a, b) <= 0.0)
+def _overlap(first: F64, second: F64) -> Bool:
+    return np.asarray(obb_distance(first, second) <= 0.0)

@@ -334,16 +334,16 @@ def _turning_points(place: I64, total: int) -> tuple[I64, F64]:
 
 def _average_precision(precision: F64, config: DetectionConfig) -> float:
     """Return the mean over recalls above the minimum of the precision above the minimum."""
-    above = precision[round(100 * config.min_recall) + 1 :] - config.min_precision
-    return float(np.mean(np.maximum(above, 0.0))) / (1.0 - config.min_precision)
+    precision_excess = precision[round(100 * config.min_recall) + 1 :] - config.min_precision
+    return float(np.mean(np.maximum(precision_excess, 0.0))) / (1.0 - config.min_precision)
 
 
 def _tp_errors(errors: F64, score: F64, confidence: F64, config: DetectionConfig) -> F64:
     """Mean of each error [5] up to the highest recall reached; errors [5, T] and score [T] of the matches."""
-    first = round(100 * config.min_recall) + 1
+    first_recall = round(100 * config.min_recall) + 1
     reached_recalls = np.flatnonzero(confidence)
-    last = int(reached_recalls[-1]) if len(reached_recalls) else 0
-    if last < first:
+    last_recall = int(reached_recalls[-1]) if len(reached_recalls) else 0
+    if last_recall < first_recall:
         return np.ones(len(errors))
     is_known = ~np.isnan(errors)
     count = np.cumsum(is_known, axis=-1)
@@ -353,7 +353,13 @@ def _tp_errors(errors: F64, score: F64, confidence: F64, config: DetectionConfig
     descending_confidence, ascending_score = confidence[::-1], np.ascontiguousarray(score[::-1])
     return np.array(
         [
-            float(np.mean(np.interp(descending_confidence, ascending_score, error_mean[::-1])[::-1][first : last + 1]))
+            float(
+                np.mean(
+                    np.interp(descending_confidence, ascending_score, error_mean[::-1])[::-1][
+                        first_recall : last_recall + 1
+                    ]
+                )
+            )
             for error_mean in mean
         ]
     )

@@ -171,21 +171,21 @@ def filter_boxes(
 
 def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
     """Return which points [N] lie in a rack of their sample, bounds included, in the devkit's arithmetic."""
-    order = np.argsort(racks.sample, kind="stable")
-    first_rack = np.searchsorted(racks.sample[order], sample, side="left")
-    count = np.searchsorted(racks.sample[order], sample, side="right") - first_rack
-    point = np.repeat(np.arange(len(sample)), count)
-    rack = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - first_rack, count)]
+    rack_order = np.argsort(racks.sample, kind="stable")
+    first_rack = np.searchsorted(racks.sample[rack_order], sample, side="left")
+    count = np.searchsorted(racks.sample[rack_order], sample, side="right") - first_rack
+    centre_indices = np.repeat(np.arange(len(sample)), count)
+    rack_indices = rack_order[np.arange(len(centre_indices)) - np.repeat(np.cumsum(count) - count - first_rack, count)]
 
-    candidate_racks = racks.take(rack)
+    candidate_racks = racks.take(rack_indices)
     half_size, rack_axes = 0.5 * candidate_racks.size_lwh, candidate_racks.axes()
-    corner = np.empty((4, len(rack), 3))
+    corner = np.empty((4, len(rack_indices), 3))
     for corner_index, (x_sign, y_sign, z_sign) in enumerate(((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))):
-        local = [x_sign, y_sign, z_sign] * half_size
-        corner[corner_index] = np.einsum("nij,nj->ni", rack_axes, local) + candidate_racks.centre
-    offset = centre[point] - corner[0]
-    is_inside = np.ones(len(rack), np.bool_)
+        local_corners = [x_sign, y_sign, z_sign] * half_size
+        corner[corner_index] = np.einsum("nij,nj->ni", rack_axes, local_corners) + candidate_racks.centre
+    offset = centre[centre_indices] - corner[0]
+    is_inside = np.ones(len(rack_indices), np.bool_)
     for edge in corner[1:] - corner[0]:
         projection = (edge * offset).sum(axis=1)
         is_inside &= (projection >= 0.0) & (projection <= (edge * edge).sum(axis=1))
-    return np.bincount(point[is_inside], minlength=len(sample)) > 0
+    return np.bincount(centre_indices[is_inside], minlength=len(sample)) > 0

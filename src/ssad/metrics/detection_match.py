@@ -1,4 +1,4 @@
-"""Which prediction takes which ground-truth box: the devkit's greedy matching, for all boxes at once.
+"""Assignment of predictions to ground-truth boxes: the devkit's greedy matching, for all boxes at once.
 
 The devkit walks through the predictions of a class from the best score down (of equal scores the later first); each
 takes the nearest ground-truth box of its sample that is still free and nearer than the threshold (of equal distances
@@ -71,7 +71,7 @@ def match_class(
     truth_rows = truth_rows[np.argsort(truth.sample[truth_rows], kind="stable")]
     sample, score = predictions.sample[ranking], predictions.score[ranking]
 
-    pred, box, distance = _near_pairs(
+    prediction_indices, box, distance = _near_pairs(
         sample,
         predictions.centre[ranking, :2],
         truth.sample[truth_rows],
@@ -79,7 +79,7 @@ def match_class(
         samples=samples,
         limit=max(config.dist_ths),
     )
-    pairs = assign(pred, box, distance, boxes=len(truth_rows), thresholds=config.dist_ths)
+    pairs = assign(prediction_indices, box, distance, boxes=len(truth_rows), thresholds=config.dist_ths)
     for matched_ranks, matched_boxes in pairs:
         _check_sizes(truth, truth_rows[matched_boxes], predictions, ranking[matched_ranks], names)
     matched_ranks, matched_boxes = pairs[config.dist_ths.index(config.dist_th_tp)]
@@ -120,14 +120,16 @@ def _near_pairs(
     x, y = np.ascontiguousarray(centre[:, 0]), np.ascontiguousarray(centre[:, 1])
     box_x, box_y = np.ascontiguousarray(box_centre[:, 0]), np.ascontiguousarray(box_centre[:, 1])
     near_pairs: list[tuple[I64, I64, F64]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
-    for pred, box in pairs_of(count, start):
-        dx, dy = x[pred] - box_x[box], y[pred] - box_y[box]
+    for prediction_indices, box in pairs_of(count, start):
+        dx, dy = x[prediction_indices] - box_x[box], y[prediction_indices] - box_y[box]
         distance = np.sqrt(dx * dx + dy * dy)
         near_index = np.flatnonzero(distance < limit)
-        near_pairs.append((pred[near_index], box[near_index], distance[near_index]))
-    pred, box, distance = (np.concatenate([pair_columns[column] for pair_columns in near_pairs]) for column in range(3))
-    pair_order = np.lexsort((distance, pred))
-    return pred[pair_order], box[pair_order], distance[pair_order]
+        near_pairs.append((prediction_indices[near_index], box[near_index], distance[near_index]))
+    prediction_indices, box, distance = (
+        np.concatenate([pair_columns[column] for pair_columns in near_pairs]) for column in range(3)
+    )
+    pair_order = np.lexsort((distance, prediction_indices))
+    return prediction_indices[pair_order], box[pair_order], distance[pair_order]
 
 
 def pairs_of(count: I64, start: I64) -> Iterator[tuple[I64, I64]]:
@@ -137,30 +139,36 @@ def pairs_of(count: I64, start: I64) -> Iterator[tuple[I64, I64]]:
     while chunk_start < len(count):
         chunk_end = max(int(np.searchsorted(total, pairs_done + PAIRS, side="right")), chunk_start + 1)
         chunk_counts = count[chunk_start:chunk_end]
-        pred = np.repeat(np.arange(chunk_start, chunk_end), chunk_counts)
+        prediction_indices = np.repeat(np.arange(chunk_start, chunk_end), chunk_counts)
         yield (
-            pred,
-            np.arange(len(pred))
+            prediction_indices,
+            np.arange(len(prediction_indices))
             + np.repeat(start[chunk_start:chunk_end] - (np.cumsum(chunk_counts) - chunk_counts), chunk_counts),
         )
         chunk_start, pairs_done = chunk_end, int(total[chunk_end - 1])
 
 
-def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequence[float]) -> list[tuple[I64, I64]]:
+def assign(
+    prediction_indices: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequence[float]
+) -> list[tuple[I64, I64]]:
     """Return for each threshold the matched predictions, ascending, and their boxes.
 
     A proposer is a prediction at a threshold; its choices are the first ones of its pairs, up to the threshold.
 
     Args:
-        pred: Prediction of each near pair [K], sorted as by `_near_pairs`.
+        prediction_indices: Prediction of each near pair [K], sorted as by `_near_pairs`.
         box: True box of each pair [K].
         distance: Distance of each pair [K], m.
         boxes: Number of true boxes.
         thresholds: Thresholds of a match, m.
     """
     threshold_count = len(thresholds)
-    first_pair = np.flatnonzero(np.r_[True, pred[1:] != pred[:-1]]) if len(pred) else np.zeros(0, np.int64)
-    proposing_prediction = pred[first_pair]
+    first_pair = (
+        np.flatnonzero(np.r_[True, prediction_indices[1:] != prediction_indices[:-1]])
+        if len(prediction_indices)
+        else np.zeros(0, np.int64)
+    )
+    proposing_prediction = prediction_indices[first_pair]
     choice_end = np.stack(
         [
             np.add.reduceat(distance < threshold_index, first_pair) if len(first_pair) else first_pair
@@ -171,54 +179,56 @@ def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequen
     choice_end = (choice_end + first_pair[:, None]).ravel()  # proposer i * n + t
     choice = np.repeat(first_pair, threshold_count)
     no_proposer = len(choice_end)
-    holder = np.full(boxes * threshold_count, no_proposer, np.int64)
-    free = np.flatnonzero(choice < choice_end)
-    while len(free):
-        target = box[choice[free]] * threshold_count + free % threshold_count
-        previous_holder = holder[target]
+    holders = np.full(boxes * threshold_count, no_proposer, np.int64)
+    unmatched = np.flatnonzero(choice < choice_end)
+    while len(unmatched):
+        target = box[choice[unmatched]] * threshold_count + unmatched % threshold_count
+        previous_holder = holders[target]
         # proposers are numbered by rank, so the least of them is the best
-        np.minimum.at(holder, target, free)
-        new_holder = holder[target]
-        is_accepted = new_holder == free
-        rejected = np.concatenate([free[~is_accepted], previous_holder[is_accepted]])
-        rejected = rejected[rejected < no_proposer]
-        choice[rejected] += 1
-        free = rejected[choice[rejected] < choice_end[rejected]]
+        np.minimum.at(holders, target, unmatched)
+        new_holder = holders[target]
+        is_accepted = new_holder == unmatched
+        rejected_predictions = np.concatenate([unmatched[~is_accepted], previous_holder[is_accepted]])
+        rejected_predictions = rejected_predictions[rejected_predictions < no_proposer]
+        choice[rejected_predictions] += 1
+        unmatched = rejected_predictions[choice[rejected_predictions] < choice_end[rejected_predictions]]
     matches = []
     for threshold_index in range(threshold_count):
-        taken_boxes = np.flatnonzero(holder[threshold_index::threshold_count] < no_proposer)
+        taken_boxes = np.flatnonzero(holders[threshold_index::threshold_count] < no_proposer)
         matched_predictions = proposing_prediction[
-            holder[threshold_index::threshold_count][taken_boxes] // threshold_count
+            holders[threshold_index::threshold_count][taken_boxes] // threshold_count
         ]
         by_prediction = np.argsort(matched_predictions)
         matches.append((matched_predictions[by_prediction], taken_boxes[by_prediction]))
     return matches
 
 
-def _check_sizes(truth: BoxTable, real: I64, predictions: BoxTable, rank: I64, names: Sequence[str] | None) -> None:
+def _check_sizes(
+    truth: BoxTable, truth_rows: I64, predictions: BoxTable, prediction_rows: I64, names: Sequence[str] | None
+) -> None:
     """The devkit refuses a matched box one of whose sides is not positive."""
-    for role, boxes, rows in (("prediction", predictions, rank), ("ground truth", truth, real)):
+    for role_name, boxes, rows in (("prediction", predictions, prediction_rows), ("ground truth", truth, truth_rows)):
         # Negated, so that NaN counts as invalid too.
         is_flat: Bool = np.asarray(~(boxes.size_lwh[rows] > 0.0).all(axis=1))
         if is_flat.any():
             row = int(rows[is_flat.argmax()])
             sample = int(boxes.sample[row])
             raise FormatError(
-                f"sample {sample if names is None else names[sample]}: a {role} box has the size "
+                f"sample {sample if names is None else names[sample]}: a {role_name} box has the size "
                 f"{boxes.size_wlh[row].tolist()}; all sides must be positive"
             )
 
 
-def _errors(truth: BoxTable, found: BoxTable, period: float) -> F64:
+def _errors(truth: BoxTable, detections: BoxTable, period: float) -> F64:
     """Errors [5, T] of matched pairs: translation m, 1 - IoU of the sizes, yaw rad, velocity m/s, attribute 0 or 1."""
-    dx, dy = (found.centre[:, :2] - truth.centre[:, :2]).T
-    intersection = np.prod(np.minimum(truth.size_lwh, found.size_lwh), axis=1)
-    union = np.prod(truth.size_lwh, axis=1) + np.prod(found.size_lwh, axis=1) - intersection
-    yaw_difference = quaternion_to_yaw(truth.rotation) - quaternion_to_yaw(found.rotation)
+    dx, dy = (detections.centre[:, :2] - truth.centre[:, :2]).T
+    intersection = np.prod(np.minimum(truth.size_lwh, detections.size_lwh), axis=1)
+    union = np.prod(truth.size_lwh, axis=1) + np.prod(detections.size_lwh, axis=1) - intersection
+    yaw_difference = quaternion_to_yaw(truth.rotation) - quaternion_to_yaw(detections.rotation)
     # The period is pi for barriers, whose front and rear look alike.
     yaw_error = np.abs((yaw_difference + period / 2) % period - period / 2)
-    vx, vy = (found.velocity - truth.velocity).T
-    attribute_error = np.where(truth.attribute < 0, np.nan, truth.attribute != found.attribute)
+    vx, vy = (detections.velocity - truth.velocity).T
+    attribute_error = np.where(truth.attribute < 0, np.nan, truth.attribute != detections.attribute)
     return np.stack(
         [np.sqrt(dx * dx + dy * dy), 1.0 - intersection / union, yaw_error, np.sqrt(vx * vx + vy * vy), attribute_error]
     )

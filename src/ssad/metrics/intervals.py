@@ -24,11 +24,11 @@ MIN_CLUSTERS = 5
 MIN_DIFFERENT = 8
 """A mean without bounds has an interval only if so many clusters differ from the commonest value."""
 
-_ROOM = 0.3
+_EXTREME_WEIGHT = 0.3
 """Part of a cluster that each end of an interval of a mean leaves room for: of the intervals simulated, at least
 93.4 % hold in every case (93.9 with 0.5), and at most 97.5 % where clusters are normal (97.8 with 0.5)."""
 _Z = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
-_TAIL = 0.5 - 0.5 * LEVEL
+_TAIL_PROBABILITY = 0.5 - 0.5 * LEVEL
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Clusters:
 
 
 @dataclass(frozen=True)
-class Limits:
+class ConfidenceLimits:
     """Mean, limits [...] (NaN: no interval) and the name of the method."""
 
     mean: F64
@@ -65,7 +65,7 @@ class Limits:
     method: str
 
 
-def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> Limits:
+def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> ConfidenceLimits:
     """Return the interval of the mean of values in [0, 1]: beta limits at an effective number of cases.
 
     The effective number is that of independent yes-or-no cases whose share would vary as the clusters do (Korn
@@ -78,7 +78,7 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> L
         cap: Maximum effective number; twice the number of cases for values that are 0 or 1.
 
     Returns:
-        Limits [...]; NaN where values inside (0, 1) do not vary at all and `cap` is infinite.
+        The limits [...]; NaN where values inside (0, 1) do not vary at all and `cap` is infinite.
     """
     means, mean, contributions = _contributions(sums, clusters)
     cluster_counts = clusters.member.sum(axis=0)
@@ -100,12 +100,12 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> L
         effective = np.clip(
             np.where(is_constant, np.inf, np.nan_to_num(effective, nan=min_effective)), min_effective, cap
         )
-    low, high = share_limits(mean, np.where(np.isinf(effective), 1.0, effective))
+    lower, upper = share_limits(mean, np.where(np.isinf(effective), 1.0, effective))
     has_interval = np.isfinite(effective)
-    return Limits(mean, np.where(has_interval, low, np.nan), np.where(has_interval, high, np.nan), "beta")
+    return ConfidenceLimits(mean, np.where(has_interval, lower, np.nan), np.where(has_interval, upper, np.nan), "beta")
 
 
-def mean_limits(sums: F64, clusters: Clusters) -> Limits:
+def mean_limits(sums: F64, clusters: Clusters) -> ConfidenceLimits:
     """Interval of the mean of values without bounds: Student's, wider at both ends and on the side of the skew.
 
     The degrees of freedom fall with the kurtosis of the clusters; each end leaves room for 0.3 of a cluster more
@@ -116,17 +116,17 @@ def mean_limits(sums: F64, clusters: Clusters) -> Limits:
         clusters: their sizes and strata.
 
     Returns:
-        Limits [...]; NaN where fewer than `MIN_DIFFERENT` clusters differ from the commonest value.
+        The limits [...]; NaN where fewer than `MIN_DIFFERENT` clusters differ from the commonest value.
     """
     _, mean, contributions = _contributions(sums, clusters)
     spread = _spread(contributions, clusters)
     t = t_quantile(spread.freedom)
     standard_error = np.sqrt(spread.variance)
-    skewed = spread.skew * (2.0 * t * t + 1.0) / 6.0 * standard_error
-    low = mean - t * standard_error - np.maximum(-skewed, 0.0) + _ROOM * contributions.min(axis=-1)
-    high = mean + t * standard_error + np.maximum(skewed, 0.0) + _ROOM * contributions.max(axis=-1)
+    skew_term = spread.skew * (2.0 * t * t + 1.0) / 6.0 * standard_error
+    lower = mean - t * standard_error - np.maximum(-skew_term, 0.0) + _EXTREME_WEIGHT * contributions.min(axis=-1)
+    upper = mean + t * standard_error + np.maximum(skew_term, 0.0) + _EXTREME_WEIGHT * contributions.max(axis=-1)
     has_interval = (_different(sums / clusters.size) >= MIN_DIFFERENT) & ~_flat(spread.variance, mean)
-    return Limits(mean, np.where(has_interval, low, np.nan), np.where(has_interval, high, np.nan), "t")
+    return ConfidenceLimits(mean, np.where(has_interval, lower, np.nan), np.where(has_interval, upper, np.nan), "t")
 
 
 def replicate_limits(value: F64, variance: F64, clusters: int, *, bounded: bool) -> tuple[F64, F64]:
@@ -168,18 +168,18 @@ def share_limits(share: npt.ArrayLike, n: npt.ArrayLike) -> tuple[F64, F64]:
     jeffreys_part = 0.25 * np.clip(rarer_count - 1.0, 0.0, 1.0)
     # beyond 500 events, beta and score limits agree to three digits
     is_large = rarer_count > 500.0
-    centre, half = p + _Z**2 / (2.0 * n), _Z * np.sqrt(p * (1.0 - p) / n + _Z**2 / (4.0 * n * n))
-    low = np.where(is_large, (centre - half) / (1.0 + _Z**2 / n), 0.0)
-    high = np.where(is_large, (centre + half) / (1.0 + _Z**2 / n), 1.0)
+    centre, half_width = p + _Z**2 / (2.0 * n), _Z * np.sqrt(p * (1.0 - p) / n + _Z**2 / (4.0 * n * n))
+    lower = np.where(is_large, (centre - half_width) / (1.0 + _Z**2 / n), 0.0)
+    upper = np.where(is_large, (centre + half_width) / (1.0 + _Z**2 / n), 1.0)
     needs_beta = ~is_large & (events > 0.0)
-    low[needs_beta] = betaincinv(
-        (events + jeffreys_part)[needs_beta], (non_events + 1.0 - jeffreys_part)[needs_beta], _TAIL
+    lower[needs_beta] = betaincinv(
+        (events + jeffreys_part)[needs_beta], (non_events + 1.0 - jeffreys_part)[needs_beta], _TAIL_PROBABILITY
     )
     needs_beta = ~is_large & (non_events > 0.0)
-    high[needs_beta] = betaincinv(
-        (events + 1.0 - jeffreys_part)[needs_beta], (non_events + jeffreys_part)[needs_beta], 1.0 - _TAIL
+    upper[needs_beta] = betaincinv(
+        (events + 1.0 - jeffreys_part)[needs_beta], (non_events + jeffreys_part)[needs_beta], 1.0 - _TAIL_PROBABILITY
     )
-    return low, high
+    return lower, upper
 
 
 def t_quantile(freedom: npt.ArrayLike) -> F64:
@@ -209,20 +209,20 @@ def _contributions(sums: F64, clusters: Clusters) -> tuple[F64, F64, F64]:
     return means, mean, (sums / clusters.size - centre) * clusters.weight
 
 
-def _spread(part: F64, clusters: Clusters) -> _Spread:
+def _spread(contributions: F64, clusters: Clusters) -> _Spread:
     cluster_counts = clusters.member.sum(axis=0)
     if cluster_counts.min() < 2:
-        cluster_counts = np.array([float(len(part.T))])
-        stratum_count = np.full(part.shape[-1], cluster_counts[0])
+        cluster_counts = np.array([float(len(contributions.T))])
+        stratum_count = np.full(contributions.shape[-1], cluster_counts[0])
     else:
         stratum_count = cluster_counts[clusters.stratum]
-    variance = (part**2 * stratum_count / (stratum_count - 1.0)).sum(axis=-1)
-    cluster_count, max_freedom = part.shape[-1], float((cluster_counts - 1.0).sum())
+    variance = (contributions**2 * stratum_count / (stratum_count - 1.0)).sum(axis=-1)
+    cluster_count, max_freedom = contributions.shape[-1], float((cluster_counts - 1.0).sum())
     with np.errstate(divide="ignore", invalid="ignore"):
-        kurtosis = cluster_count * (part**4).sum(axis=-1) / (part**2).sum(axis=-1) ** 2
+        kurtosis = cluster_count * (contributions**4).sum(axis=-1) / (contributions**2).sum(axis=-1) ** 2
         freedom = np.nan_to_num(2.0 * cluster_count / np.maximum(kurtosis - 1.0, 1e-9), nan=max_freedom)
         third_moment = (
-            part**3 * stratum_count**2 / np.maximum((stratum_count - 1.0) * (stratum_count - 2.0), 1.0)
+            contributions**3 * stratum_count**2 / np.maximum((stratum_count - 1.0) * (stratum_count - 2.0), 1.0)
         ).sum(axis=-1)
         skew = np.nan_to_num(third_moment / variance**1.5)
     return _Spread(variance, np.clip(freedom, 1.0, max_freedom), skew)

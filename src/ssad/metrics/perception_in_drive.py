@@ -37,7 +37,7 @@ CAUSES: Final[Mapping[str, str]] = {
 
 
 def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Camera]) -> Bool:
-    """Which agents [N, A] the ego's cameras can see at N steps: not hidden, near enough, their middle in a picture.
+    """Return the agents [N, A] in view of the ego's cameras at N steps: near, not hidden, their middle in an image.
 
     Without cameras (a perceiver of LiDAR or radar) all agents that are near and not hidden count.
     """
@@ -52,24 +52,24 @@ def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Cam
         np.broadcast_to(size, (len(step_indices), *size.shape)),
         kind,
     )
-    unoccluded = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
+    is_unoccluded = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
     if not cameras:
-        return np.asarray(unoccluded)
-    egos = upright_poses(pose[:, 0].astype(np.float64))
-    ones = np.ones(kind.shape)
-    homogeneous = np.stack([pose[..., 0], pose[..., 1], 0.8 * ones, ones], -1)
+        return np.asarray(is_unoccluded)
+    ego_poses = upright_poses(pose[:, 0].astype(np.float64))
+    homogeneous_ones = np.ones(kind.shape)
+    homogeneous = np.stack([pose[..., 0], pose[..., 1], 0.8 * homogeneous_ones, homogeneous_ones], -1)
     in_image = np.zeros(kind.shape, bool)
     for camera in cameras.values():
-        to_camera = np.linalg.inv(egos @ camera.to_ego)
+        to_camera = np.linalg.inv(ego_poses @ camera.to_ego)
         lateral, depth = (np.einsum("nak,nk->na", homogeneous, to_camera[:, axis]) for axis in (0, 2))
         pixel_column = lateral / np.maximum(depth, 1e-6) * camera.intrinsic[0, 0] + camera.intrinsic[0, 2]
         in_image |= (depth > 0.5) & (pixel_column >= 0) & (pixel_column < camera.width)
-    return np.asarray(unoccluded & in_image)
+    return np.asarray(is_unoccluded & in_image)
 
 
-def _steps(trace: EpisodeTrace, told: Sequence[tuple[float, Any]]) -> list[int]:
-    """The steps of what was noted at times."""
-    return [min(round(time / trace.dt), len(trace.x) - 1) for time, _ in told]
+def _steps(trace: EpisodeTrace, records: Sequence[tuple[float, Any]]) -> list[int]:
+    """Return the steps of records with times."""
+    return [min(round(time / trace.dt), len(trace.x) - 1) for time, _ in records]
 
 
 def object_that_matters(trace: EpisodeTrace) -> int | None:
@@ -85,13 +85,13 @@ def object_that_matters(trace: EpisodeTrace) -> int | None:
     return nearest_agent + 1 if np.isfinite(distances[:, nearest_agent]).any() else None
 
 
-def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> dict[str, float | None]:
+def component_metrics(trace: EpisodeTrace, perceived: Perceived, *, phantom_score: float) -> dict[str, float | None]:
     """Numbers of the component on the frames of a drive; None where there was nothing to measure.
 
     Args:
         trace: The drive.
-        seen: What was perceived in it.
-        sure: Score from which an object that is not there is a phantom.
+        perceived: What was perceived in it.
+        phantom_score: Score from which an object that is not there is a phantom.
 
     Returns:
         AP: average precision of all kinds together, the mean of those within 0.5, 1, 2 and 4 m. recall: of the objects
@@ -107,8 +107,10 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
     look_tables: list[tuple[F64, Bool, Objects | None]] = []
     missed_agents: list[Bool] = []
     distance_errors: list[F64] = []
-    steps = _steps(trace, seen.looks)
-    for (_, detections), step, visible in zip(seen.looks, steps, in_view(trace, steps, seen.cameras), strict=True):
+    steps = _steps(trace, perceived.looks)
+    for (_, detections), step, visible in zip(
+        perceived.looks, steps, in_view(trace, steps, perceived.cameras), strict=True
+    ):
         agent_positions = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
         look_tables.append((agent_positions, visible, detections))
         look_count += 1
@@ -132,7 +134,7 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
             is_other[0] = False
             # All other agents count here, hidden ones too: a detection of one of them is no phantom.
             is_phantom = distances[is_other].min(0, initial=np.inf) > ROUGH
-            phantom_count += int((is_phantom & (detections.score >= sure)).sum())
+            phantom_count += int((is_phantom & (detections.score >= phantom_score)).sum())
         if critical is not None and visible[critical]:
             critical_distance = float(np.linalg.norm(agent_positions[critical] - agent_positions[0]))
             distance_error = np.nan
@@ -156,25 +158,27 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
         metrics[f"target_recall_{band_start:.0f}_{band_end:.0f}"] = _mean(
             rows[(rows[:, 0] >= band_start) & (rows[:, 0] < band_end), 1]
         )
-    return metrics | _belief_metrics(trace, seen, critical) | track_metrics(trace, seen)
+    return metrics | _belief_metrics(trace, perceived, critical) | track_metrics(trace, perceived)
 
 
-def _burst(missed: Sequence[Bool]) -> float | None:
-    """Looks in a row that an object is missed, on average over all times that one is; `missed` [A] for each look."""
-    missed_table = np.array(missed, bool)
+def _burst(missed_by_look: Sequence[Bool]) -> float | None:
+    """Return the mean number of successive looks that miss an object; `missed_by_look` has [A] for each look."""
+    missed_table = np.array(missed_by_look, bool)
     if not missed_table.any():
         return None
     run_starts = missed_table & ~np.concatenate([np.zeros_like(missed_table[:1]), missed_table[:-1]])
     return float(missed_table.sum() / run_starts.sum())
 
 
-def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | None]:
+def track_metrics(trace: EpisodeTrace, perceived: Perceived) -> dict[str, float | None]:
     """HOTA, MOTA and IDF1 of what is believed against who is in view, within 2 m; None: nobody ever was.
 
     A track on somebody who is out of view, whom the driver may well remember, counts neither for nor against.
     """
-    frames, steps = [], _steps(trace, seen.known)
-    for (_, tracks), step, visible in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
+    frames, steps = [], _steps(trace, perceived.known)
+    for (_, tracks), step, visible in zip(
+        perceived.known, steps, in_view(trace, steps, perceived.cameras), strict=True
+    ):
         agent_positions = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
         similarity = similarity_of(agent_positions, tracks.place, 2.0 * NEAR)
         is_hidden = trace.active[step] & ~visible
@@ -192,12 +196,12 @@ def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | Non
     return {"HOTA": scores.hota, "MOTA": scores.mota, "IDF1": scores.idf1}
 
 
-def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, float | None]:
-    """How well stop signs were read on the frames of a drive; None where none stood before the ego.
+def sign_metrics(trace: EpisodeTrace, perceived: Perceived, signs: F64) -> dict[str, float | None]:
+    """Return metrics of the reading of stop signs in a drive; None without a sign before the ego.
 
     Args:
         trace: The drive.
-        seen: What was perceived in it.
+        perceived: What was perceived in it.
         signs: Where the stop signs stand that the route comes by, x, y [N, 2].
 
     Returns:
@@ -205,7 +209,7 @@ def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, 
         on: the same within a band of `SIGN_BANDS`. sign_read_at: m from the sign at which one was first read.
     """
     sign_looks: list[tuple[float, bool]] = []  # m to the sign ahead, whether it was read
-    for time, readings in seen.signs:
+    for time, readings in perceived.signs:
         step = min(round(time / trace.dt), len(trace.x) - 1)
         ego_position = np.array([trace.x[step, 0], trace.y[step, 0]], np.float64)
         yaw = float(trace.yaw[step, 0])
@@ -231,16 +235,16 @@ def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, 
     }
 
 
-def average_precision(looks: Sequence[tuple[F64, Bool, Objects | None]]) -> float | None:
+def average_precision(detections_by_look: Sequence[tuple[F64, Bool, Objects | None]]) -> float | None:
     """Return AP over looks, all kinds as one, the mean over nuScenes' four distances; None if nothing was in view.
 
     Detections of hidden agents count neither for nor against.
 
     Args:
-        looks: Positions of all agents [A, 2], which of them are in view [A], and the detections.
+        detections_by_look: Positions of all agents [A, 2], which of them are in view [A], and the detections.
     """
     truth_parts, detection_parts = [], []
-    for look_index, (agent_positions, visible, detections) in enumerate(looks):
+    for look_index, (agent_positions, visible, detections) in enumerate(detections_by_look):
         truth_parts.append(
             (np.full(int(visible.sum()), look_index), agent_positions[visible], np.full(int(visible.sum()), -1.0))
         )
@@ -259,12 +263,12 @@ def average_precision(looks: Sequence[tuple[F64, Bool, Objects | None]]) -> floa
     truth_table, detection_table = _table(truth_parts), _table(detection_parts)
     if not len(truth_table):
         return None
-    scores = match(truth_table, detection_table, samples=len(looks)).scores()
+    scores = match(truth_table, detection_table, samples=len(detections_by_look)).scores()
     return float(scores.mean_dist_aps["car"])
 
 
-def cause_of_collision(trace: EpisodeTrace, seen: Perceived) -> dict[str, Any] | None:
-    """What the object that was hit was to the driver in the three seconds before; None: there was no collision.
+def cause_of_collision(trace: EpisodeTrace, perceived: Perceived) -> dict[str, Any] | None:
+    """Return the perception of the struck object in the three seconds before a collision; None without one.
 
     Returns:
         cause: the commonest of `CAUSES` from 3 s to 0.5 s before the contact; of equal ones the worse. unknown_s: for
@@ -276,7 +280,7 @@ def cause_of_collision(trace: EpisodeTrace, seen: Perceived) -> dict[str, Any] |
     contact_step = int(contact_steps[0])
     agent = int(trace.contact_agent[contact_step])
     perception_states = [
-        _state(trace, step, agent, seen)
+        _state(trace, step, agent, perceived)
         for step in range(max(contact_step - round(BEFORE / trace.dt), 0), contact_step)
     ]
     if not perception_states:
@@ -286,9 +290,9 @@ def cause_of_collision(trace: EpisodeTrace, seen: Perceived) -> dict[str, Any] |
         unknown_steps += 1
     early_states = perception_states[: max(len(perception_states) - round(0.5 / trace.dt), 1)]
     shares = {name: early_states.count(name) / len(early_states) for name in CAUSES}
-    cause = max(CAUSES, key=lambda name: shares[name])
+    commonest_cause = max(CAUSES, key=lambda name: shares[name])
     return {
-        "cause": cause,
+        "cause": commonest_cause,
         "unknown_s": round(unknown_steps * trace.dt, 3),
         "shares": shares,
         "agent": trace.names[agent],
@@ -312,10 +316,10 @@ def hard_braking(trace: EpisodeTrace, limit: float = 4.0) -> int:
     return int((brakes_hard & ~np.concatenate([[False], brakes_hard[:-1]])).sum())
 
 
-def phantom_stop(trace: EpisodeTrace, seen: Perceived) -> float:
+def phantom_stop(trace: EpisodeTrace, perceived: Perceived) -> float:
     """Seconds that the ego stood (below 0.5 m/s) with something on the road ahead, within 20 m, that is not there."""
     standing_time = 0.0
-    for time, tracks in seen.known:
+    for time, tracks in perceived.known:
         step = min(round(time / trace.dt), len(trace.x) - 1)
         if trace.speed[step, 0] > 0.5 or not len(tracks):
             continue
@@ -331,9 +335,11 @@ def phantom_stop(trace: EpisodeTrace, seen: Perceived) -> float:
     return standing_time
 
 
-def _belief_metrics(trace: EpisodeTrace, seen: Perceived, target: int | None) -> dict[str, float | None]:
-    is_believed, track_ids, steps = [], [], _steps(trace, seen.known)
-    for (_, tracks), step, visible in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
+def _belief_metrics(trace: EpisodeTrace, perceived: Perceived, target: int | None) -> dict[str, float | None]:
+    is_believed, track_ids, steps = [], [], _steps(trace, perceived.known)
+    for (_, tracks), step, visible in zip(
+        perceived.known, steps, in_view(trace, steps, perceived.cameras), strict=True
+    ):
         if target is None or not visible[target]:
             continue
         distances = _gaps(tracks, trace, step, target)
@@ -344,15 +350,15 @@ def _belief_metrics(trace: EpisodeTrace, seen: Perceived, target: int | None) ->
     return {"believed": _mean(np.array(is_believed)), "switches": switches}
 
 
-def _state(trace: EpisodeTrace, step: int, agent: int, seen: Perceived) -> str:
-    """Which of `CAUSES` an agent is at a step."""
+def _state(trace: EpisodeTrace, step: int, agent: int, perceived: Perceived) -> str:
+    """Return the entry of `CAUSES` that holds for an agent at a step."""
     time = step * trace.dt
-    for record_time, tracks in seen.known:
+    for record_time, tracks in perceived.known:
         if abs(record_time - time) < 0.5 * trace.dt and _gaps(tracks, trace, step, agent).min(initial=np.inf) < NEAR:
             return "known"
-    if not in_view(trace, [step], seen.cameras)[0, agent]:
+    if not in_view(trace, [step], perceived.cameras)[0, agent]:
         return "hidden"
-    last_look = [detections for record_time, detections in seen.looks if record_time <= time + 0.5 * trace.dt][-1:]
+    last_look = [detections for record_time, detections in perceived.looks if record_time <= time + 0.5 * trace.dt][-1:]
     if not last_look or last_look[0] is None or not len(last_look[0]):
         return "missed"
     agent_position = np.array([trace.x[step, agent], trace.y[step, agent]])
@@ -368,11 +374,11 @@ def _mean(values: F64) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def _table(parts: Sequence[tuple[I64, F64, F64]]) -> BoxTable:
+def _table(objects_by_look: Sequence[tuple[I64, F64, F64]]) -> BoxTable:
     """Return boxes of one class, of which only the position counts."""
-    if not parts:
+    if not objects_by_look:
         return BoxTable.empty()
-    sample, positions, score = (np.concatenate(column) for column in zip(*parts, strict=True))
+    sample, positions, score = (np.concatenate(column) for column in zip(*objects_by_look, strict=True))
     table = BoxTable.empty(len(sample))
     table.sample[:], table.score[:] = sample, score
     table.centre[:, :2] = positions

@@ -11,7 +11,7 @@ from ssad.core.seeding import generator
 from ssad.metrics.uncertainty import NOTHING, Estimate
 
 REPLICATES = 2000
-LEAST = 5
+MIN_PAIRS = 5
 """With fewer families there is no interval; with fewer points that differ, no correlation."""
 
 
@@ -56,7 +56,7 @@ def family_correlation(first: Sequence[float], second: Sequence[float], families
     value = rank_correlation(first_values, second_values) if len(first_values) >= 3 else float("nan")
     if np.isnan(value):
         return NOTHING
-    if len(unique) < LEAST:
+    if len(unique) < MIN_PAIRS:
         return Estimate(value, float("nan"), float("nan"), len(first_values), 0, "none", len(unique))
     rows = [np.array([row for row, family_name in enumerate(names) if family_name == family]) for family in unique]
     random_source = generator("family correlation", len(first_values), len(unique))
@@ -64,5 +64,5 @@ def family_correlation(first: Sequence[float], second: Sequence[float], families
     for _ in range(REPLICATES):
         index = np.concatenate([rows[row] for row in random_source.integers(0, len(rows), len(rows))])
         replicates.append(rank_correlation(first_values[index], second_values[index]))
-    low, high = np.nanpercentile(replicates, [2.5, 97.5])
-    return Estimate(value, float(low), float(high), len(first_values), 0, "bootstrap", len(unique))
+    lower, upper = np.nanpercentile(replicates, [2.5, 97.5])
+    return Estimate(value, float(lower), float(upper), len(first_values), 0, "bootstrap", len(unique))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ssad.core.types import F64
 from ssad.metrics.intervals import LEVEL, Clusters, mean_limits
 
-_TAIL = 0.5 - 0.5 * LEVEL
+_TAIL_PROBABILITY = 0.5 - 0.5 * LEVEL
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,12 @@ class RareEstimate:
 
 
 def weighted_limits(
-    total: npt.ArrayLike, square: npt.ArrayLike, most: npt.ArrayLike, n: npt.ArrayLike, *, unlike: bool = False
+    total: npt.ArrayLike,
+    square: npt.ArrayLike,
+    max_weight: npt.ArrayLike,
+    n: npt.ArrayLike,
+    *,
+    unequal_weights: bool = False,
 ) -> tuple[F64, F64]:
     """95 % limits of a mean of n values that are 0 but for some rare events.
 
@@ -65,9 +70,9 @@ def weighted_limits(
     Args:
         total: [...] sum of the values.
         square: Sum of their squares.
-        most: The largest value that one more event could have; for weights, the largest weight seen or possible.
+        max_weight: The largest value that one more event could have; for weights, the largest weight seen or possible.
         n: How many values there are, zeros included.
-        unlike: Whether the values of the events differ.
+        unequal_weights: Whether the values of the events differ.
 
     Returns:
         Lower and upper limits of the mean.
@@ -78,56 +83,60 @@ def weighted_limits(
     """
     from scipy.special import gammainc
 
-    total, square, most, n = np.broadcast_arrays(
-        *(np.asarray(argument, np.float64) for argument in (total, square, most, n))
+    total, square, max_weight, n = np.broadcast_arrays(
+        *(np.asarray(argument, np.float64) for argument in (total, square, max_weight, n))
     )
     # Events that are not rare vary less than a Poisson number of them.
     variance = np.maximum(square - total**2 / n, 1e-9 * square)
     has_events = total > 0.0
     positive_total, positive_variance = np.where(has_events, total, 1.0), np.where(has_events, variance, 1.0)
-    total_plus_one, variance_plus_one = total + most, variance + most**2
+    total_plus_one, variance_plus_one = total + max_weight, variance + max_weight**2
 
-    def probability_below(x: F64, room: float) -> F64:
-        """Return the probability that the gamma variable is at most x, with one event more for the share `room`."""
-        lower = np.where(
+    def probability_below(x: F64, slack: float) -> F64:
+        """Return the probability that the gamma variable is at most x, with one event more for the share `slack`."""
+        lower_tail = np.where(
             has_events, gammainc(positive_total**2 / positive_variance, x * positive_total / positive_variance), 1.0
         )
         return np.asarray(
-            (1.0 - room) * lower
-            + room * gammainc(total_plus_one**2 / variance_plus_one, x * total_plus_one / variance_plus_one)
+            (1.0 - slack) * lower_tail
+            + slack * gammainc(total_plus_one**2 / variance_plus_one, x * total_plus_one / variance_plus_one)
         )
 
-    def quantile(share: float, room: float) -> F64:
-        low, high = np.zeros(total.shape), total_plus_one + 20.0 * np.sqrt(variance_plus_one) + 20.0 * most
+    def quantile(probability: float, slack: float) -> F64:
+        lower, upper = np.zeros(total.shape), total_plus_one + 20.0 * np.sqrt(variance_plus_one) + 20.0 * max_weight
         # Bisection works elementwise on arrays; 80 halvings exhaust float64.
         for _ in range(80):
-            midpoint = 0.5 * (low + high)
-            is_below = probability_below(midpoint, room) < share
-            low, high = np.where(is_below, midpoint, low), np.where(is_below, high, midpoint)
-        return np.asarray(0.5 * (low + high))
+            midpoint = 0.5 * (lower + upper)
+            is_below = probability_below(midpoint, slack) < probability
+            lower, upper = np.where(is_below, midpoint, lower), np.where(is_below, upper, midpoint)
+        return np.asarray(0.5 * (lower + upper))
 
-    low_room, high_room = (0.0, 1.0) if unlike else (0.5, 0.5)
-    return np.where(has_events, quantile(_TAIL, low_room), 0.0) / n, quantile(1.0 - _TAIL, high_room) / n
+    low_room, high_room = (0.0, 1.0) if unequal_weights else (0.5, 0.5)
+    return np.where(has_events, quantile(_TAIL_PROBABILITY, low_room), 0.0) / n, quantile(
+        1.0 - _TAIL_PROBABILITY, high_room
+    ) / n
 
 
-def weighted_estimate(values: F64, method: str, *, most: float, work: float, training: float = 0.0) -> RareEstimate:
+def weighted_estimate(
+    values: F64, method: str, *, max_weight: float, work: float, training: float = 0.0
+) -> RareEstimate:
     """The mean of the values of episodes, which are 0 where nothing happened.
 
     Args:
         values: [n] 0, or the weight of an episode that failed.
         method: How it was estimated.
-        most: The largest weight an episode could have.
+        max_weight: The largest weight an episode could have.
         work: Agent-steps simulated in all.
         training: Of those, for learning.
     """
     total, square = float(values.sum()), float((values**2).sum())
     # Without an event there is no observed weight, so the largest possible one bounds the interval.
-    largest_weight = float(values.max()) if total > 0.0 else most
-    low, high = weighted_limits(total, square, largest_weight, len(values), unlike=True)
+    largest_weight = float(values.max()) if total > 0.0 else max_weight
+    lower, upper = weighted_limits(total, square, largest_weight, len(values), unequal_weights=True)
     events = int((values > 0.0).sum())
     effective = total**2 / square if square > 0.0 else 0.0
     return RareEstimate(
-        total / len(values), float(low), float(high), method, len(values), events, effective, work, training
+        total / len(values), float(lower), float(upper), method, len(values), events, effective, work, training
     )
 
 
@@ -138,5 +147,5 @@ def repeated_estimate(values: Sequence[float], method: str, *, episodes: int, ev
     mean = float(estimates.mean())
     variance = float(estimates.var(ddof=1)) / len(estimates) if len(estimates) > 1 else math.nan
     effective = mean**2 / variance if variance > 0.0 else math.nan
-    low, high = max(float(limits.low), 0.0), float(limits.high)
-    return RareEstimate(mean, low, high, method, episodes, events, effective, work)
+    lower, upper = max(float(limits.low), 0.0), float(limits.high)
+    return RareEstimate(mean, lower, upper, method, episodes, events, effective, work)

@@ -50,13 +50,13 @@ FEATURES: Final[Mapping[str, Feature]] = {
 those with others than the ego, since a collision with the ego is what a generator is asked for."""
 
 
-def motion_features(trace: EpisodeTrace, agent: int, edge: F64) -> dict[str, F64]:
+def motion_features(trace: EpisodeTrace, agent: int, road_edge: F64) -> dict[str, F64]:
     """Return the features of one agent's motion.
 
     Args:
         trace: The trace of the episode.
         agent: The agent.
-        edge: [T] signed distance of its centre from the edge of the road, m, positive off the road.
+        road_edge: [T] signed distance of its centre from the edge of the road, m, positive off the road.
 
     Returns:
         Feature -> values, one for each step with the agent present and the feature defined; collision and
@@ -66,23 +66,23 @@ def motion_features(trace: EpisodeTrace, agent: int, edge: F64) -> dict[str, F64
     dt, body_boxes = float(trace.dt), boxes(trace)
     speed = trace.speed[active_steps, agent].astype(np.float64)
     yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[active_steps, agent].astype(np.float64)))) / dt
-    others = [other_agent for other_agent in range(len(trace.kind)) if other_agent != agent]
-    distances = np.full((len(active_steps), len(others)), np.inf)
-    collision_times = np.full((len(active_steps), len(others)), np.inf)
+    other_agents = [other_agent for other_agent in range(len(trace.kind)) if other_agent != agent]
+    distances = np.full((len(active_steps), len(other_agents)), np.inf)
+    collision_times = np.full((len(active_steps), len(other_agents)), np.inf)
     velocity = trace.speed[..., None] * np.stack([np.cos(trace.yaw), np.sin(trace.yaw)], -1)
-    for other_column, other in enumerate(others):
-        both_active = trace.active[active_steps, other]
+    for other_column, other_index in enumerate(other_agents):
+        both_active = trace.active[active_steps, other_index]
         rows = active_steps[both_active]
-        distances[both_active, other_column] = obb_distance(body_boxes[rows, agent], body_boxes[rows, other])
-        closing = (velocity[rows, agent] - velocity[rows, other]).astype(np.float64)
+        distances[both_active, other_column] = obb_distance(body_boxes[rows, agent], body_boxes[rows, other_index])
+        closing_velocity = (velocity[rows, agent] - velocity[rows, other_index]).astype(np.float64)
         collision_times[both_active, other_column] = time_to_collision(
-            body_boxes[rows, agent], body_boxes[rows, other], closing
+            body_boxes[rows, agent], body_boxes[rows, other_index], closing_velocity
         )
     nearest = distances.min(axis=1, initial=np.inf)
     # Agent 0 is left out: a collision with the ego is the goal of a generator.
     touched_agents = [
         other_agent
-        for other_column, other_agent in enumerate(others)
+        for other_column, other_agent in enumerate(other_agents)
         if other_agent != 0 and (distances[:, other_column] <= 0.0).any()
     ]
     return {
@@ -92,9 +92,9 @@ def motion_features(trace: EpisodeTrace, agent: int, edge: F64) -> dict[str, F64
         "yaw_acceleration": np.diff(yaw_rate) / dt,
         "nearest": nearest[np.isfinite(nearest)],
         "ttc": np.minimum(collision_times.min(axis=1, initial=np.inf), FEATURES["ttc"].high),
-        "road_edge": edge[active_steps],
+        "road_edge": road_edge[active_steps],
         "collision": np.array([float(bool(touched_agents))]),
-        "off_road": np.array([float((edge[active_steps] > 0.0).any())]),
+        "off_road": np.array([float((road_edge[active_steps] > 0.0).any())]),
     }
 
 
@@ -140,5 +140,5 @@ def wasserstein(motions: Mapping[str, F64], reference: Mapping[str, F64]) -> dic
 
 
 def _bin(values: F64, feature: Feature) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    share = (np.asarray(values, np.float64) - feature.low) / (feature.high - feature.low)
-    return np.clip(np.floor(share * feature.bins), 0, feature.bins - 1).astype(np.int64)
+    fraction = (np.asarray(values, np.float64) - feature.low) / (feature.high - feature.low)
+    return np.clip(np.floor(fraction * feature.bins), 0, feature.bins - 1).astype(np.int64)

@@ -36,8 +36,8 @@ def corruption_error(scores: Scores, baseline: Scores) -> dict[str, float]:
     names, values = _table(scores, "scores")
     baseline_names, baseline_values = _table(baseline, "baseline")
     if set(names) != set(baseline_names) or values.shape != baseline_values.shape:
-        different = ", ".join(sorted(set(names) ^ set(baseline_names))) or "the number of severities"
-        raise ConfigError(f"scores and baseline differ in: {different}; run both under the same shifts")
+        differing_names = ", ".join(sorted(set(names) ^ set(baseline_names))) or "the number of severities"
+        raise ConfigError(f"scores and baseline differ in: {differing_names}; run both under the same shifts")
     baseline_values = baseline_values[[baseline_names.index(name) for name in names]]
     error, baseline_error = (1.0 - values).sum(axis=1), (1.0 - baseline_values).sum(axis=1)
     if (baseline_error == 0.0).any():
@@ -70,17 +70,19 @@ def mean_resilience_rate(scores: Scores, clean: float) -> float:
     return math.fsum(resilience_rate(scores, clean).values()) / len(scores)
 
 
-def _table(scores: Scores, what: str) -> tuple[list[str], F64]:
+def _table(scores: Scores, table_name: str) -> tuple[list[str], F64]:
     """Names of the shifts and scores [C, S]. ConfigError: none, severities that differ in number, a missing value."""
     if not scores:
-        raise ConfigError(f"{what}: no shift is given")
+        raise ConfigError(f"{table_name}: no shift is given")
     names = list(scores)
     counts = {len(scores[name]) for name in names}
     if counts == {0} or len(counts) > 1:
         listed = ", ".join(f"{name}: {len(scores[name])}" for name in names)
-        raise ConfigError(f"{what}: every shift needs the same severities, but there are {listed}")
+        raise ConfigError(f"{table_name}: every shift needs the same severities, but there are {listed}")
     values = np.array([[math.nan if score is None else score for score in scores[name]] for name in names], np.float64)
     if np.isnan(values).any():
         row, column = np.argwhere(np.isnan(values))[0].tolist()
-        raise ConfigError(f"{what}: shift '{names[row]}' has no value at severity {column + 1}; run that cell first")
+        raise ConfigError(
+            f"{table_name}: shift '{names[row]}' has no value at severity {column + 1}; run that cell first"
+        )
     return names, values

@@ -20,15 +20,15 @@ from ssad.metrics.detection_boxes import I64
 from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, replicate_limits
 
 IOU = 0.5
-COVERED = 0.25  # share of the target from which on a box of any class says that something is there
+MIN_COVERED_SHARE = 0.25  # share of the target from which on a box of any class says that something is there
 PRECISIONS = {"AP50": (True, 0.0), "AP50_25": (True, 0.25), "AP50_all": (False, 0.0), "AP50_all_25": (False, 0.25)}
 THRESHOLD = 0.001  # least score of a box that AP counts
-TOGETHER = 16  # pictures that a GPU is shown at once; a processor takes one, whose bits depend on nothing else
+GPU_BATCH = 16  # pictures that a GPU is shown at once; a processor takes one, whose bits depend on nothing else
 CONFIDENCES = (0.25, 0.5)  # from which score on a box counts as a detection
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class TargetSighting:
     """Detections in one image of the target, as plain arrays.
 
     Attributes:
@@ -57,15 +57,15 @@ class Sighting:
         confidence_by_truth = np.zeros(len(self.real))
         for overlap, score in zip(_overlaps(self.box, self.real)[0], self.score.tolist(), strict=True):
             free_overlap = np.where(confidence_by_truth > 0.0, 0.0, overlap)
-            best = int(free_overlap.argmax())
-            if free_overlap[best] >= IOU:
-                confidence_by_truth[best] = score
+            best_index = int(free_overlap.argmax())
+            if free_overlap[best_index] >= IOU:
+                confidence_by_truth[best_index] = score
         return confidence_by_truth
 
 
-def _overlaps(box: F64, real: F64) -> tuple[F64, F64]:
+def _overlaps(box: F64, truth_boxes: F64) -> tuple[F64, F64]:
     """Return IoU [N, Q] of boxes [N, 4] and [Q, 4], and the share of the latter that the former cover [N, Q]."""
-    boxes, truth = box[:, None], real[None]
+    boxes, truth = box[:, None], truth_boxes[None]
     overlap_sides = np.minimum(boxes[..., 2:], truth[..., 2:]) - np.maximum(boxes[..., :2], truth[..., :2])
     intersection = np.where((overlap_sides > 0.0).all(-1), overlap_sides.prod(-1), 0.0)
     truth_area = (truth[..., 2:] - truth[..., :2]).prod(-1)
@@ -74,25 +74,27 @@ def _overlaps(box: F64, real: F64) -> tuple[F64, F64]:
     return intersection / np.maximum(union_area, 1e-9), intersection / np.maximum(truth_area, 1e-9)
 
 
-def _on_target(box: F64, score: F64, real: F64) -> float:
+def _on_target(box: F64, score: F64, truth_boxes: F64) -> float:
     """Return the best score of boxes [N, 4] that cover enough of the first true box [Q, 4] and find no other."""
-    overlap, covered = _overlaps(box, real)
+    overlap, covered_share = _overlaps(box, truth_boxes)
     other_overlap = overlap[:, 1:].max(1, initial=0.0)
-    is_on_target = (covered[:, 0] >= COVERED) & ((other_overlap < IOU) | (other_overlap < overlap[:, 0]))
+    is_on_target = (covered_share[:, 0] >= MIN_COVERED_SHARE) & (
+        (other_overlap < IOU) | (other_overlap < overlap[:, 0])
+    )
     return float(score[is_on_target].max(initial=0.0))
 
 
-def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
-    """What was found of the class of the target, the first object of the truth, and on it of any class."""
+def sighting(drive_name: str, detections: Detections, truth: Truth) -> TargetSighting:
+    """Return the detections of the target's class, and the best of any class on the target, the first true object."""
     target_label = int(truth.label[0])
-    is_own_class, is_same_class = (found.label == target_label).cpu(), (truth.label == target_label).cpu()
-    box, score = found.box.cpu().double().numpy(), found.score.cpu().double().numpy()
+    is_own_class, is_same_class = (detections.label == target_label).cpu(), (truth.label == target_label).cpu()
+    box, score = detections.box.cpu().double().numpy(), detections.score.cpu().double().numpy()
     truth_boxes = truth.box.cpu().double().numpy()
     crowd_flags = (
         np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
     )
-    return Sighting(
-        drive,
+    return TargetSighting(
+        drive_name,
         box[is_own_class.numpy()],
         score[is_own_class.numpy()],
         truth_boxes[is_same_class.numpy()],
@@ -101,8 +103,8 @@ def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
     )
 
 
-def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]]) -> Iterator[Sighting]:
-    """What a detector finds in pictures, one after another.
+def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]]) -> Iterator[TargetSighting]:
+    """Yield the detections of a detector in images, one image after another.
 
     Args:
         detector: Of a 3D detector the hulls of its boxes in the picture count.
@@ -112,7 +114,7 @@ def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]])
     remaining = iter(pictures)
     while views_batch := list(islice(remaining, 1)):
         if views_batch[0][1].is_cuda:
-            views_batch += islice(remaining, TOGETHER - 1)
+            views_batch += islice(remaining, GPU_BATCH - 1)
         drives, image_batch, truths = zip(*views_batch, strict=True)
         batch = torch.cat(image_batch)
         cameras = [truth.intrinsic for truth in truths if truth.intrinsic is not None and detector.task == "3d"]
@@ -124,7 +126,11 @@ def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]])
 
 
 def target_scores(
-    sightings: Sequence[Sighting], clean: Sequence[Sighting] | None = None, *, replicates: int = 100, seed: int = 0
+    sightings: Sequence[TargetSighting],
+    clean_sightings: Sequence[TargetSighting] | None = None,
+    *,
+    replicates: int = 100,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Scores of a set of pictures.
 
@@ -136,7 +142,7 @@ def target_scores(
 
     Args:
         sightings: With the attack.
-        clean: The same pictures without it; None for these themselves.
+        clean_sightings: The same pictures without it; None for these themselves.
         replicates: Of the bootstrap over drives, for the intervals of AP.
         seed: Of its draws.
 
@@ -150,18 +156,18 @@ def target_scores(
     intervals: dict[str, list[float] | None] = {}
     ap_replicates: dict[str, list[float]] = {}
     for name, (target_only, min_score) in PRECISIONS.items():
-        ap = metrics[name] = precision(sightings, target_only=target_only, least=min_score)
+        ap = metrics[name] = precision(sightings, target_only=target_only, min_score=min_score)
         if len(drives) >= MIN_CLUSTERS and replicates and ap is not None:
             rng = generator("target scores", seed, name)
             # Whole drives are drawn: images of one drive are too similar to count as independent.
             drive_draws = [rng.integers(len(drives), size=len(drives)) for _ in range(replicates)]
-            values = _precisions(sightings, drive_indices, drive_draws, target_only=target_only, least=min_score)
+            values = _precisions(sightings, drive_indices, drive_draws, target_only=target_only, min_score=min_score)
             variance = np.asarray(np.var(values, ddof=1))
             lower_limit, upper_limit = replicate_limits(np.asarray(ap), variance, len(drives), bounded=True)
             intervals[name] = [float(lower_limit), float(upper_limit)]
             ap_replicates[name] = [round(entry, 5) for entry in values]
     scores = [entry.confidences() for entry in sightings]
-    scores_before = scores if clean is None else [entry.confidences() for entry in clean]
+    scores_before = scores if clean_sightings is None else [entry.confidences() for entry in clean_sightings]
     target_scores_now, target_scores_before = (
         np.array([entry[0] for entry in scores]),
         np.array([entry[0] for entry in scores_before]),
@@ -172,11 +178,11 @@ def target_scores(
         metrics[f"found_{percent}"], intervals[f"found_{percent}"] = _share(
             is_found, np.ones(len(target_scores_now), bool), drive_indices
         )
-        if clean is not None:
+        if clean_sightings is not None:
             metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(
                 ~is_found, target_scores_before > confidence, drive_indices
             )
-    if clean is not None:
+    if clean_sightings is not None:
         min_score = CONFIDENCES[0]
         is_undetected = np.maximum(target_scores_now, [entry.any_class for entry in sightings]) <= min_score
         metrics["ASR_any_25"], intervals["ASR_any_25"] = _share(
@@ -199,26 +205,31 @@ def target_scores(
     }
 
 
-def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least: float = 0.0) -> float | None:
+def precision(sightings: Sequence[TargetSighting], *, target_only: bool = True, min_score: float = 0.0) -> float | None:
     """AP50 of boxes above a score: of the target alone (others count neither way), or of all vehicles of its class."""
-    truth, boxes = _tables(sightings, target_only=target_only, least=least)
-    ap = average_precision(truth, boxes, labels=1, threshold=IOU)[0]
-    return None if np.isnan(ap) else float(ap)
+    truth, boxes = _tables(sightings, target_only=target_only, min_score=min_score)
+    average_precision_value = average_precision(truth, boxes, labels=1, threshold=IOU)[0]
+    return None if np.isnan(average_precision_value) else float(average_precision_value)
 
 
 def _precisions(
-    sightings: Sequence[Sighting], of: I32, drawn: Iterable[I64], *, target_only: bool, least: float
+    sightings: Sequence[TargetSighting],
+    selected_images: I32,
+    drive_draws: Iterable[I64],
+    *,
+    target_only: bool,
+    min_score: float,
 ) -> list[float]:
     """`precision` of several draws of drives; what a box hits in its picture does not depend on the draw.
 
     Args:
         sightings: All pictures.
-        of: The drive of each [N].
-        drawn: Drives of each draw, some of them several times.
+        selected_images: The drive of each [N].
+        drive_draws: Drives of each draw, some of them several times.
         target_only: See `precision`.
-        least: See `precision`.
+        min_score: See `precision`.
     """
-    truth, detected = _tables(sightings, target_only=target_only, least=least)
+    truth, detected = _tables(sightings, target_only=target_only, min_score=min_score)
     matched = match_2d(truth, detected, labels=1, threshold=IOU)
     assert matched.row is not None
     assert detected.score is not None
@@ -226,25 +237,25 @@ def _precisions(
     rows, hits = matched.row[~matched.ignored], matched.hit[~matched.ignored]
     order = np.argsort(detected.image[rows], kind="stable")  # picture after picture, in each the best box first
     rows, hits = rows[order], hits[order]
-    drive_of_row = of[detected.image[rows]]
-    truth_counts = np.bincount(of[truth.image[~truth.ignore]], minlength=int(of.max()) + 1)
+    drive_of_row = selected_images[detected.image[rows]]
+    truth_counts = np.bincount(selected_images[truth.image[~truth.ignore]], minlength=int(selected_images.max()) + 1)
     rows_by_drive = [np.flatnonzero(drive_of_row == drive_index) for drive_index in range(len(truth_counts))]
     values = []
-    for drives in drawn:
-        drawn_rows = np.concatenate([rows_by_drive[drive_index] for drive_index in drives])
+    for drive_draw in drive_draws:
+        drawn_rows = np.concatenate([rows_by_drive[drive_index] for drive_index in drive_draw])
         drawn_rows = drawn_rows[np.argsort(-detected.score[rows[drawn_rows]], kind="stable")]
         no_flags = np.zeros(len(drawn_rows), np.bool_)
-        ranked = Matched2D(
-            no_flags.astype(np.int32), hits[drawn_rows], no_flags, np.array([truth_counts[drives].sum()])
+        resampled = Matched2D(
+            no_flags.astype(np.int32), hits[drawn_rows], no_flags, np.array([truth_counts[drive_draw].sum()])
         )
-        values.append(float(ranked.average_precision()[0]))
+        values.append(float(resampled.average_precision()[0]))
     return [value for value in values if not np.isnan(value)]
 
 
-def _tables(sightings: Sequence[Sighting], *, target_only: bool, least: float) -> tuple[Boxes2D, Boxes2D]:
+def _tables(sightings: Sequence[TargetSighting], *, target_only: bool, min_score: float) -> tuple[Boxes2D, Boxes2D]:
     """True and found boxes of pictures, for their AP."""
     ignored = []
-    own_boxes = [(entry.box[entry.score > least], entry.score[entry.score > least]) for entry in sightings]
+    own_boxes = [(entry.box[entry.score > min_score], entry.score[entry.score > min_score]) for entry in sightings]
     for entry in sightings:
         ignore_flags = entry.crowd.copy()
         # The target always counts, even if the recording marks it as crowd.
@@ -271,13 +282,13 @@ def _boxes(
     )
 
 
-def _share(event: Bool, counted: Bool, drive: I32) -> tuple[float | None, list[float] | None]:
+def _share(event: Bool, is_counted: Bool, drive: I32) -> tuple[float | None, list[float] | None]:
     """Share of the counted pictures with an event, and its interval from drives; None where nothing is counted."""
-    if not counted.any():
+    if not is_counted.any():
         return None, None
-    drives, drive_of_counted = np.unique(drive[counted], return_inverse=True)
+    drives, drive_of_counted = np.unique(drive[is_counted], return_inverse=True)
     drive_sizes = np.bincount(drive_of_counted).astype(np.float64)
-    event_sums: F64 = np.bincount(drive_of_counted, weights=event[counted].astype(np.float64)).astype(np.float64)
+    event_sums: F64 = np.bincount(drive_of_counted, weights=event[is_counted].astype(np.float64)).astype(np.float64)
     share = float(event_sums.sum() / drive_sizes.sum())
     if len(drives) < MIN_CLUSTERS:
         return share, None

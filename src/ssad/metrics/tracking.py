@@ -58,10 +58,10 @@ class TrackScores:
     switches: int
 
 
-def similarity_of(places: F64, tracks: F64, reach: float) -> F64:
-    """How well tracks [m, 2] lie on objects [n, 2] on the ground, [n, m]: 1 on the spot, falling to 0 at `reach` m."""
-    distance = np.linalg.norm(places[:, None] - tracks[None], axis=-1)
-    return np.asarray(np.maximum(1.0 - distance / reach, 0.0), np.float64)
+def similarity_of(positions: F64, tracks: F64, max_distance: float) -> F64:
+    """Return the similarity [n, m] of objects [n, 2] and tracks [m, 2]: 1 on the spot, 0 at `max_distance` m."""
+    distance = np.linalg.norm(positions[:, None] - tracks[None], axis=-1)
+    return np.asarray(np.maximum(1.0 - distance / max_distance, 0.0), np.float64)
 
 
 def track_scores(frames: Sequence[TrackedFrame]) -> TrackScores | None:
@@ -111,13 +111,13 @@ def _pairs(score: F64) -> tuple[I64, I64]:
 def _hota(frames: Sequence[TrackedFrame]) -> tuple[float, float, float]:
     """Means over `LEVELS` of HOTA, DetA and AssA."""
     objects, tracks = _counts(frames)
-    shared = np.zeros((len(objects), len(tracks)))
+    shared_similarity = np.zeros((len(objects), len(tracks)))
     for frame in frames:
         similarity = frame.similarity
         union = similarity.sum(0)[None] + similarity.sum(1)[:, None] - similarity
         share = np.divide(similarity, union, out=np.zeros_like(similarity), where=union > _EPS)
-        shared[np.ix_(frame.objects, frame.tracks)] += share
-    alignment = shared / (objects[:, None] + tracks[None] - shared)
+        shared_similarity[np.ix_(frame.objects, frame.tracks)] += share
+    alignment = shared_similarity / (objects[:, None] + tracks[None] - shared_similarity)
     matches = np.zeros((len(LEVELS), len(objects), len(tracks)))
     for frame in frames:
         rows, columns = _pairs(alignment[np.ix_(frame.objects, frame.tracks)] * frame.similarity)
@@ -157,8 +157,8 @@ def _clear(frames: Sequence[TrackedFrame]) -> tuple[float, int]:
 def _idf1(frames: Sequence[TrackedFrame]) -> float:
     """Return the F1 of identities: each object has at most one track over the whole sequence."""
     objects, tracks = _counts(frames)
-    shared = np.zeros((len(objects), len(tracks)))
+    shared_frames = np.zeros((len(objects), len(tracks)))
     for frame in frames:
-        shared[np.ix_(frame.objects, frame.tracks)] += frame.similarity >= ENOUGH
-    hits = float(shared[_pairs(shared)].sum())
+        shared_frames[np.ix_(frame.objects, frame.tracks)] += frame.similarity >= ENOUGH
+    hits = float(shared_frames[_pairs(shared_frames)].sum())
     return hits / max(0.5 * float(objects.sum() + tracks.sum()), 1.0)

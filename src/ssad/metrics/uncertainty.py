@@ -20,7 +20,7 @@ from ssad.core.types import F64
 from ssad.metrics.intervals import (
     MIN_CLUSTERS,
     Clusters,
-    Limits,
+    ConfidenceLimits,
     bounded_limits,
     mean_limits,
     replicate_limits,
@@ -77,14 +77,14 @@ class Estimate:
 
     def scaled(self, factor: float, offset: float = 0.0) -> Estimate:
         """Return the estimate of factor x value + offset."""
-        ends = sorted((factor * self.low + offset, factor * self.high + offset))
-        return replace(self, mean=factor * self.mean + offset, low=ends[0], high=ends[1])
+        limits = sorted((factor * self.low + offset, factor * self.high + offset))
+        return replace(self, mean=factor * self.mean + offset, low=limits[0], high=limits[1])
 
 
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
-def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, least: float = -math.inf) -> Estimate:
+def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, min_value: float = -math.inf) -> Estimate:
     """Mean of case values with its 95 % interval; with several strata, the unweighted mean of their means.
 
     Args:
@@ -93,34 +93,43 @@ def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, lea
             the lower limit and as 1 in the upper one, so the interval holds whatever it was. "bounded": values lie in
             [0, `scale`]. "mean": any values.
         scale: upper bound of a bounded value.
-        least: lower bound of a mean; the interval does not go below it.
+        min_value: lower bound of a mean; the interval does not go below it.
 
     Returns:
         The estimate. Fewer than five clusters, or clusters too alike for an interval: low and high are the range.
     """
-    distinct = _distinct(values)
-    failed = sum(case_value.failed for case_value in distinct)
-    counted = [
+    distinct_values = _distinct(values)
+    failed = sum(case_value.failed for case_value in distinct_values)
+    counted_values = [
         case_value
-        for case_value in distinct
+        for case_value in distinct_values
         if not math.isnan(case_value.value) or (case_value.failed and kind == "share")
     ]
-    if not counted:
+    if not counted_values:
         return replace(NOTHING, failed=failed)
-    clusters, cluster_index = _clusters(counted)
+    clusters, cluster_index = _clusters(counted_values)
     limits = []
-    has_unknown = any(math.isnan(case_value.value) for case_value in counted)
+    has_unknown = any(math.isnan(case_value.value) for case_value in counted_values)
     # Unknown outcomes: once all 0 for the mean and lower limit, once all 1 for the upper one.
-    for assumed in (0.0, 1.0) if has_unknown else (0.0,):
-        numbers = (
-            np.array([assumed if math.isnan(case_value.value) else case_value.value for case_value in counted]) / scale
+    for assumed_value in (0.0, 1.0) if has_unknown else (0.0,):
+        value_array = (
+            np.array(
+                [assumed_value if math.isnan(case_value.value) else case_value.value for case_value in counted_values]
+            )
+            / scale
         )
-        sums = np.bincount(cluster_index, numbers, len(clusters.size)).astype(np.float64)
-        limits.append(_ends(sums, clusters, kind, least / scale))
+        cluster_sums = np.bincount(cluster_index, value_array, len(clusters.size)).astype(np.float64)
+        limits.append(_ends(cluster_sums, clusters, kind, min_value / scale))
     mean, low, method = float(limits[0].mean), float(limits[0].low), limits[0].method
     high = float(limits[-1].high)
     return Estimate(
-        scale * mean, scale * min(low, mean), scale * max(high, mean), len(counted), failed, method, len(clusters.size)
+        scale * mean,
+        scale * min(low, mean),
+        scale * max(high, mean),
+        len(counted_values),
+        failed,
+        method,
+        len(clusters.size),
     )
 
 
@@ -140,8 +149,8 @@ def replicate_estimate(
     variance = float(defined.var(ddof=1)) if len(defined) > 1 else math.nan
     if clusters < MIN_CLUSTERS or math.isnan(value + variance) or not (bounded or min(value, variance) > 0.0):
         return Estimate(value, math.nan, math.nan, n, clusters=clusters)
-    low, high = replicate_limits(np.asarray(value), np.asarray(variance), clusters, bounded=bounded)
-    return Estimate(value, float(low), float(high), n, 0, "beta" if bounded else "t", clusters)
+    lower, upper = replicate_limits(np.asarray(value), np.asarray(variance), clusters, bounded=bounded)
+    return Estimate(value, float(lower), float(upper), n, 0, "beta" if bounded else "t", clusters)
 
 
 def replicate_difference(value: float, differences: Sequence[float], *, n: int, clusters: int) -> Estimate:
@@ -188,17 +197,30 @@ def paired_difference(
     only_first, only_second = (
         estimate([replace(pair, value=float(sign * pair.value > 0.0)) for pair in pairs], "share") for sign in (1, -1)
     )
-    p, q = only_first.mean, only_second.mean
+    first_share, second_share = only_first.mean, only_second.mean
     if not pairs or "beta" not in (only_first.method, only_second.method):
         return replace(estimate(pairs, "mean"), failed=missing)
-    correlation = 0.0 if p * q == 0.0 else -math.sqrt(p * q / ((1.0 - p) * (1.0 - q)))
+    correlation = (
+        0.0
+        if first_share * second_share == 0.0
+        else -math.sqrt(first_share * second_share / ((1.0 - first_share) * (1.0 - second_share)))
+    )
 
-    def margin(a: float, b: float) -> float:
-        return math.sqrt(max(a * a + b * b - 2.0 * correlation * a * b, 0.0))
+    def margin(first_margin: float, second_margin: float) -> float:
+        return math.sqrt(
+            max(
+                first_margin * first_margin
+                + second_margin * second_margin
+                - 2.0 * correlation * first_margin * second_margin,
+                0.0,
+            )
+        )
 
-    low = p - q - margin(p - only_first.low, only_second.high - q)
-    high = p - q + margin(only_first.high - p, q - only_second.low)
-    return replace(only_first, mean=p - q, low=max(low, -1.0), high=min(high, 1.0), failed=missing)
+    lower = first_share - second_share - margin(first_share - only_first.low, only_second.high - second_share)
+    upper = first_share - second_share + margin(only_first.high - first_share, second_share - only_second.low)
+    return replace(
+        only_first, mean=first_share - second_share, low=max(lower, -1.0), high=min(upper, 1.0), failed=missing
+    )
 
 
 def sign_flip_test(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, draws: int = 20_000) -> float:
@@ -221,19 +243,21 @@ def sign_flip_test(first: Mapping[str, CaseValue], second: Mapping[str, CaseValu
     pairs, _ = _pairs(first, second)
     if not pairs:
         return math.nan
-    distinct = _distinct(pairs)
-    _, cluster_index = _clusters(distinct)
-    sums = np.bincount(cluster_index, np.array([pair.value for pair in distinct]))
-    sums = sums[sums != 0.0]
-    if not len(sums):
+    distinct_pairs = _distinct(pairs)
+    _, cluster_index = _clusters(distinct_pairs)
+    cluster_sums = np.bincount(cluster_index, np.array([pair.value for pair in distinct_pairs]))
+    cluster_sums = cluster_sums[cluster_sums != 0.0]
+    if not len(cluster_sums):
         return 1.0
-    is_exact = len(sums) <= 14
+    is_exact = len(cluster_sums) <= 14
     if is_exact:
-        signs = 1.0 - 2.0 * ((np.arange(2 ** len(sums))[:, None] >> np.arange(len(sums))) & 1)
+        signs = 1.0 - 2.0 * ((np.arange(2 ** len(cluster_sums))[:, None] >> np.arange(len(cluster_sums))) & 1)
     else:
-        signs = generator("sign flip test", len(sums), draws).choice([-1.0, 1.0], size=(draws, len(sums)))
+        signs = generator("sign flip test", len(cluster_sums), draws).choice(
+            [-1.0, 1.0], size=(draws, len(cluster_sums))
+        )
     # The slack keeps ties that rounding would break.
-    as_large = int((np.abs(signs @ sums) >= np.abs(sums.sum()) * (1.0 - 1e-9)).sum())
+    as_large = int((np.abs(signs @ cluster_sums) >= np.abs(cluster_sums.sum()) * (1.0 - 1e-9)).sum())
     # Random draws leave out the observed signs, hence the 1.
     return as_large / len(signs) if is_exact else (as_large + 1) / (draws + 1)
 
@@ -285,17 +309,19 @@ def _clusters(values: Sequence[CaseValue]) -> tuple[Clusters, npt.NDArray[np.int
     return Clusters(size, np.array([strata[stratum] for stratum, _ in names])), cluster_index
 
 
-def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> Limits:
+def _ends(cluster_sums: F64, clusters: Clusters, kind: Kind, min_value: float) -> ConfidenceLimits:
     """The interval, or the range of the clusters' means where there is none; one cluster has neither."""
-    if len(sums) >= MIN_CLUSTERS:
+    if len(cluster_sums) >= MIN_CLUSTERS:
         if kind == "mean":
-            limits = mean_limits(sums, clusters)
+            limits = mean_limits(cluster_sums, clusters)
         else:
-            limits = bounded_limits(sums, clusters, cap=2.0 * clusters.size.sum() if kind == "share" else math.inf)
+            limits = bounded_limits(
+                cluster_sums, clusters, cap=2.0 * clusters.size.sum() if kind == "share" else math.inf
+            )
         if not math.isnan(float(limits.low)):
-            return replace(limits, low=np.maximum(limits.low, least))
-    means = sums / clusters.size
+            return replace(limits, low=np.maximum(limits.low, min_value))
+    means = cluster_sums / clusters.size
     mean = np.asarray(means @ clusters.weight)
     if len(means) == 1:
-        return Limits(mean, np.asarray(math.nan), np.asarray(math.nan), "none")
-    return Limits(mean, means.min(), means.max(), "range")
+        return ConfidenceLimits(mean, np.asarray(math.nan), np.asarray(math.nan), "none")
+    return ConfidenceLimits(mean, means.min(), means.max(), "range")

@@ -9,7 +9,17 @@ import numpy as np
 from ssad.core.errors import ConfigError, MapError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario, SignalPlan
+from ssad.core.types import (
+    Controller,
+    Episode,
+    EpisodeAgent,
+    EpisodeLimits,
+    LaneType,
+    Pose,
+    Route,
+    Scenario,
+    SignalPlan,
+)
 from ssad.rendering.scene_objects import thin_shares
 from ssad.rendering.street import STYLES, Street, build_street, cached_street
 from ssad.scenarios.dynamic.episode import forced_signals
@@ -17,12 +27,12 @@ from ssad.scenarios.dynamic.knowledge.natural_junction import fits
 from ssad.world.models import model
 from ssad.world.roads.router import random_route
 
-NEAR = 120.0  # m from the ego's way within which traffic starts
-WAY = 260.0  # m of the ego's way that counts for this: what is driven in 30 s
-MOST = 44  # vehicles
+TRAFFIC_RANGE = 120.0  # m from the ego's way within which traffic starts
+ROUTE_RANGE = 260.0  # m of the ego's way that counts for this: what is driven in 30 s
+MAX_VEHICLES = 44  # vehicles
 TOWN_SPEED = 12.0  # m/s that a driver who wants the most drives in town
 FAST = 21.0  # m/s: on roads with a higher limit everybody wants to drive faster in proportion
-TRIES = 8  # ways that are tried for a long vehicle, whose nose must stay in its lane
+ROUTE_TRIES = 8  # ways that are tried for a long vehicle, whose nose must stay in its lane
 # body -> share; long vehicles and two-wheelers are more frequent than on real roads, so that each class is seen
 MIX = {
     "car": 0.25,
@@ -74,12 +84,12 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
     lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0) & (graph.length > 25.0))
     if not len(lanes):
         raise MapError(f"town '{graph.name}' has no driving lane of 25 m or more; nothing can be recorded there")
-    route = _way(graph, lanes, rng)
+    route = _long_route(graph, lanes, rng)
     ego_speed = float(rng.uniform(7, 10)) * _haste(route)
     ego = EpisodeAgent("ego", "car", Controller.EXTERNAL, _pose(route), target_speed=ego_speed, route=route)
     agents = [ego]
     # Route points are 1 m apart; every fifth is enough to measure distances of 120 m.
-    route_points = route.xy[: int(WAY) : 5]
+    route_points = route.xy[: int(ROUTE_RANGE) : 5]
     density = float(rng.uniform(0.25, 0.8))
     start_places = [
         (int(lane), float(distance))
@@ -87,16 +97,16 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
         for distance in np.arange(6.0 + rng.uniform(0, 8), float(graph.length[lane]) - 6.0, 15.0)
     ]
     for place_index in rng.permutation(len(start_places)).tolist():
-        if len(agents) > MOST:
+        if len(agents) > MAX_VEHICLES:
             break
         lane, distance = start_places[place_index]
         x, y, yaw, _ = graph.at(lane, distance)
         # Free places are drawn in random order with a density per drive, so that traffic varies.
-        if np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() > NEAR or rng.random() > density:
+        if np.hypot(route_points[:, 0] - x, route_points[:, 1] - y).min() > TRAFFIC_RANGE or rng.random() > density:
             continue
         body = str(rng.choice(list(body_shares), p=list(body_shares.values())))
         agent_route = random_route(graph, lane, distance, 400.0, rng)
-        for _ in range(TRIES):
+        for _ in range(ROUTE_TRIES):
             if fits(body, agent_route):
                 break
             agent_route = random_route(graph, lane, distance, 400.0, rng)
@@ -106,12 +116,13 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
             body = "motorcycle"  # nobody cycles on a motorway
         clearance = 0.5 * model(body).length + 4.0
         if any(
-            math.hypot(other.pose.x - x, other.pose.y - y) < clearance + 0.5 * model(other.model).length
-            for other in agents
+            math.hypot(other_agent.pose.x - x, other_agent.pose.y - y)
+            < clearance + 0.5 * model(other_agent.model).length
+            for other_agent in agents
         ):
             continue
         desired_speed = 5.0 if body == "bicycle" else float(rng.uniform(5.5, 11.0)) * _haste(agent_route)
-        limit = float(graph.speed_limit[lane])
+        speed_limit = float(graph.speed_limit[lane])
         pose = Pose(x, y, yaw)
         agents.append(
             EpisodeAgent(
@@ -119,32 +130,32 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
                 body,
                 Controller.AUTOPILOT,
                 pose,
-                min(desired_speed, limit) * 0.6,
-                min(desired_speed, limit),
+                min(desired_speed, speed_limit) * 0.6,
+                min(desired_speed, speed_limit),
                 route=agent_route,
             )
         )
     drive_name = "/".join(str(piece) for piece in key)
     end_poses = (agents[0].pose, Pose(float(route.xy[-1, 0]), float(route.xy[-1, 1]), float(route.yaw[-1])))
     steps = math.ceil(seconds / 0.1) + 2
-    limits = Limits(max_steps=steps, max_time=2 * seconds + 60)
+    limits = EpisodeLimits(max_steps=steps, max_time=2 * seconds + 60)
     scenario = Scenario(f"drive/{drive_name}", "Custom", graph.name, end_poses, limits=limits)
     signals = forced_signals(graph, route, SignalPlan(ego="green", others="green", until=1e6), whole_town=True)
     return Episode(f"drive/{graph.name}/{drive_name}", scenario, graph.name, tuple(agents), signals, 1e6, limits)
 
 
-def _way(graph: LaneGraph, lanes: np.ndarray, draws: np.random.Generator) -> Route:
+def _long_route(graph: LaneGraph, lanes: np.ndarray, draws: np.random.Generator) -> Route:
     """The longest of a few random ways."""
-    longest: Route | None = None
+    longest_route: Route | None = None
     for _ in range(8):
         lane = int(draws.choice(lanes))
         candidate = random_route(graph, lane, float(draws.uniform(4.0, 20.0)), 400.0, draws)
-        if longest is None or candidate.length > longest.length:
-            longest = candidate
-        if longest.length > 395.0:
+        if longest_route is None or candidate.length > longest_route.length:
+            longest_route = candidate
+        if longest_route.length > 395.0:
             break
-    assert longest is not None
-    return longest
+    assert longest_route is not None
+    return longest_route
 
 
 def _haste(route: Route) -> float:

@@ -49,8 +49,8 @@ HELD_OUT: Final = ("Oldmarket", "Larkhill")
 WEATHERS: Final = ("day", "overcast", "low", "fog", "wet", "night")
 KEY: Final = 5  # steps of the world (0.1 s) from one key frame to the next
 START: Final = 1_600_000_000_000_000  # us
-REACH: Final = 80.0  # m within which things are annotated
-DRAWN: Final = 140.0  # m within which things are drawn
+ANNOTATION_RANGE: Final = 80.0  # m within which things are annotated
+RENDER_RANGE: Final = 140.0  # m within which things are drawn
 # s by which each camera fires before the LiDAR's sweep ends, as in nuScenes
 AHEAD: Final = {
     "CAM_FRONT_LEFT": 0.0431,
@@ -60,8 +60,8 @@ AHEAD: Final = {
     "CAM_BACK": 0.0104,
     "CAM_BACK_LEFT": 0.0005,
 }
-FIRST: Final = 0.1  # s, when the first sweep ends
-SHARED: Final = 4  # drives along one street where each street is built for the recording
+FIRST_SWEEP_END: Final = 0.1  # s, when the first sweep ends
+DRIVES_PER_STREET: Final = 4  # drives along one street where each street is built for the recording
 GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 
@@ -163,9 +163,9 @@ def depth_bytes(depth: Any) -> bytes:
     return bytes(cv2.imencode(".png", codes, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
 
 
-def attributes_of(who: PlacedObject) -> tuple[str, ...]:
+def attributes_of(placed_object: PlacedObject) -> tuple[str, ...]:
     """The nuScenes attributes of a body at a moment."""
-    body, moving = who.body, who.speed > 0.3
+    body, moving = placed_object.body, placed_object.speed > 0.3
     if body.kind == "pedestrian":
         return ("pedestrian.moving",) if moving else ("pedestrian.standing",)
     if body.kind in ("motorcycle", "bicycle"):
@@ -216,7 +216,7 @@ def _scene(recording: Recording, town: str, number: int) -> None:
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
     graph = load_town(town)
-    street = _street(town, recording.streets, (recording.seed, town, number // SHARED))
+    street = _street(town, recording.streets, (recording.seed, town, number // DRIVES_PER_STREET))
     # The last sweep ends 0.1 s after the last step, and interpolation needs one more.
     seconds, streets = recording.seconds + 0.2, recording.streets
     episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
@@ -241,10 +241,10 @@ def _scene(recording: Recording, town: str, number: int) -> None:
         moments = [
             _Moment.of(step, population, trace, cameras, weather, key) for step in steps[start : start + steps_per_call]
         ]
-        for moment, shares in _look(scene, moments, files, number, together=recording.device != "cpu"):
+        for moment, shares in _look(scene, moments, files, number, batched=recording.device != "cpu"):
             sweep_end = moment.now
             ego = ego_at(trace, sweep_end)
-            surrounding = population.at(sweep_end, ego[:2, 3], DRAWN)
+            surrounding = population.at(sweep_end, ego[:2, 3], RENDER_RANGE)
             points, _ = sweep(
                 scene, HDL32E, ego, [placed.scene_object for placed in surrounding], key=("lidar", *key, moment.step)
             )
@@ -264,13 +264,15 @@ def _scene(recording: Recording, town: str, number: int) -> None:
     parts.finish(name, part_page)
 
 
-def _meshes_near(cast: SceneObjects, trace: EpisodeTrace, steps: Sequence[int]) -> set[int]:
+def _meshes_near(population: SceneObjects, trace: EpisodeTrace, steps: Sequence[int]) -> set[int]:
     """The meshes of all that is drawn at these steps."""
     mesh_indices = set()
     for step in steps:
-        sweep_end = FIRST + step * trace.dt
-        for time in [sweep_end, *(sweep_end - lead for lead in AHEAD.values())]:
-            mesh_indices |= {placed.scene_object.mesh for placed in cast.at(time, ego_at(trace, time)[:2, 3], DRAWN)}
+        sweep_end = FIRST_SWEEP_END + step * trace.dt
+        for time in [sweep_end, *(sweep_end - lead_time for lead_time in AHEAD.values())]:
+            mesh_indices |= {
+                placed.scene_object.mesh for placed in population.at(time, ego_at(trace, time)[:2, 3], RENDER_RANGE)
+            }
     return mesh_indices
 
 
@@ -300,20 +302,22 @@ class _Moment:
     @staticmethod
     def of(  # noqa: PLR0917
         step: int,
-        cast: SceneObjects,
+        population: SceneObjects,
         trace: EpisodeTrace,
         cameras: list[Camera],
         weather: SceneWeather,
         key: tuple[object, ...],
     ) -> _Moment:
         """Each camera at its own time; the first sweep ends when every camera has fired."""
-        sweep_end = FIRST + step * trace.dt
+        sweep_end = FIRST_SWEEP_END + step * trace.dt
         views, times, egos = [], [], []
         for camera_index, camera in enumerate(cameras):
             exposure_time = sweep_end - AHEAD[camera.channel]
             # The ego moves between the exposures of two cameras, as in nuScenes.
             ego = ego_at(trace, exposure_time)
-            scene_objects = tuple(placed.scene_object for placed in cast.at(exposure_time, ego[:2, 3], DRAWN))
+            scene_objects = tuple(
+                placed.scene_object for placed in population.at(exposure_time, ego[:2, 3], RENDER_RANGE)
+            )
             noise_seed = int(digest("noise", *key, step, camera_index)[:7], 16)
             lamps = own_lamps(ego, weather)
             views.append(View(camera, ego @ camera.to_ego, scene_objects, weather, SENSOR, noise_seed, lamps))
@@ -323,7 +327,7 @@ class _Moment:
 
 
 def _look(
-    stage: RenderScene, moments: Sequence[_Moment], files: _Files, number: int, *, together: bool
+    stage: RenderScene, moments: Sequence[_Moment], files: _Files, number: int, *, batched: bool
 ) -> Iterator[tuple[_Moment, dict[int, float]]]:
     """Render and write the pictures of some moments, all of them in one call or one by one.
 
@@ -332,7 +336,7 @@ def _look(
     """
     camera_moments = [(moment, camera_index) for moment in moments for camera_index in range(len(moment.views))]
     largest_shares: list[dict[int, float]] = [{} for _ in moments]
-    views_per_call = len(camera_moments) if together else 1
+    views_per_call = len(camera_moments) if batched else 1
     for start in range(0, len(camera_moments), views_per_call):
         batch = camera_moments[start : start + views_per_call]
         rendering = render(stage, [moment.views[camera_index] for moment, camera_index in batch], linear=False)
@@ -356,9 +360,9 @@ def _look(
     yield from zip(moments, largest_shares, strict=True)
 
 
-def moment_of(number: int, time: float) -> int:
-    """Return the time stamp in us of a moment of scene `number`."""
-    return START + number * 100_000_000 + round(time * 1e6)
+def moment_of(sweep_number: int, time: float) -> int:
+    """Return the time stamp in us of a moment of scene `sweep_number`."""
+    return START + sweep_number * 100_000_000 + round(time * 1e6)
 
 
 def drive(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
@@ -413,24 +417,26 @@ class _Files:
         self.rows.append({"file": name} | row)
 
 
-def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[int, float]) -> list[dict[str, Any]]:
+def _annotate(
+    nearby_objects: list[PlacedObject], ego: F64, points: Any, shares: dict[int, float]
+) -> list[dict[str, Any]]:
     """Boxes of what nuScenes has a category for, within reach and seen by a camera or hit by the LiDAR."""
-    nearby = [
+    annotated_objects = [
         placed
-        for placed in around
-        if placed.body.kind in BODY_CATEGORIES and np.hypot(*(placed.pose[:2, 3] - ego[:2, 3])) < REACH
+        for placed in nearby_objects
+        if placed.body.kind in BODY_CATEGORIES and np.hypot(*(placed.pose[:2, 3] - ego[:2, 3])) < ANNOTATION_RANGE
     ]
-    if not nearby:
+    if not annotated_objects:
         return []
-    centre = np.array([placed.pose[:3, 3] + [0, 0, placed.body.size[2] / 2] for placed in nearby])
-    size_lwh = np.array([placed.body.size for placed in nearby])
-    rotation = matrix_to_quaternion([placed.pose[:3, :3] for placed in nearby])
+    centre = np.array([placed.pose[:3, 3] + [0, 0, placed.body.size[2] / 2] for placed in annotated_objects])
+    size_lwh = np.array([placed.body.size for placed in annotated_objects])
+    rotation = matrix_to_quaternion([placed.pose[:3, :3] for placed in annotated_objects])
     boxes = WorldBoxes(centre, size_lwh, rotation, np.zeros_like(centre))
     pose = ego @ HDL32E.to_ego
     world_points = np.asarray(points[:, :3], np.float64) @ pose[:3, :3].T + pose[:3, 3]
     point_counts, size = points_in_boxes(world_points, boxes), boxes.size_wlh
     annotation_rows = []
-    for row, placed_object in enumerate(nearby):
+    for row, placed_object in enumerate(annotated_objects):
         share = shares.get(placed_object.body.tag, 0.0)
         if point_counts[row] or share > 0:
             annotation_rows.append(
@@ -477,7 +483,7 @@ def record_nuscenes(
         StoreError: The folder holds something else, or scenes failed.
     """
     out = recording.out
-    scenes_per_task = SHARED if recording.streets == "any" else 1
+    scenes_per_task = DRIVES_PER_STREET if recording.streets == "any" else 1
     tasks = [
         (recording, town, range(first_scene, min(first_scene + scenes_per_task, recording.scenes)))
         for town in recording.towns

@@ -71,18 +71,18 @@ from ssad.world.roads import load_town
 
 CLASSES: Final = (*MMDET3D_CLASSES, *PLAIN_CLASSES)  # category ids are 1 and more in this order
 EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there
-DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes other cells than it should
-TRIES: Final = (3, 6, 12, 24)  # places tried for one view of an orbit in each turn of one drive
+MAX_DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes other cells than it should
+PLACE_TRIES: Final = (3, 6, 12, 24)  # places tried for one view of an orbit in each turn of one drive
 TARGETS: Final = 5  # bodies that an orbit shows in turn
 SECONDS: Final = 24.0  # of a drive
 TARGET: Final = 1_000_000  # its tag
 HIDDEN: Final = 0.25  # visible share below which an object is crowd, as one with a side below SMALL
-SEEN: Final = 0.6  # least visible share of the target, and least share of it inside the picture
-NEAR: Final = 0.2  # largest share of the picture that something right before the camera may cover
+MIN_VISIBLE_SHARE: Final = 0.6  # least visible share of the target, and least share of it inside the picture
+MAX_NEAR_SHARE: Final = 0.2  # largest share of the picture that something right before the camera may cover
 
 
 @dataclass(frozen=True, slots=True)
-class _Set:
+class _StageSet:
     """A drive to take images of.
 
     Attributes:
@@ -104,7 +104,7 @@ class _Set:
     places: tuple[Place, ...] = ()
 
 
-def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
+def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _StageSet:
     graph = load_town(town)
     street = drive_street(graph, clips.streets, key=("clips", *key))
     trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
@@ -115,37 +115,39 @@ def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
         route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
         free_ground = GroundOccupancy(street)
         occupy_standing(population, free_ground)
-        free = free_places(graph, route_points, free_ground, key=("target", *key))
-        places = tuple((*place, plate_height(targets[0])) for place in free)
+        free_spots = free_places(graph, route_points, free_ground, key=("target", *key))
+        places = tuple((*place, plate_height(targets[0])) for place in free_spots)
     elif clips.target is not None:
-        targets = (_named(population, clips.target),)
+        targets = (_body_of_target(population, clips.target),)
     else:
         target_count = TARGETS if clips.mode == "orbit" else 1
-        targets = tuple(_drawn(population, generator("clips target", *key, index)) for index in range(target_count))
-    return _Set(
+        targets = tuple(
+            _draw_target(population, generator("clips target", *key, index)) for index in range(target_count)
+        )
+    return _StageSet(
         clips, key, trace, population, RenderScene(street, population.meshes, device=clips.device), targets, places
     )
 
 
-def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
+def _draw_target(population: SceneObjects, rng: np.random.Generator) -> ObjectBody:
     """Some car in the place of the ego, with its mesh in the cast."""
-    style = draw_style("car", generator=draws)
-    full_size = draw_size("car", style, generator=draws)
+    style = draw_style("car", generator=rng)
+    full_size = draw_size("car", style, generator=rng)
     # The car plays the ego of the drive, so its footprint is bounded.
     size = min(full_size[0], 4.9), min(full_size[1], 2.06), full_size[2]
-    mesh = cast.meshes.add(make_body("car", style=style, size=size, generator=draws))
-    return _body(mesh, style, size, draw_paint(draws))
+    mesh = population.meshes.add(make_body("car", style=style, size=size, generator=rng))
+    return _body(mesh, style, size, draw_paint(rng))
 
 
-def _named(cast: SceneObjects, target: TargetCar | TargetWalker) -> ObjectBody:
+def _body_of_target(population: SceneObjects, target: TargetCar | TargetWalker) -> ObjectBody:
     """The target in the place of the ego, with its mesh in the cast."""
-    body = _body(cast.meshes.add(target.mesh()), target.style, target.full_size, target.colour)
+    body = _body(population.meshes.add(target.mesh()), target.style, target.full_size, target.colour)
     return replace(body, kind=class_of_target(target))
 
 
-def _sign(cast: SceneObjects, target: TargetSign) -> ObjectBody:
+def _sign(population: SceneObjects, target: TargetSign) -> ObjectBody:
     """The target sign: its plate, which is labelled, and its post."""
-    meshes = tuple(cast.meshes.add(piece) for piece in plate_and_post(target.mesh()))
+    meshes = tuple(population.meshes.add(mesh) for mesh in plate_and_post(target.mesh()))
     size, static_track = target.full_size, (np.zeros((1, 4)), np.ones(1, bool), np.zeros(1))
     return ObjectBody(TARGET, target.kind, target.style, size, (0.5, 0.5, 0.5), meshes, *static_track)
 
@@ -165,20 +167,22 @@ def batch_size(device: str) -> int:
 
 
 def _rounds(
-    made: _Set, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
+    stage_set: _StageSet, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
 ) -> Iterator[list[tuple[int, Viewpoint]]]:
     """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
-    recording, key = made.clips, made.key
+    recording, key = stage_set.clips, stage_set.key
     rng = generator("clips shots", *key)
     if recording.mode == "drive":
         weather = draw_weather(("clips", *key))
         remaining = iter(
-            follow(made.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), draws=rng)
+            follow(
+                stage_set.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), rng=rng
+            )
         )
         while batch := list(zip(missing(), remaining, strict=False)):
             yield batch
         return
-    if isinstance(recording.target, TargetSign) and not made.places:
+    if isinstance(recording.target, TargetSign) and not stage_set.places:
         return
     grid = list(product(recording.distances, recording.azimuths, recording.elevations, recording.weathers or ("",)))
     cell_indices = turn_of(slots, len(grid), key=(recording.seed, town))
@@ -186,20 +190,23 @@ def _rounds(
         # Some cells have no free view in a town; random cells keep the recording from stalling.
         cell_indices = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
     # low things before a sign hide little of it
-    height = made.places[0][4] if made.places else 2 * AIM
-    for turn, attempts in enumerate(TRIES):
+    height = stage_set.places[0][4] if stage_set.places else 2 * AIM
+    for turn, attempts in enumerate(PLACE_TRIES):
         proposals: list[tuple[int, Viewpoint]] = []
         for index in missing():
             *cell, weather_kind = grid[cell_indices[index]]
             weather = draw_weather(("clips", *key, turn, index), weather_kind)
             if isinstance(recording.target, TargetSign):
-                seconds = (len(made.trace.x) - 1) * made.trace.dt
-                views = orbit_sign(made.places, seconds, weather, (cell[0], cell[1]), rng)
+                seconds = (len(stage_set.trace.x) - 1) * stage_set.trace.dt
+                views = orbit_sign(stage_set.places, seconds, weather, (cell[0], cell[1]), rng)
             else:
-                views = orbit(made.trace, weather, (cell[0], cell[1], cell[2]), rng)
+                views = orbit(stage_set.trace, weather, (cell[0], cell[1], cell[2]), rng)
             proposals += [(index, viewpoint) for viewpoint in islice(views, attempts)]
         sight_free = free_sight(
-            made.stage, [viewpoint for _, viewpoint in proposals], at_once=batch_size(recording.device), height=height
+            stage_set.stage,
+            [viewpoint for _, viewpoint in proposals],
+            batch=batch_size(recording.device),
+            height=height,
         )
         # Reversed, so that the first free proposal of each image wins.
         first_free = dict(reversed([pair for pair, is_free in zip(proposals, sight_free, strict=True) if is_free]))
@@ -228,16 +235,16 @@ def _part(task: tuple[Clips, str, int, int, str]) -> str:
     def missing() -> list[int]:
         return [index for index in range(count) if index not in rows]
 
-    for attempt in range(DRIVES):
-        prepared = _prepare(recording, town, (recording.seed, recording.mode, town, number, attempt))
-        for viewpoints in _rounds(prepared, town, slots, attempt, missing):
-            for image_index, row, image in _take(prepared, viewpoints, skipped):
+    for attempt in range(MAX_DRIVES):
+        stage_set = _prepare(recording, town, (recording.seed, recording.mode, town, number, attempt))
+        for viewpoints in _rounds(stage_set, town, slots, attempt, missing):
+            for image_index, row, image in _accept_views(stage_set, viewpoints, skipped):
                 file = f"{name}-{image_index:03d}.jpg"
                 safeio.write_atomic(recording.out / "images" / file, encode_jpeg(image, recording.quality, "420"))
                 base_row = {
                     "file_name": file,
                     "town": town,
-                    "drive": prepared.trace.key,
+                    "drive": stage_set.trace.key,
                     "part": number,
                     "attempt": attempt,
                 }
@@ -250,33 +257,33 @@ def _part(task: tuple[Clips, str, int, int, str]) -> str:
             or "the drives are too short"
         )
         raise ConfigError(
-            f"{town}: {len(rows)} of {count} pictures in {DRIVES} drives ({reasons}); choose smaller distances"
+            f"{town}: {len(rows)} of {count} pictures in {MAX_DRIVES} drives ({reasons}); choose smaller distances"
         )
     parts.finish(name, {"images": [rows[image_index] for image_index in range(count)], "skipped": skipped})
     return name
 
 
-def _take(
-    made: _Set, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
+def _accept_views(
+    stage_set: _StageSet, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
 ) -> Iterator[tuple[int, dict[str, Any], U8]]:
     """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
-    recording = made.clips
+    recording = stage_set.clips
     camera = _camera(recording.size)
     candidates: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
     for slot, viewpoint in shots:
-        target = made.targets[slot % len(made.targets)]
-        surrounding = made.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+        target = stage_set.targets[slot % len(stage_set.targets)]
+        surrounding = stage_set.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
         if not has_room(target, viewpoint, surrounding):
             skipped["crowded"] += 1
             continue
-        view = _view(made, slot, viewpoint, surrounding, camera)
+        view = _view(stage_set, slot, viewpoint, surrounding, camera)
         surrounding.append(PlacedObject(target, viewpoint.target, 0.0, view.objects[0]))
         candidates.append((slot, viewpoint, view, surrounding))
-    size = batch_size(recording.device)
-    for start in range(0, len(candidates), size):
-        rendering = render(made.stage, [view for _, _, view, _ in candidates[start : start + size]], linear=False)
-        for index, (slot, viewpoint, view, surrounding) in enumerate(candidates[start : start + size]):
-            objects, reject_reason = _annotate(made.stage, view, rendering, index, surrounding)
+    batch = batch_size(recording.device)
+    for start in range(0, len(candidates), batch):
+        rendering = render(stage_set.stage, [view for _, _, view, _ in candidates[start : start + batch]], linear=False)
+        for index, (slot, viewpoint, view, surrounding) in enumerate(candidates[start : start + batch]):
+            objects, reject_reason = _annotate(stage_set.stage, view, rendering, index, surrounding)
             if reject_reason:
                 skipped[reject_reason] += 1
                 continue
@@ -304,53 +311,58 @@ def label_of(kind: str) -> int | None:
     return CLASSES.index(class_of(kind)) if kind in BODY_CATEGORIES else None
 
 
-def faces(sign: F64, eye: F64) -> bool:
-    """Whether the front of a sign of pose [4, 4] can be read from a place [3]: not from behind or far from aside."""
-    ahead, left, _ = sign[:3, :3].T @ (eye - sign[:3, 3])
-    return bool(abs(np.degrees(np.arctan2(left, ahead))) < BEHIND)
+def faces(sign: F64, viewer: F64) -> bool:
+    """Return whether the front of a sign of pose [4, 4] can be read from a position [3]: not from behind or aside."""
+    forward, left, _ = sign[:3, :3].T @ (viewer - sign[:3, 3])
+    return bool(abs(np.degrees(np.arctan2(left, forward))) < BEHIND)
 
 
 def _camera(size: int) -> Camera:
-    middle, focal = size / 2, FOCAL * size
-    return Camera(size, size, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]))
+    centre, focal = size / 2, FOCAL * size
+    return Camera(size, size, np.array([[focal, 0, centre], [0, focal, centre], [0, 0, 1.0]]))
 
 
-def _view(made: _Set, n: int, shot: Viewpoint, around: Sequence[PlacedObject], camera: Camera) -> View:
+def _view(
+    stage_set: _StageSet, n: int, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject], camera: Camera
+) -> View:
     """View `n` of a part: the target first, then who else is there."""
-    target = made.targets[n % len(made.targets)]
-    target_object = SceneObject(target.meshes[0], shot.target, target.paint, TARGET)
-    noise_seed = int(digest("clips noise", *made.key, n)[:7], 16)
-    lamps = own_lamps(_follower(shot), shot.weather) if made.clips.mode == "drive" else ()
-    focus = float(shot.target[0, 3]), float(shot.target[1, 3])
-    other_parts = (SceneObject(mesh, shot.target, target.paint) for mesh in target.meshes[1:])
-    scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in around))
-    return View(camera, shot.camera, scene_objects, shot.weather, SENSOR, noise_seed, lamps, focus)
+    target = stage_set.targets[n % len(stage_set.targets)]
+    target_object = SceneObject(target.meshes[0], viewpoint.target, target.paint, TARGET)
+    noise_seed = int(digest("clips noise", *stage_set.key, n)[:7], 16)
+    lamps = own_lamps(_follower(viewpoint), viewpoint.weather) if stage_set.clips.mode == "drive" else ()
+    focus_point = float(viewpoint.target[0, 3]), float(viewpoint.target[1, 3])
+    other_parts = (SceneObject(mesh, viewpoint.target, target.paint) for mesh in target.meshes[1:])
+    scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in nearby_objects))
+    return View(camera, viewpoint.camera, scene_objects, viewpoint.weather, SENSOR, noise_seed, lamps, focus_point)
 
 
-def _follower(shot: Viewpoint) -> F64:
+def _follower(viewpoint: Viewpoint) -> F64:
     """The vehicle [4, 4] that carries the following camera, which is 2 m behind its nose."""
-    eye, forward = shot.camera[:3, 3], shot.camera[:3, 2]
-    pose = upright_pose(float(eye[0]), float(eye[1]), float(np.arctan2(forward[1], forward[0])))
+    camera_position, forward = viewpoint.camera[:3, 3], viewpoint.camera[:3, 2]
+    pose = upright_pose(float(camera_position[0]), float(camera_position[1]), float(np.arctan2(forward[1], forward[0])))
     return pose @ upright_pose(2.0 - NOSE, 0.0, 0.0)
 
 
 def _annotate(
-    stage: RenderScene, view: View, picture: Rendering, index: int, around: Sequence[PlacedObject]
+    stage: RenderScene, view: View, picture: Rendering, index: int, nearby_objects: Sequence[PlacedObject]
 ) -> tuple[list[dict[str, Any]], str]:
-    """What is seen in a picture, the target among it; and why the picture is of no use (else '')."""
+    """Return the annotation of an image, and the reason why the image is of no use ("" if it is of use)."""
     labels = label_picture(stage, view, picture, index)
-    placed_by_tag = {placed.body.tag: placed for placed in around}
+    placed_by_tag = {placed.body.tag: placed for placed in nearby_objects}
     is_target = labels.tag == TARGET
     extents = labels.box[:, 2:] - labels.box[:, :2]
-    if not is_target.any() or labels.share[is_target][0] < SEEN:
+    if not is_target.any() or labels.share[is_target][0] < MIN_VISIBLE_SHARE:
         return [], "hidden"
-    if labels.inside[is_target][0] < SEEN or extents[is_target].min() < SMALL:
+    if labels.inside[is_target][0] < MIN_VISIBLE_SHARE or extents[is_target].min() < SMALL:
         return [], "cut or small"
     target_distance = float(np.linalg.norm(placed_by_tag[TARGET].pose[:3, 3] - view.pose[:3, 3]))
     # A wall or post right before the camera leaves too little of the street to see.
-    if near_share(view, picture.depth[index], picture.tag[index], within=max(2.0, target_distance / 3)) > NEAR:
+    if (
+        near_share(view, picture.depth[index], picture.tag[index], max_distance=max(2.0, target_distance / 3))
+        > MAX_NEAR_SHARE
+    ):
         return [], "blocked"
-    crowd = (extents.min(1) < SMALL) | (labels.share < HIDDEN)
+    is_crowd = (extents.min(1) < SMALL) | (labels.share < HIDDEN)
     objects = []
     for row, tag in enumerate(labels.tag.tolist()):
         placed_object = placed_by_tag[tag]
@@ -358,7 +370,7 @@ def _annotate(
         if label is not None:
             centre_height = placed_object.body.size[2] / 2
             if placed_object.body.kind in PLAIN_CLASSES:
-                crowd[row] |= not faces(placed_object.pose, view.pose[:3, 3])
+                is_crowd[row] |= not faces(placed_object.pose, view.pose[:3, 3])
                 centre_height = plate_height(placed_object.body)
             middle = placed_object.pose[:3, 3] + [0.0, 0.0, centre_height]
             x1, y1, x2, y2 = _hull(view, placed_object.pose, placed_object.body.size).tolist()
@@ -367,7 +379,7 @@ def _annotate(
                     "label": label,
                     "box": labels.box[row].tolist(),
                     "pixels": int(labels.pixels[row]),
-                    "crowd": bool(crowd[row]),
+                    "crowd": bool(is_crowd[row]),
                     "target": tag == TARGET,
                     "hull": [x1, y1, x2 - x1, y2 - y1],
                     "visible": round(float(labels.share[row]), 3),
@@ -442,9 +454,9 @@ def record_all(
 
 def _check_other(clips: Clips) -> None:
     """StoreError: the folder holds another recording."""
-    finished = clips.out / "annotations" / "all.json"
-    if finished.is_file() and not clips.parts.claimed:
-        data = safeio.read_json(finished)
+    annotations_file = clips.out / "annotations" / "all.json"
+    if annotations_file.is_file() and not clips.parts.claimed:
+        data = safeio.read_json(annotations_file)
         info = data.get("info") if isinstance(data, dict) else None
         if not isinstance(info, dict) or not same_request(info.get("recording"), clips.identity()):
             raise StoreError(f"{clips.out}: holds another recording; choose another folder")
@@ -497,12 +509,12 @@ class ClipView:
     view: View
     objects: tuple[Mapping[str, Any], ...]
 
-    def wearing(self, *shown: TextureLayer | TextureDecal) -> View:
+    def wearing(self, *edits: TextureLayer | TextureDecal) -> View:
         """The view with layers on the target, and with decals, given in the target's frame, around it."""
         target, *other_objects = self.view.objects
-        layers = tuple(layer for layer in shown if isinstance(layer, TextureLayer))
+        layers = tuple(layer for layer in edits if isinstance(layer, TextureLayer))
         decals = tuple(
-            replace(layer, pose=target.pose @ layer.pose) for layer in shown if isinstance(layer, TextureDecal)
+            replace(layer, pose=target.pose @ layer.pose) for layer in edits if isinstance(layer, TextureDecal)
         )
         textured_target = replace(target, layers=layers)
         return replace(self.view, objects=(textured_target, *other_objects), decals=(*self.view.decals, *decals))
@@ -533,7 +545,7 @@ def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ..
 
 
 def recording_of(folder: Path, split: str = "all") -> dict[str, Any]:
-    """What was recorded (see `Clips.identity`).
+    """Return the description of a recording (see `Clips.identity`).
 
     Raises:
         FormatError: No recording.
@@ -550,7 +562,7 @@ def clip_views(
     *,
     split: str = "all",
     device: str = "cpu",
-    only: Collection[str] | None = None,
+    selected_keys: Collection[str] | None = None,
     hour: Callable[[SceneWeather, float], SceneWeather] = lambda weather, heading: weather,
     stages: dict[Any, Any] | None = None,
 ) -> Iterator[ClipView]:
@@ -562,7 +574,7 @@ def clip_views(
         folder: What `record_clips` wrote.
         split: train, test or all.
         device: Where to render.
-        only: Names of the files that are wanted; None for all.
+        selected_keys: Names of the files that are wanted; None for all.
         hour: The weather to show instead of the recorded one, from that and the heading of the target, rad.
         stages: Where all scenes are kept for another call; None: they are let go one after the other.
 
@@ -573,9 +585,9 @@ def clip_views(
     rows = clip_rows(folder, split)
     try:
         recording = _clips_of(recording_of(folder, split), folder, device)
-        prepared_drives: dict[tuple[object, ...], _Set] = {} if stages is None else stages
+        prepared_drives: dict[tuple[object, ...], _StageSet] = {} if stages is None else stages
         for row, objects in rows:
-            if only is not None and row["file_name"] not in only:
+            if selected_keys is not None and row["file_name"] not in selected_keys:
                 continue
             key = (recording.seed, recording.mode, row["town"], row["part"], row["attempt"])
             if key not in prepared_drives:
@@ -586,20 +598,20 @@ def clip_views(
                         if other_key[:-1] == key[:-1]
                     }
                 prepared_drives[key] = _prepare(recording, row["town"], key)
-            prepared = prepared_drives[key]
+            stage_set = prepared_drives[key]
             target_pose = np.array(row["target_pose"])
             weather = hour(SceneWeather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
-            surrounding = prepared.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
-            view = _view(prepared, row["slot"], viewpoint, surrounding, _camera(recording.size))
-            yield ClipView(row["file_name"], row, prepared.stage, view, objects)
+            surrounding = stage_set.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+            view = _view(stage_set, row["slot"], viewpoint, surrounding, _camera(recording.size))
+            yield ClipView(row["file_name"], row, stage_set.stage, view, objects)
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
 
 
 def _unknown(path: Path, error: Exception) -> FormatError:
-    cause = f"({type(error).__name__}: {error})"
-    return FormatError(f"{path}: not the clips of this version {cause}; record them again")
+    error_text = f"({type(error).__name__}: {error})"
+    return FormatError(f"{path}: not the clips of this version {error_text}; record them again")
 
 
 def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:

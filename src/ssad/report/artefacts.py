@@ -37,12 +37,12 @@ def check_artefacts(folder: Path | str) -> list[str]:
 def artefact_problems(run: Run) -> list[str]:
     """Return `check_artefacts` of a loaded run."""
     problems: dict[str, str] = {}
-    checked: set[str] = set()
+    checked_paths: set[str] = set()
     for line in run.lines:
         hashes: Mapping[str, str] = line.get("hashes") or {}
         for path in [*_paths(line.get("artefacts") or {}), *hashes]:
-            if path not in checked:
-                checked.add(path)
+            if path not in checked_paths:
+                checked_paths.add(path)
                 expected_hash = run.episodes.get(line["key"], {}).get("trace_hash", "") if path.endswith(".npz") else ""
                 problem = _problem(run.folder, path, hashes.get(path, ""), expected_hash)
                 if problem:

@@ -11,10 +11,18 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
-from ssad.metrics import METRICS, CaseValue, Estimate, Outcome, paired_difference, replicate_difference, sign_flip_test
+from ssad.metrics import (
+    METRICS,
+    CaseValue,
+    EpisodeOutcome,
+    Estimate,
+    paired_difference,
+    replicate_difference,
+    sign_flip_test,
+)
 from ssad.report.load import Run, load_run
 from ssad.report.pages import render
-from ssad.report.tables import METHODS, Cell, Row, Table, write_tables
+from ssad.report.tables import METHODS, Table, TableCell, TableRow, write_tables
 
 SHOWN = ("CR", "OR", "DR", "RC", "DS")
 EVERYTHING = "all"
@@ -100,11 +108,11 @@ def compare_runs(folders: Sequence[Path]) -> list[Comparison]:
         raise ConfigError("compare needs at least two results folders, such as: ssad compare runs/a runs/b")
     labels = _labels(folders)
     runs = [ComparedRun(label, load_run(folder)) for label, folder in zip(labels, folders, strict=True)]
-    for other in runs[1:]:
-        if other.run.kind != runs[0].run.kind:
-            kinds = f"{runs[0].run.kind} and {other.run.kind}"
-            raise ConfigError(f"{other.run.folder}: runs of different kinds cannot be compared ({kinds})")
-    return [_compare(runs[0], other, number) for number, other in enumerate(runs[1:], 1)]
+    for compared_run in runs[1:]:
+        if compared_run.run.kind != runs[0].run.kind:
+            kinds = f"{runs[0].run.kind} and {compared_run.run.kind}"
+            raise ConfigError(f"{compared_run.run.folder}: runs of different kinds cannot be compared ({kinds})")
+    return [_compare(runs[0], compared_run, number) for number, compared_run in enumerate(runs[1:], 1)]
 
 
 def write_comparison(folders: Sequence[Path], out: Path) -> tuple[Path, list[Comparison]]:
@@ -141,26 +149,29 @@ def _labels(folders: Sequence[Path]) -> list[str]:
 
 def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison:
     pairs = _subject_pairs(first, second)
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     verdicts: list[str] = []
-    equal = both = 0
-    unshared = [0, 0]
+    equal = shared_count = 0
+    unshared_counts = [0, 0]
     for first_subject, second_subject in pairs:
         first_lines = {name: line for (subject, name), line in first.lines.items() if subject == first_subject}
         second_lines = {name: line for (subject, name), line in second.lines.items() if subject == second_subject}
-        shared = [name for name in first_lines if name in second_lines]
-        both += len(shared)
-        unshared = [unshared[0] + len(first_lines) - len(shared), unshared[1] + len(second_lines) - len(shared)]
-        equal += sum(_equal(_metrics(first_lines[name]), _metrics(second_lines[name])) for name in shared)
+        shared_names = [name for name in first_lines if name in second_lines]
+        shared_count += len(shared_names)
+        unshared_counts = [
+            unshared_counts[0] + len(first_lines) - len(shared_names),
+            unshared_counts[1] + len(second_lines) - len(shared_names),
+        ]
+        equal += sum(_equal(_metrics(first_lines[name]), _metrics(second_lines[name])) for name in shared_names)
         title = first_subject if first_subject == second_subject else f"{first_subject} → {second_subject}"
         verdicts += [
-            f"{title}/{name}: {change}"
-            for name in shared
-            if (change := _verdict(first_lines[name], second_lines[name]))
+            f"{title}/{name}: {verdict_change}"
+            for name in shared_names
+            if (verdict_change := _verdict(first_lines[name], second_lines[name]))
         ]
-        if shared:
+        if shared_names:
             rows += _rows(first.run, second.run, title, first_lines, second_lines)
-    if not both:
+    if not shared_count:
         raise ConfigError(f"{second.run.folder}: it shares no cell with {first.run.folder}; run the same suite twice")
     note = (
         f"Difference: {second.label} minus {first.label}, over the cells that both have. p: how often chance alone "
@@ -185,39 +196,43 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
         verdicts=tuple(verdicts),
         findings=tuple(_findings(table)),
         equal=equal,
-        both=both,
-        only=(unshared[0], unshared[1]),
+        both=shared_count,
+        only=(unshared_counts[0], unshared_counts[1]),
         left_out=tuple(sorted(left_out)),
     )
 
 
 def _findings(table: Table) -> Iterator[str]:
     """Yield sentences about the differences that remain significant after Holm's correction at 5 %."""
-    tested = [row for row in table.rows if not math.isnan(row.cells[-1].mean)]
-    tested.sort(key=lambda row: row.cells[-1].mean)
+    tested_rows = [row for row in table.rows if not math.isnan(row.cells[-1].mean)]
+    tested_rows.sort(key=lambda row: row.cells[-1].mean)
     changes_by_subject: dict[str, list[str]] = {}
-    for rank, row in enumerate(tested):
+    for rank, row in enumerate(tested_rows):
         first_cell, second_cell, difference, p_value = row.cells
         # Holm: the k-th smallest p-value is compared with 5 % over the number of tests that are left.
-        if p_value.mean > 0.05 / (len(tested) - rank):
+        if p_value.mean > 0.05 / (len(tested_rows) - rank):
             break
         quantity = " ".join(name for name in row.head[1:] if name != EVERYTHING)
-        change = f"{difference.text} {difference.interval}".strip()
+        change_text = f"{difference.text} {difference.interval}".strip()
         changes_by_subject.setdefault(row.head[0], []).append(
-            f"{quantity} {first_cell.text} → {second_cell.text} ({change})"
+            f"{quantity} {first_cell.text} → {second_cell.text} ({change_text})"
         )
     for subject, changes in changes_by_subject.items():
         remainder = f" and {len(changes) - 4} more" if len(changes) > 4 else ""
         yield f"{subject}: {', '.join(changes[:4])}{remainder}: more than chance alone makes."
-    if not tested:
+    if not tested_rows:
         yield "There is too little data to tell a difference from chance."
     elif not changes_by_subject:
         yield "No difference is larger than chance alone makes."
 
 
-def _equal(own: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    shared = {name for name in own.keys() & other.keys() if own[name] is not None and other[name] is not None}
-    return bool(shared) and all(own[name] == other[name] for name in shared)
+def _equal(first_line: Mapping[str, Any], second_line: Mapping[str, Any]) -> bool:
+    shared_fields = {
+        name
+        for name in first_line.keys() & second_line.keys()
+        if first_line[name] is not None and second_line[name] is not None
+    }
+    return bool(shared_fields) and all(first_line[name] == second_line[name] for name in shared_fields)
 
 
 def _heads(run: Run) -> tuple[str, str]:
@@ -227,9 +242,9 @@ def _heads(run: Run) -> tuple[str, str]:
 
 def _subject_pairs(first: ComparedRun, second: ComparedRun) -> list[tuple[str, str]]:
     """Return the pairs of subjects of the first and the second run that are compared."""
-    shared = [name for name in first.subjects if name in second.subjects]
-    if shared:
-        return [(name, name) for name in shared]
+    shared_subjects = [name for name in first.subjects if name in second.subjects]
+    if shared_subjects:
+        return [(name, name) for name in shared_subjects]
     if len(first.subjects) == len(second.subjects) == 1:
         return [(first.subjects[0], second.subjects[0])]
     raise ConfigError(
@@ -240,7 +255,7 @@ def _subject_pairs(first: ComparedRun, second: ComparedRun) -> list[tuple[str, s
 
 def _rows(
     first: Run, second: Run, title: str, own: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
-) -> Iterator[Row]:
+) -> Iterator[TableRow]:
     """Yield the differences of one subject: of all shared cells if the metrics are means, then of each group."""
     if first.kind == "driving":
         groups = {EVERYTHING: list(own)} | {
@@ -248,12 +263,12 @@ def _rows(
             for group in dict.fromkeys(line["group"] for line in own.values())
         }
         for group, names in groups.items():
-            first_lines, second_lines = (
+            first_group_lines, second_group_lines = (
                 {cell_name: lines[cell_name] for cell_name in names if cell_name in lines} for lines in (own, other)
             )
-            if set(first_lines) & set(second_lines):
+            if set(first_group_lines) & set(second_group_lines):
                 for symbol in SHOWN:
-                    yield _driving_row(title, group, symbol, first_lines, second_lines)
+                    yield _driving_row(title, group, symbol, first_group_lines, second_group_lines)
         return
     same_seed = first.suite.get("seed") == second.suite.get("seed")
     for name in own:
@@ -263,27 +278,39 @@ def _rows(
 
 
 def _driving_row(
-    title: str, group: str, symbol: str, own: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
-) -> Row:
+    title: str,
+    group: str,
+    symbol: str,
+    first_lines: Mapping[str, Mapping[str, Any]],
+    second_lines: Mapping[str, Mapping[str, Any]],
+) -> TableRow:
     metric = METRICS[symbol]
     kind = "share" if metric.kind == "share" else "mean"
-    values = [{name: _case(line, metric.field, kind) for name, line in lines.items()} for lines in (own, other)]
-    shared = set(own) & set(other)
-    measured = [
-        name for name in shared if not any(cases[name].failed or math.isnan(cases[name].value) for cases in values)
+    values = [
+        {name: _case(line, metric.field, kind) for name, line in lines.items()} for lines in (first_lines, second_lines)
+    ]
+    shared_names = set(first_lines) & set(second_lines)
+    measured_names = [
+        name
+        for name in shared_names
+        if not any(cases[name].failed or math.isnan(cases[name].value) for cases in values)
     ]
     difference = paired_difference(values[1], values[0], kind=kind)  # type: ignore[arg-type]
-    test = Cell(sign_flip_test(values[1], values[0]), digits=4)
+    p_value = TableCell(sign_flip_test(values[1], values[0]), digits=4)
     means = [
-        Cell(math.fsum(cases[name].value for name in measured) / len(measured) if measured else math.nan)
+        TableCell(
+            math.fsum(cases[name].value for name in measured_names) / len(measured_names)
+            if measured_names
+            else math.nan
+        )
         for cases in values
     ]
-    return Row((title, group, symbol), (*means, Cell.of(difference), test))
+    return TableRow((title, group, symbol), (*means, TableCell.of(difference), p_value))
 
 
 def _case(line: Mapping[str, Any], field: str, kind: str) -> CaseValue:
     """Return the value of a line in a metric; failed episodes have none, since a pair needs two that ran."""
-    outcome = Outcome.from_record(line)
+    outcome = EpisodeOutcome.from_record(line)
     number = None if outcome.metrics is None else getattr(outcome.metrics, field)
     value = math.nan if number is None else float(number)
     if kind == "share" and not math.isnan(value):
@@ -292,18 +319,18 @@ def _case(line: Mapping[str, Any], field: str, kind: str) -> CaseValue:
 
 
 def _score_row(
-    title: str, name: str, metric: str, own: Mapping[str, Any], other: Mapping[str, Any], *, paired: bool
-) -> Row:
+    title: str, name: str, metric: str, first_lines: Mapping[str, Any], second_lines: Mapping[str, Any], *, paired: bool
+) -> TableRow:
     """A score in each run; the interval of the difference where both resampled the same scenes in the same way."""
-    first_score, second_score = float(own["metrics"][metric]), float(other["metrics"][metric])
-    replicates = [(line.get("replicates") or {}).get(metric) or [] for line in (own, other)]
-    scenes, other_scenes = (int(line.get("scenes") or line.get("drives") or 0) for line in (own, other))
-    difference = Estimate(second_score - first_score, math.nan, math.nan, int(own.get("n", 1)), clusters=scenes)
+    first_score, second_score = float(first_lines["metrics"][metric]), float(second_lines["metrics"][metric])
+    replicates = [(line.get("replicates") or {}).get(metric) or [] for line in (first_lines, second_lines)]
+    scenes, other_scenes = (int(line.get("scenes") or line.get("drives") or 0) for line in (first_lines, second_lines))
+    difference = Estimate(second_score - first_score, math.nan, math.nan, int(first_lines.get("n", 1)), clusters=scenes)
     p_value = math.nan
     if (
         paired
         and scenes == other_scenes
-        and own.get("n") == other.get("n")
+        and first_lines.get("n") == second_lines.get("n")
         and len(replicates[0]) == len(replicates[1])
     ):
         difference, p_value = _replicate_difference(
@@ -311,25 +338,26 @@ def _score_row(
             [second_draw - first_draw for first_draw, second_draw in zip(*replicates, strict=True)],
             difference,
         )
-    return Row(
-        (title, name, metric), (Cell(first_score), Cell(second_score), Cell.of(difference), Cell(p_value, digits=4))
+    return TableRow(
+        (title, name, metric),
+        (TableCell(first_score), TableCell(second_score), TableCell.of(difference), TableCell(p_value, digits=4)),
     )
 
 
-def _replicate_difference(value: float, draws: Sequence[float], bare: Estimate) -> tuple[Estimate, float]:
+def _replicate_difference(value: float, replicates: Sequence[float], bare_estimate: Estimate) -> tuple[Estimate, float]:
     """Interval and p-value of a difference of scores in [0, 1]; its limits are those of (1 + difference) / 2."""
-    difference = replicate_difference(value, draws, n=bare.n, clusters=bare.clusters)
-    finite = [draw for draw in draws if not math.isnan(draw)]
+    difference = replicate_difference(value, replicates, n=bare_estimate.n, clusters=bare_estimate.clusters)
+    finite = [replicate for replicate in replicates if not math.isnan(replicate)]
     if math.isnan(difference.low) or not finite:
-        return bare, math.nan
-    smaller_tail = min(sum(draw <= 0.0 for draw in finite), sum(draw >= 0.0 for draw in finite))
+        return bare_estimate, math.nan
+    smaller_tail = min(sum(replicate <= 0.0 for replicate in finite), sum(replicate >= 0.0 for replicate in finite))
     # Two-sided; plus one, so that a finite number of draws never gives p = 0.
     return difference, min(2.0 * (smaller_tail + 1) / (len(finite) + 1), 1.0)
 
 
-def _common_metrics(run: Run, own: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+def _common_metrics(run: Run, first_lines: Mapping[str, Any], second_lines: Mapping[str, Any]) -> list[str]:
     """Return the metrics that both lines have a number for, in the order of the kind's columns."""
-    first_metrics, second_metrics = _metrics(own), _metrics(other)
+    first_metrics, second_metrics = _metrics(first_lines), _metrics(second_lines)
     columns = [str(column["name"]) for column in run.header.get("columns") or []] or list(first_metrics)
     return [
         name
@@ -342,9 +370,9 @@ def _metrics(line: Mapping[str, Any]) -> Mapping[str, Any]:
     return line.get("metrics") or {} if line["status"] == "ok" else {}
 
 
-def _verdict(own: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+def _verdict(first_line: Mapping[str, Any], second_line: Mapping[str, Any]) -> str:
     """Return how a cell's outcome changed: whether it ran, whether it collided; empty if it did not."""
-    states = [_state(line) for line in (own, other)]
+    states = [_state(line) for line in (first_line, second_line)]
     return "" if states[0] == states[1] else f"{states[0]} before, {states[1]} now"
 
 
@@ -363,14 +391,14 @@ def _changes(first: Run, second: Run) -> Iterator[str]:
         yield from _differences(name, first.header.get(name), second.header.get(name))
 
 
-def _differences(name: str, a: Any, b: Any) -> Iterator[str]:
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
-        for key in sorted(set(a) | set(b)):
-            yield from _differences(f"{name}.{key}", a.get(key), b.get(key))
-    elif a != b:
-        yield f"{name}: {_short(a)} → {_short(b)}"
+def _differences(name: str, first: Any, second: Any) -> Iterator[str]:
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        for key in sorted(set(first) | set(second)):
+            yield from _differences(f"{name}.{key}", first.get(key), second.get(key))
+    elif first != second:
+        yield f"{name}: {_short(first)} → {_short(second)}"
 
 
 def _short(value: Any) -> str:
-    text = "nothing" if value is None else str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    value_text = "nothing" if value is None else str(value)
+    return value_text if len(value_text) <= 60 else value_text[:57] + "..."

@@ -11,7 +11,7 @@ from ssad.report.artefacts import pictures
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.records import Line, field, metric_cell
-from ssad.report.tables import METHODS, Cell, Table
+from ssad.report.tables import METHODS, Table, TableCell
 
 
 def section(run: Run, *, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
@@ -73,13 +73,13 @@ def _title(column: Mapping[str, Any]) -> str:
     return str(column.get("title") or column["name"]) + (f", {unit}" if unit else "")
 
 
-def _cell(lines: Sequence[Line], name: str) -> Cell:
+def _cell(lines: Sequence[Line], name: str) -> TableCell:
     """Return a metric over the lines of a row: one line's own interval if it has one, else that of the clusters."""
     values = [(line.get("metrics") or {}).get(name) if line["status"] == "ok" else None for line in lines]
     own_interval = (lines[0].get("intervals") or {}).get(name) if len(lines) == 1 else None
     if own_interval and values[0] is not None:
-        low, high = (math.nan if limit is None else float(limit) for limit in own_interval)
-        return Cell(float(values[0]), low, high, int(lines[0].get("n", 1)), method="given")
+        lower, upper = (math.nan if limit is None else float(limit) for limit in own_interval)
+        return TableCell(float(values[0]), lower, upper, int(lines[0].get("n", 1)), method="given")
     are_booleans = [isinstance(value, bool) for value in values if value is not None]
     cell = metric_cell(lines, name, "share" if are_booleans and all(are_booleans) else "mean")
     is_count = len(values) == 1 and type(values[0]) is int

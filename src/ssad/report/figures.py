@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
-from ssad.report.tables import Cell
+from ssad.report.tables import TableCell
 
 SERIES = 5  # colours of the style sheet, --s0 to --s4
 
@@ -36,9 +36,9 @@ def label_text(x: object, y: object, text: str, *, anchor: str | None = None, cl
     return element("text", escape(text), x=x, y=y, text_anchor=anchor, class_=class_)
 
 
-def figure(parts: Sequence[str], label: str, **attributes: object) -> str:
+def figure(elements: Sequence[str], label: str, **attributes: object) -> str:
     """Return a figure of its elements, with a label for screen readers."""
-    return element("svg", "".join(parts), **attributes, role="img", aria_label=escape(label))
+    return element("svg", "".join(elements), **attributes, role="img", aria_label=escape(label))
 
 
 def dot(x: object, y: object, radius: int, colour: str, tip: str = "") -> str:
@@ -48,11 +48,11 @@ def dot(x: object, y: object, radius: int, colour: str, tip: str = "") -> str:
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """A number of a line: its place along the axis, 0 to 1, the number, and its tool tip."""
 
     at: float
-    cell: Cell
+    cell: TableCell
     tip: str
 
 
@@ -68,7 +68,7 @@ class Panel:
 
     title: str
     ticks: Sequence[tuple[float, str]]
-    lines: Sequence[Sequence[Point]]
+    lines: Sequence[Sequence[CurvePoint]]
 
 
 PANEL_WIDTH, PANEL_HEIGHT, PANEL_COLUMNS, PANEL_GAP = 178, 118, 4, 34
@@ -84,39 +84,39 @@ def panels(plots: Sequence[Panel], *, label: str, columns: int = PANEL_COLUMNS) 
     """
     cells = [point.cell for panel in plots for line in panel.lines for point in line]
     upper_ends = [cell.mean if math.isnan(cell.high) else cell.high for cell in cells if not math.isnan(cell.mean)]
-    top = max(10.0, 10 * math.ceil(max(upper_ends, default=1.0) / 10))
-    parts = []
+    top_percent = max(10.0, 10 * math.ceil(max(upper_ends, default=1.0) / 10))
+    elements = []
     for panel_index, panel in enumerate(plots):
         left = 36 + (panel_index % columns) * (PANEL_WIDTH + PANEL_GAP)
-        under = 24 + (panel_index // columns) * (PANEL_HEIGHT + 46)
+        panel_top = 24 + (panel_index // columns) * (PANEL_HEIGHT + 46)
 
-        def position(at: float, value: float, left: int = left, under: int = under) -> tuple[float, float]:
-            return left + PANEL_WIDTH * at, under + PANEL_HEIGHT * (1 - min(max(value / top, 0.0), 1.0))
+        def position(abscissa: float, value: float, left: int = left, under: int = panel_top) -> tuple[float, float]:
+            return left + PANEL_WIDTH * abscissa, under + PANEL_HEIGHT * (1 - min(max(value / top_percent, 0.0), 1.0))
 
-        parts.append(label_text(left, under - 8, panel.title, class_="name"))
-        for share in (0.0, 0.5, 1.0):
-            y = under + PANEL_HEIGHT * (1 - share)
-            parts.append(element("line", x1=left, x2=left + PANEL_WIDTH, y1=y, y2=y, class_="grid"))
-            parts.append(label_text(left - 5, y + 4, f"{top * share:.0f}", anchor="end"))
+        elements.append(label_text(left, panel_top - 8, panel.title, class_="name"))
+        for fraction in (0.0, 0.5, 1.0):
+            y = panel_top + PANEL_HEIGHT * (1 - fraction)
+            elements.append(element("line", x1=left, x2=left + PANEL_WIDTH, y1=y, y2=y, class_="grid"))
+            elements.append(label_text(left - 5, y + 4, f"{top_percent * fraction:.0f}", anchor="end"))
         for at, name in panel.ticks:
-            parts.append(label_text(left + PANEL_WIDTH * at, under + PANEL_HEIGHT + 15, name, anchor="middle"))
+            elements.append(label_text(left + PANEL_WIDTH * at, panel_top + PANEL_HEIGHT + 15, name, anchor="middle"))
         for index, line in enumerate(panel.lines):
-            measured = [point for point in line if not math.isnan(point.cell.mean)]
+            measured_points = [point for point in line if not math.isnan(point.cell.mean)]
             colour = series_colour(index)
-            with_interval = [point for point in measured if not math.isnan(point.cell.low)]
+            with_interval = [point for point in measured_points if not math.isnan(point.cell.low)]
             if with_interval:
                 # The outline of the band: along the upper limits and back along the lower ones.
-                outline = [position(vertex.at, vertex.cell.high) for vertex in with_interval]
-                outline += [position(vertex.at, vertex.cell.low) for vertex in reversed(with_interval)]
-                parts.append(element("polygon", points=_points(outline), fill=colour, opacity=".16"))
-            path = _points([position(vertex.at, vertex.cell.mean) for vertex in measured])
-            parts.append(element("polyline", points=path, fill="none", stroke=colour, stroke_width=2))
-            for point in measured:
+                band_points = [position(vertex.at, vertex.cell.high) for vertex in with_interval]
+                band_points += [position(vertex.at, vertex.cell.low) for vertex in reversed(with_interval)]
+                elements.append(element("polygon", points=_points(band_points), fill=colour, opacity=".16"))
+            path = _points([position(vertex.at, vertex.cell.mean) for vertex in measured_points])
+            elements.append(element("polyline", points=path, fill="none", stroke=colour, stroke_width=2))
+            for point in measured_points:
                 tip = f"{point.tip}: {point.cell.text} {point.cell.interval}"
-                parts.append(dot(*position(point.at, point.cell.mean), 3, colour, tip))
+                elements.append(dot(*position(point.at, point.cell.mean), 3, colour, tip))
     rows = -(-len(plots) // columns)
-    size = f"{36 + columns * (PANEL_WIDTH + PANEL_GAP)} {rows * (PANEL_HEIGHT + 46) + 12}"
-    return figure(parts, label, viewBox=f"0 0 {size}")
+    view_box = f"{36 + columns * (PANEL_WIDTH + PANEL_GAP)} {rows * (PANEL_HEIGHT + 46) + 12}"
+    return figure(elements, label, viewBox=f"0 0 {view_box}")
 
 
 def _points(positions: Sequence[tuple[float, float]]) -> str:
@@ -157,37 +157,40 @@ def heat_maps(maps: Sequence[HeatMap], *, label: str, columns: int = 3) -> str:
     """
     map_width = MAP_LEFT + CELL_WIDTH * max(len(heat_map.columns) for heat_map in maps) + MAP_GAP
     map_height = MAP_TOP + CELL_HEIGHT * max(len(heat_map.rows) for heat_map in maps) + MAP_GAP
-    parts = []
+    elements = []
     for map_index, heat_map in enumerate(maps):
-        left, top = (map_index % columns) * map_width, (map_index // columns) * map_height
-        parts.append(label_text(left + MAP_LEFT, top + 18, heat_map.title, class_="name"))
+        left, map_top = (map_index % columns) * map_width, (map_index // columns) * map_height
+        elements.append(label_text(left + MAP_LEFT, map_top + 18, heat_map.title, class_="name"))
         for column, name in enumerate(heat_map.columns):
             x = left + MAP_LEFT + CELL_WIDTH * column + CELL_WIDTH // 2
-            parts.append(label_text(x, top + MAP_TOP - 6, name, anchor="middle"))
+            elements.append(label_text(x, map_top + MAP_TOP - 6, name, anchor="middle"))
         for row_index, row in enumerate(heat_map.rows):
-            y = top + MAP_TOP + CELL_HEIGHT * row_index
-            parts.append(label_text(left + MAP_LEFT - 6, y + 16, row, anchor="end"))
+            y = map_top + MAP_TOP + CELL_HEIGHT * row_index
+            elements.append(label_text(left + MAP_LEFT - 6, y + 16, row, anchor="end"))
             for column, name in enumerate(heat_map.columns):
-                parts.append(_map_cell(heat_map, (row, name), left + MAP_LEFT + CELL_WIDTH * column, y))
+                elements.append(_map_cell(heat_map, (row, name), left + MAP_LEFT + CELL_WIDTH * column, y))
     rows = -(-len(maps) // columns)
-    return figure(parts, label, viewBox=f"0 0 {map_width * min(columns, len(maps))} {map_height * rows}")
+    return figure(elements, label, viewBox=f"0 0 {map_width * min(columns, len(maps))} {map_height * rows}")
 
 
 def _map_cell(heat_map: HeatMap, position: tuple[str, str], x: int, y: int) -> str:
     value = heat_map.values.get(position)
     if value is None or math.isnan(value):
-        colour, text = "none", "n/a"
+        colour, value_text = "none", "n/a"
     else:
-        colour, text = f"color-mix(in srgb,var(--crash) {70 * (1 - value):.0f}%,var(--card))", f"{100 * value:.0f}"
-    marked = position == heat_map.marked
-    size = {"x": x + 1, "y": y + 1, "width": CELL_WIDTH - 2, "height": CELL_HEIGHT - 2, "rx": 3}
-    frame = {"stroke": "var(--ink)", "stroke_width": 2} if marked else {"stroke": "var(--line)"}
-    ink = {"text_anchor": "middle", "style": "fill:var(--ink)"}
+        colour, value_text = (
+            f"color-mix(in srgb,var(--crash) {70 * (1 - value):.0f}%,var(--card))",
+            f"{100 * value:.0f}",
+        )
+    is_marked = position == heat_map.marked
+    rectangle = {"x": x + 1, "y": y + 1, "width": CELL_WIDTH - 2, "height": CELL_HEIGHT - 2, "rx": 3}
+    frame = {"stroke": "var(--ink)", "stroke_width": 2} if is_marked else {"stroke": "var(--line)"}
+    text_style = {"text_anchor": "middle", "style": "fill:var(--ink)"}
     return element(
         "g",
         f"<title>{escape((heat_map.tips or {}).get(position, ''))}</title>"
-        + element("rect", **size, style=f"fill:{colour}", **frame)
-        + element("text", text, x=x + CELL_WIDTH / 2, y=y + 16, **ink),
+        + element("rect", **rectangle, style=f"fill:{colour}", **frame)
+        + element("text", value_text, x=x + CELL_WIDTH / 2, y=y + 16, **text_style),
     )
 
 
@@ -196,7 +199,7 @@ class Interval:
     """A number with its interval: number of the series (for its colour), the number, and its tool tip."""
 
     series: int
-    cell: Cell
+    cell: TableCell
     tip: str
 
 
@@ -212,24 +215,24 @@ def interval_plot(groups: Sequence[tuple[str, Sequence[Interval]]], *, label: st
         groups: Title of each group, and its numbers, 0 to 1; empty groups are left out.
         label: Label for screen readers.
     """
-    parts: list[str] = []
+    elements: list[str] = []
     y = 8.0
     for name, intervals in groups:
         if not intervals:
             continue
-        parts.append(label_text(f"{LABEL}%", y + STEP * len(intervals) / 2 + 4, name, anchor="end"))
+        elements.append(label_text(f"{LABEL}%", y + STEP * len(intervals) / 2 + 4, name, anchor="end"))
         for interval in intervals:
             cell, colour, row_y = interval.cell, series_colour(interval.series), y + STEP / 2
             if cell.interval:
-                ends = {"x1": f"{LEFT + WIDTH * cell.low:.2f}%", "x2": f"{LEFT + WIDTH * cell.high:.2f}%"}
+                segment_ends = {"x1": f"{LEFT + WIDTH * cell.low:.2f}%", "x2": f"{LEFT + WIDTH * cell.high:.2f}%"}
                 style = (
                     {"stroke_width": "1.5", "stroke_dasharray": "3 3"}
                     if cell.method == "range"
                     else {"stroke_width": "3", "stroke_linecap": "round", "opacity": ".45"}
                 )
-                parts.append(element("line", **ends, y1=row_y, y2=row_y, stroke=colour, **style))
+                elements.append(element("line", **segment_ends, y1=row_y, y2=row_y, stroke=colour, **style))
             if not math.isnan(cell.mean):
-                parts.append(dot(f"{LEFT + WIDTH * cell.mean:.2f}%", row_y, 5, colour, interval.tip))
+                elements.append(dot(f"{LEFT + WIDTH * cell.mean:.2f}%", row_y, 5, colour, interval.tip))
             y += STEP
         y += GROUP_GAP
     grid = []
@@ -237,15 +240,15 @@ def interval_plot(groups: Sequence[tuple[str, Sequence[Interval]]], *, label: st
         x = f"{LEFT + WIDTH * tick / 4}%"
         grid.append(element("line", x1=x, x2=x, y1=2, y2=y - 6, class_="grid"))
         grid.append(label_text(x, y + 12, f"{tick / 4:g}", anchor="middle"))
-    return figure([*grid, *parts], label, height=f"{y + 22:.0f}")
+    return figure([*grid, *elements], label, height=f"{y + 22:.0f}")
 
 
 @dataclass(frozen=True)
-class Change:
+class MetricChange:
     """A point of a scatter plot: change along each axis with its interval, its name, its group and its tool tip."""
 
-    x: Cell
-    y: Cell
+    x: TableCell
+    y: TableCell
     name: str
     group: str
     tip: str
@@ -256,7 +259,7 @@ NAME_ROOM = (110.0, 13.0)  # pixels of a name
 
 
 def change_plot(
-    changes: Sequence[Change], colours: Mapping[str, str], *, label: str, x_title: str, y_title: str
+    changes: Sequence[MetricChange], colours: Mapping[str, str], *, label: str, x_title: str, y_title: str
 ) -> str:
     """Draw changes of two metrics against each other, with their intervals; as SVG text, "" without a change.
 
@@ -283,47 +286,47 @@ def change_plot(
     def emphasis(tick: float) -> str | None:
         return "stroke-width:2" if tick == 0.0 else None
 
-    parts = []
+    elements = []
     for tick in _ticks(left, right):
-        ends = {"x1": x(tick), "x2": x(tick), "y1": 10, "y2": SIZE + 10}
-        parts.append(element("line", **ends, class_="grid", style=emphasis(tick)))
-        parts.append(label_text(x(tick), SIZE + 26, f"{tick:g}", anchor="middle"))
+        segment_ends = {"x1": x(tick), "x2": x(tick), "y1": 10, "y2": SIZE + 10}
+        elements.append(element("line", **segment_ends, class_="grid", style=emphasis(tick)))
+        elements.append(label_text(x(tick), SIZE + 26, f"{tick:g}", anchor="middle"))
     for tick in _ticks(bottom, top):
-        ends = {"x1": MARGIN, "x2": MARGIN + SIZE, "y1": y(tick), "y2": y(tick)}
-        parts.append(element("line", **ends, class_="grid", style=emphasis(tick)))
-        parts.append(label_text(MARGIN - 6, y(tick) + 4, f"{tick:g}", anchor="end"))
+        segment_ends = {"x1": MARGIN, "x2": MARGIN + SIZE, "y1": y(tick), "y2": y(tick)}
+        elements.append(element("line", **segment_ends, class_="grid", style=emphasis(tick)))
+        elements.append(label_text(MARGIN - 6, y(tick) + 4, f"{tick:g}", anchor="end"))
     names: list[tuple[float, float]] = []
     for change in sorted(changes, key=lambda change: -abs(change.y.mean - change.x.mean)):
         colour = colours.get(change.group, series_colour(3))
         point_x, point_y = x(change.x.mean), y(change.y.mean)
         dashes = "2 3" if "range" in (change.x.method, change.y.method) else None
-        for begin, end in (
+        for start_point, end_point in (
             ((x(change.x.low), point_y), (x(change.x.high), point_y)),
             ((point_x, y(change.y.low)), (point_x, y(change.y.high))),
         ):
-            if not any(math.isnan(coordinate) for coordinate in (*begin, *end)):
-                ends = {"x1": begin[0], "y1": begin[1], "x2": end[0], "y2": end[1]}
-                parts.append(element("line", **ends, stroke=colour, opacity=".5", stroke_dasharray=dashes))
-        parts.append(dot(point_x, point_y, 4, colour, change.tip))
+            if not any(math.isnan(coordinate) for coordinate in (*start_point, *end_point)):
+                segment_ends = {"x1": start_point[0], "y1": start_point[1], "x2": end_point[0], "y2": end_point[1]}
+                elements.append(element("line", **segment_ends, stroke=colour, opacity=".5", stroke_dasharray=dashes))
+        elements.append(dot(point_x, point_y, 4, colour, change.tip))
         if all(abs(point_x - at_x) > NAME_ROOM[0] or abs(point_y - at_y) > NAME_ROOM[1] for at_x, at_y in names):
             names.append((point_x, point_y))
-            parts.append(label_text(point_x + 7, point_y - 6, change.name))
+            elements.append(label_text(point_x + 7, point_y - 6, change.name))
     for number, group in enumerate(dict.fromkeys(change.group for change in changes)):
         legend_y = 22 + 16 * number
-        parts.append(dot(MARGIN + SIZE + 64, legend_y, 5, colours.get(group, series_colour(3))))
-        parts.append(label_text(MARGIN + SIZE + 74, legend_y + 4, group))
-    parts.append(label_text(MARGIN + SIZE / 2, SIZE + 44, x_title, anchor="middle"))
-    turned = f"rotate(-90 12 {SIZE / 2})"
-    parts.append(element("text", escape(y_title), x=12, y=SIZE / 2, transform=turned, text_anchor="middle"))
-    return figure(parts, label, viewBox=f"0 0 {SIZE + MARGIN + 140} {SIZE + 52}")
+        elements.append(dot(MARGIN + SIZE + 64, legend_y, 5, colours.get(group, series_colour(3))))
+        elements.append(label_text(MARGIN + SIZE + 74, legend_y + 4, group))
+    elements.append(label_text(MARGIN + SIZE / 2, SIZE + 44, x_title, anchor="middle"))
+    rotation = f"rotate(-90 12 {SIZE / 2})"
+    elements.append(element("text", escape(y_title), x=12, y=SIZE / 2, transform=rotation, text_anchor="middle"))
+    return figure(elements, label, viewBox=f"0 0 {SIZE + MARGIN + 140} {SIZE + 52}")
 
 
 def _ends(values: Sequence[float]) -> tuple[float, float]:
     """Return the ends of an axis in tenths, with 0 and some room; intervals may be missing."""
     finite_values = [value for value in values if not math.isnan(value)]
     # Changes of shares lie in [-1, 1].
-    low, high = max(min(*finite_values, 0.0) - 0.05, -1.0), min(max(*finite_values, 0.1) + 0.05, 1.0)
-    return math.floor(10.0 * low) / 10.0, math.ceil(10.0 * high) / 10.0
+    lower, upper = max(min(*finite_values, 0.0) - 0.05, -1.0), min(max(*finite_values, 0.1) + 0.05, 1.0)
+    return math.floor(10.0 * lower) / 10.0, math.ceil(10.0 * upper) / 10.0
 
 
 def _ticks(low: float, high: float) -> list[float]:

@@ -49,8 +49,8 @@ class Run:
     @property
     def suite(self) -> Mapping[str, Any]:
         """The resolved suite."""
-        found: Mapping[str, Any] = self.header.get("suite", {})
-        return found
+        suite_settings: Mapping[str, Any] = self.header.get("suite", {})
+        return suite_settings
 
     @property
     def kind(self) -> str:
@@ -72,9 +72,9 @@ class Run:
 
     @cached_property
     def changed(self) -> tuple[str, ...]:
-        """What the run does otherwise than the suite of its name, as KEY=VALUE; what changes no result is left out."""
-        words = shlex.split(self.command)
-        settings = [word for option, word in itertools.pairwise(words) if option == "--set"]
+        """Settings that differ from the suite of this name, as KEY=VALUE; those that change no result are left out."""
+        arguments = shlex.split(self.command)
+        settings = [argument for option, argument in itertools.pairwise(arguments) if option == "--set"]
         return tuple(setting for setting in settings if setting.partition("=")[0] not in INCIDENTAL)
 
     @property
@@ -95,11 +95,11 @@ class Run:
 
 def _in_words(setting: str) -> str:
     """Return KEY=VALUE in words: objects with a name by that name, lists without brackets."""
-    key, _, text = setting.partition("=")
+    key, _, value_text = setting.partition("=")
     try:
-        value = safeio.parse_yaml(text)
+        value = safeio.parse_yaml(value_text)
     except FormatError:
-        return f"{key} {text}"
+        return f"{key} {value_text}"
     return f"{key} {_spoken(value)}"
 
 
@@ -131,7 +131,7 @@ def load_run(folder: Path | str) -> Run:
         if not (isinstance(line["key"], str) and "status" in line):
             problem = f"the line with key {line['key']!r} is no result of a cell"
             raise StoreError(f"{folder}/results.jsonl: {problem}; remove it and run the suite again")
-    order = {cell["key"]: position for position, cell in enumerate(header.get("cells", []))}
-    lines.sort(key=lambda line: order.get(line["key"], len(order)))
+    positions = {cell["key"]: position for position, cell in enumerate(header.get("cells", []))}
+    lines.sort(key=lambda line: positions.get(line["key"], len(positions)))
     episodes = {line["key"]: line for line in read_lines(folder / "episodes.jsonl")}
-    return Run(folder, header, tuple(lines), episodes, max(len(order), len(lines)))
+    return Run(folder, header, tuple(lines), episodes, max(len(positions), len(lines)))

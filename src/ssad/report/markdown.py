@@ -48,18 +48,20 @@ def _origin(run: Run) -> list[str]:
     lines.append(f"* Software: {', '.join(software)}.")
     for key, title in INPUT_TITLES.items():
         inputs: Mapping[str, Any] = run.header.get(key) or {}
-        known = [f"`{name}` {version}" for name, version in inputs.items() if version]
-        lines += [f"* {title}: {', '.join(known)}."] if known else []
-    succeeded = [line for line in run.lines if line["status"] == "ok"]
+        input_lines = [f"`{name}` {version}" for name, version in inputs.items() if version]
+        lines += [f"* {title}: {', '.join(input_lines)}."] if input_lines else []
+    successful_lines = [line for line in run.lines if line["status"] == "ok"]
     devices = Counter(
         str((line.get("versions") or {}).get("device") or header_versions.get("device") or "an unknown device")
-        for line in succeeded
+        for line in successful_lines
     )
-    places = " and ".join(f"{count:,} on {device}" for device, count in devices.items())
-    lines.append(f"* Cells: {len(succeeded):,} of {run.planned:,}{f', {places}' if places else ''}.")
-    finished = {line["key"] for line in run.lines}
+    device_counts = " and ".join(f"{count:,} on {device}" for device, count in devices.items())
+    lines.append(
+        f"* Cells: {len(successful_lines):,} of {run.planned:,}{f', {device_counts}' if device_counts else ''}."
+    )
+    finished_keys = {line["key"] for line in run.lines}
     missing = [
-        str(cell.get("name", cell["key"])) for cell in run.header.get("cells", ()) if cell["key"] not in finished
+        str(cell.get("name", cell["key"])) for cell in run.header.get("cells", ()) if cell["key"] not in finished_keys
     ]
     lines += [f"* Not run: {_listed(missing)}."] if missing else []
     reasons: dict[str, list[str]] = {}
@@ -71,10 +73,10 @@ def _origin(run: Run) -> list[str]:
     return lines
 
 
-def _listed(names: Sequence[str], most: int = 20) -> str:
+def _listed(names: Sequence[str], limit: int = 20) -> str:
     """Return names in a list, the number of the others at its end."""
-    shown = ", ".join(f"`{name}`" for name in names[:most])
-    return f"{shown} and {len(names) - most:,} more" if len(names) > most else shown
+    listed_names = ", ".join(f"`{name}`" for name in names[:limit])
+    return f"{listed_names} and {len(names) - limit:,} more" if len(names) > limit else listed_names
 
 
 def _counts(table: Table) -> list[str]:
@@ -88,5 +90,5 @@ def _counts(table: Table) -> list[str]:
 
 
 def _range(counts: Sequence[int]) -> str:
-    low, high = min(counts), max(counts)
-    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
+    lowest, highest = min(counts), max(counts)
+    return f"{lowest:,}" if lowest == highest else f"{lowest:,} to {highest:,}"

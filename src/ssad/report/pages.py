@@ -13,7 +13,7 @@ import jinja2
 from ssad.metrics import METRICS
 from ssad.report.artefacts import artefact_problems
 from ssad.report.load import Run
-from ssad.report.tables import Cell, Table, to_csv
+from ssad.report.tables import Table, TableCell, to_csv
 from ssad.report.verdict import complete_verdict
 
 TABLE_HASH = "hash-of-the-main-table"  # stands on a page until its tables are known
@@ -59,12 +59,12 @@ def render(template: str | Path, run: Run, *, verdict: Sequence[str] = (), **val
     )
 
 
-def heat(cell: Cell, symbol: str) -> str:
+def heat(cell: TableCell, symbol: str) -> str:
     """Background of a table cell, from good (0) to bad (1), as a CSS colour mix; none but for driving metrics."""
     metric = METRICS.get(symbol)
     if metric is None or math.isnan(cell.mean) or metric.unit not in ("", "m") or not metric.better:
         return ""
     scale = {"OR": 10.0, "DR": 5.0}.get(symbol, metric.scale)
-    share = min(max(cell.mean / scale, 0.0), 1.0)
-    badness = share if metric.better == "lower" else 1.0 - share
-    return f"--bad:{100 * badness:.0f}%"
+    fraction = min(max(cell.mean / scale, 0.0), 1.0)
+    redness = fraction if metric.better == "lower" else 1.0 - fraction
+    return f"--bad:{100 * redness:.0f}%"

@@ -8,7 +8,7 @@ from typing import Any
 
 from ssad.metrics import CaseValue, estimate
 from ssad.metrics.uncertainty import Kind
-from ssad.report.tables import Cell
+from ssad.report.tables import TableCell
 
 Line = Mapping[str, Any]
 """A line of results.jsonl."""
@@ -44,7 +44,7 @@ def case_of(line: Line, value: float) -> CaseValue:
     )
 
 
-def metric_cell(lines: Sequence[Line], name: str, kind: Kind) -> Cell:
+def metric_cell(lines: Sequence[Line], name: str, kind: Kind) -> TableCell:
     """Return the mean of a metric over lines with its interval, which the clusters give.
 
     Args:
@@ -52,4 +52,4 @@ def metric_cell(lines: Sequence[Line], name: str, kind: Kind) -> Cell:
         name: Name of the metric.
         kind: Kind of its values; see `ssad.metrics.uncertainty.estimate`.
     """
-    return Cell.of(estimate([case_of(line, metric_of(line, name)) for line in lines], kind))
+    return TableCell.of(estimate([case_of(line, metric_of(line, name)) for line in lines], kind))

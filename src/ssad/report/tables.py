@@ -26,7 +26,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """One number, with the interval and counts of `ssad.metrics.Estimate`; a published number has only its mean."""
 
     mean: float
@@ -39,12 +39,14 @@ class Cell:
     digits: int = 2
 
     @classmethod
-    def of(cls, e: Estimate) -> Cell:
+    def of(cls, estimate: Estimate) -> TableCell:
         """Return the cell of an estimate."""
-        return cls(e.mean, e.low, e.high, e.n, e.failed, e.clusters, e.method)
+        return cls(
+            estimate.mean, estimate.low, estimate.high, estimate.n, estimate.failed, estimate.clusters, estimate.method
+        )
 
     @classmethod
-    def value(cls, number: float | None, *, digits: int = 2) -> Cell:
+    def value(cls, number: float | None, *, digits: int = 2) -> TableCell:
         """Return the cell of a number without an interval; None: it was not measured."""
         return cls(math.nan if number is None else number, digits=digits)
 
@@ -83,17 +85,17 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A line of a table; `published` marks numbers that are not ours."""
 
     head: tuple[str, ...]
-    cells: tuple[Cell, ...]
+    cells: tuple[TableCell, ...]
     published: bool = False
 
     @classmethod
-    def of_published(cls, head: Sequence[str], numbers: Iterable[float | None]) -> Row:
+    def of_published(cls, head: Sequence[str], numbers: Iterable[float | None]) -> TableRow:
         """Return a row of published numbers; None: the publication has no number there."""
-        return cls(tuple(head), tuple(Cell.value(number) for number in numbers), published=True)
+        return cls(tuple(head), tuple(TableCell.value(number) for number in numbers), published=True)
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class Table:
     title: str
     heads: tuple[str, ...]
     columns: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     note: str = ""
     source: str = ""
 
@@ -117,11 +119,11 @@ class Table:
         *,
         rows: Mapping[str, Callable[[Record], object]],
         columns: Mapping[Column, str],
-        metric: Callable[[Sequence[Record], Column], Cell],
+        metric: Callable[[Sequence[Record], Column], TableCell],
         key: Callable[[Record], Hashable] | None = None,
-        having: Callable[[Sequence[Record]], bool] | None = None,
-        published: Callable[[Record], Iterable[Row]] | None = None,
-        below: Iterable[Row] = (),
+        condition: Callable[[Sequence[Record]], bool] | None = None,
+        published: Callable[[Record], Iterable[TableRow]] | None = None,
+        footer_rows: Iterable[TableRow] = (),
         note: str = "",
         source: str = "",
     ) -> Table:
@@ -135,9 +137,9 @@ class Table:
             columns: Names of metrics, or values of a column factor -> heads of the other columns.
             metric: Function of a row's records and a column, which estimates the number there and its interval.
             key: Key that the records of a row share; None: the values of the row factors.
-            having: Condition on the records of a row; other rows are left out.
+            condition: Condition on the records of a row; other rows are left out.
             published: Rows of published numbers that follow the row of a record (the first of its row).
-            below: Rows of published numbers at the end.
+            footer_rows: Rows of published numbers at the end.
             note: Text under the table.
             source: Source of the published numbers.
         """
@@ -145,14 +147,14 @@ class Table:
         for record in records:
             group = key(record) if key else tuple(str(factor(record)) for factor in rows.values())
             groups.setdefault(group, []).append(record)
-        table_rows: list[Row] = []
+        table_rows: list[TableRow] = []
         for group_records in groups.values():
-            if having is None or having(group_records):
-                first = group_records[0]
-                head = tuple(str(factor(first)) for factor in rows.values())
-                table_rows.append(Row(head, tuple(metric(group_records, column) for column in columns)))
-                table_rows += published(first) if published else ()
-        return cls(name, title, tuple(rows), tuple(columns.values()), (*table_rows, *below), note, source)
+            if condition is None or condition(group_records):
+                first_record = group_records[0]
+                head = tuple(str(factor(first_record)) for factor in rows.values())
+                table_rows.append(TableRow(head, tuple(metric(group_records, column) for column in columns)))
+                table_rows += published(first_record) if published else ()
+        return cls(name, title, tuple(rows), tuple(columns.values()), (*table_rows, *footer_rows), note, source)
 
     @classmethod
     def listing(
@@ -163,9 +165,9 @@ class Table:
         *,
         rows: Mapping[str, Callable[[Record], object]],
         columns: Mapping[Column, str],
-        metric: Callable[[Record, Column], Cell],
-        published: Callable[[Record], Iterable[Row]] | None = None,
-        below: Iterable[Row] = (),
+        metric: Callable[[Record, Column], TableCell],
+        published: Callable[[Record], Iterable[TableRow]] | None = None,
+        footer_rows: Iterable[TableRow] = (),
         note: str = "",
         source: str = "",
     ) -> Table:
@@ -179,7 +181,7 @@ class Table:
             metric=lambda entries, column: metric(entries[0][1], column),
             key=lambda entry: entry[0],
             published=partial(_of_second, published) if published else None,
-            below=below,
+            footer_rows=footer_rows,
             note=note,
             source=source,
         )
@@ -253,12 +255,12 @@ def to_latex(table: Table) -> str:
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", ""])
 
 
-def write_tables(folder: Path, found: Sequence[Table]) -> list[Path]:
+def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
     """Write tables/NAME.csv, .md and .tex, each whole or not at all.
 
     Args:
         folder: Parent of the folder `tables`.
-        found: The tables.
+        tables: The tables.
 
     Returns:
         Paths of the files.
@@ -268,7 +270,7 @@ def write_tables(folder: Path, found: Sequence[Table]) -> list[Path]:
     """
     paths = []
     (folder / "tables").mkdir(parents=True, exist_ok=True)
-    for table in found:
+    for table in tables:
         for suffix, text in (("csv", to_csv(table)), ("md", to_markdown(table)), ("tex", to_latex(table))):
             path = folder / "tables" / f"{table.name}.{suffix}"
             safeio.write_atomic(path, text)

@@ -33,8 +33,8 @@ def terminal_table(run: Run, table: Table) -> rich.table.Table:
     display_names = {
         head: short_name if short_counts[short_name := MODULE.sub("", head)] == 1 else head for head in ("", *row_heads)
     }
-    first, *others = table.columns
-    for name in ("n", first, "", *others):
+    first_column, *other_columns = table.columns
+    for name in ("n", first_column, "", *other_columns):
         result.add_column(escape(name), justify="right", min_width=4)
     rows = [row for row in table.rows if not row.published]
     for previous_row, row, next_row in zip([None, *rows], rows, [*rows[1:], None], strict=False):
@@ -64,13 +64,15 @@ def comparison_table(table: Table) -> rich.table.Table:
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    varying = [column for column in range(len(table.heads)) if len({row.head[column] for row in table.rows}) > 1]
-    for column in varying:
+    varying_columns = [
+        column for column in range(len(table.heads)) if len({row.head[column] for row in table.rows}) > 1
+    ]
+    for column in varying_columns:
         result.add_column(escape(table.heads[column].lower()))
     for name in (*table.columns, ""):
         result.add_column(escape(name), justify="right", no_wrap=True)
     for row in table.rows:
         *values, difference, p_value = row.cells
         texts = [*(cell.text for cell in values), difference.text, p_value.text, difference.interval]
-        result.add_row(*(escape(text) for text in (*(row.head[column] for column in varying), *texts)))
+        result.add_row(*(escape(text) for text in (*(row.head[column] for column in varying_columns), *texts)))
     return result

@@ -12,20 +12,27 @@ from ssad.report.records import Line
 
 def complete_verdict(run: Run, sentences: Sequence[str]) -> list[str]:
     """Return the sentences of a kind after the state of the run, and a default where there are none."""
-    state = [f"Not finished: {len(run.lines)} of {run.planned} cells have run."] if len(run.lines) < run.planned else []
-    return [sentence for sentence in [*state, *sentences] if sentence] or ["See the table."]
+    progress_sentences = (
+        [f"Not finished: {len(run.lines)} of {run.planned} cells have run."] if len(run.lines) < run.planned else []
+    )
+    return [sentence for sentence in [*progress_sentences, *sentences] if sentence] or ["See the table."]
 
 
-def worst_condition(who: str, metric: str, scores: Mapping[str, float], what: str) -> str:
+def worst_condition(subject: str, metric: str, scores: Mapping[str, float], condition_noun: str) -> str:
     """Return in a sentence the clean score ("") and the lowest of the others."""
-    others = {name: value for name, value in scores.items() if name and name != "clean" and not math.isnan(value)}
-    clean = scores.get("", scores.get("clean", math.nan))
-    if not others or math.isnan(clean):
+    perturbed_scores = {
+        name: value for name, value in scores.items() if name and name != "clean" and not math.isnan(value)
+    }
+    clean_score = scores.get("", scores.get("clean", math.nan))
+    if not perturbed_scores or math.isnan(clean_score):
         return ""
-    name = min(others, key=lambda condition: others[condition])
-    if others[name] >= clean:
-        return f"{who}: {metric} {clean:.0%} clean; no {what} takes any of it."
-    return f"{who}: {metric} {clean:.0%} clean; the {what} that costs most is {name}, which leaves {others[name]:.0%}."
+    name = min(perturbed_scores, key=lambda condition: perturbed_scores[condition])
+    if perturbed_scores[name] >= clean_score:
+        return f"{subject}: {metric} {clean_score:.0%} clean; no {condition_noun} takes any of it."
+    return (
+        f"{subject}: {metric} {clean_score:.0%} clean; the {condition_noun} that costs most is {name}, "
+        f"which leaves {perturbed_scores[name]:.0%}."
+    )
 
 
 def lines_by(run: Run, field: str, *, failed: bool = False) -> dict[str, list[Line]]:

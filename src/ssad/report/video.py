@@ -13,7 +13,7 @@ from PIL import Image
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import atomic_path
-from ssad.core.top_view import Frame, Moment, TopView
+from ssad.core.top_view import Frame, TopView, TopViewScene
 from ssad.core.types import EpisodeTrace
 
 CODECS = ("vp09", "mp4v")  # VP9, which browsers play; where it is missing MPEG-4 part 2, which most players know
@@ -35,7 +35,7 @@ def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (96
         steps_since_contact = None if first_hit is None or step < first_hit else step - int(first_hit)
         trail = pose[max(step - 30, 0) : step + 1, 0, :2]
         yield top_view.draw(
-            Moment(
+            TopViewScene(
                 pose[step],
                 sizes,
                 trace.kind,
@@ -62,11 +62,11 @@ def write_video(trace: EpisodeTrace, graph: LaneGraph, path: Path | str) -> Path
     return save_frames(frames(trace, graph), path, dt=trace.dt)
 
 
-def save_frames(shown: Iterable[Frame], path: Path, *, dt: float) -> Path:
+def save_frames(images: Iterable[Frame], path: Path, *, dt: float) -> Path:
     """Write frames as .mp4 or .gif (every second frame), whole or not at all.
 
     Args:
-        shown: RGB, uint8 [H, W, 3], one size.
+        images: RGB, uint8 [H, W, 3], one size.
         path: Output file.
         dt: Time between two frames, s.
 
@@ -77,15 +77,15 @@ def save_frames(shown: Iterable[Frame], path: Path, *, dt: float) -> Path:
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"{path}: a video is .mp4 or .gif")
     with atomic_path(path) as temporary:
-        (_mp4 if path.suffix == ".mp4" else _gif)(iter(shown), temporary, dt)
+        (_mp4 if path.suffix == ".mp4" else _gif)(iter(images), temporary, dt)
     return path
 
 
-def _mp4(shown: Iterator[Frame], path: Path, dt: float) -> None:
-    first = next(shown, None)
-    if first is None:
+def _mp4(images: Iterator[Frame], path: Path, dt: float) -> None:
+    first_image = next(images, None)
+    if first_image is None:
         raise ConfigError(f"{path}: a video without frames")
-    size = first.shape[1], first.shape[0]
+    size = first_image.shape[1], first_image.shape[0]
     for codec in CODECS:
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), round(1.0 / dt), size)
         if writer.isOpened():
@@ -93,14 +93,16 @@ def _mp4(shown: Iterator[Frame], path: Path, dt: float) -> None:
     else:
         raise ConfigError(f"{path}: OpenCV has no mp4 encoder here; write a .gif")
     try:
-        for frame in chain([first], shown):
+        for frame in chain([first_image], images):
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
     finally:
         writer.release()
 
 
-def _gif(shown: Iterator[Frame], path: Path, dt: float) -> None:
-    pictures = [Image.fromarray(frame).quantize(64) for index, frame in enumerate(shown) if index % 2 == 0]
-    if not pictures:
+def _gif(images: Iterator[Frame], path: Path, dt: float) -> None:
+    palette_images = [Image.fromarray(frame).quantize(64) for index, frame in enumerate(images) if index % 2 == 0]
+    if not palette_images:
         raise ConfigError(f"{path}: a video without frames")
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(2000 * dt), loop=0, optimize=False)
+    palette_images[0].save(
+        path, save_all=True, append_images=palette_images[1:], duration=round(2000 * dt), loop=0, optimize=False
+    )

@@ -27,8 +27,8 @@ from ssad.core.types import (
     Controller,
     Episode,
     EpisodeAgent,
+    EpisodeLimits,
     LaneType,
-    Limits,
     Model,
     Pose,
     Route,
@@ -79,7 +79,7 @@ def highway_scenarios(count: int = 4) -> tuple[Scenario, ...]:
     """Return `count` scenarios of each place; the seed determines the traffic."""
     scenarios = []
     for town, place in PLACES.items():
-        limits = Limits(max_steps=round(place.duration * 10), max_time=place.duration)
+        limits = EpisodeLimits(max_steps=round(place.duration * 10), max_time=place.duration)
         for seed in range(count):
             ego = highway_episode(Scenario("", TYPE, town, (), seed=seed, limits=limits)).agents[0]
             assert ego.route is not None

@@ -110,9 +110,9 @@ class AdversaryPlan:
         return self.scenarios or SCENARIOS.get(self.algorithm, ("training",))
 
 
-def natural_only(refs: Sequence[str]) -> tuple[list[Scenario], dict[str, Any]]:
+def natural_only(references: Sequence[str]) -> tuple[list[Scenario], dict[str, Any]]:
     """The scenarios of some sets that have background traffic, and the lane graphs of their towns."""
-    scenarios, graphs = find_scenarios(refs)
+    scenarios, graphs = find_scenarios(references)
     with_traffic = [
         scenario for scenario in scenarios if scenario.type == "NaturalJunction" or scenario.traffic is not None
     ]
@@ -152,12 +152,12 @@ def measure_adversary(
     return {name: sum(values) / len(values) for name, values in shares.items()}
 
 
-def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator[str]:
+def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Iterator[str]:
     """Train an adversary, and write OUT/ALGORITHM.safetensors with its card, log.jsonl and curves.png.
 
     Args:
         plan: Plan of the training.
-        say: Called with progress messages.
+        report: Called with progress messages.
 
     Yields:
         Lines about what was written.
@@ -180,7 +180,7 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
             f"{', '.join(plan.learned_in())}: no scenario has background traffic to take adversaries from"
         )
     episodes = draw_episodes(scenarios, graphs, draws=learning.draws, seed=0)
-    say(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}; ego: {plan.ego}")
+    report(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}; ego: {plan.ego}")
     environment = _environment(learning, plan, episodes, graphs, ego)
     model = make_model(learning, environment)
     validation_setup = {"ego": plan.ego, "scenarios": scenarios, "graphs": graphs, "seed": VALIDATION_SEED}
@@ -193,9 +193,9 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
     fingerprint = digest(
         "adversary training", plan.ego, plan.literal, plan.off_road, *(episode.key for episode in episodes)
     )[:16]
-    state = learn(model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=fingerprint)
+    state = learn(model, learning, plan.out, validate=validate, report=report, seconds=plan.seconds, about=fingerprint)
     if state["steps"] < learning.steps:
-        say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
+        report(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
     description = f"{', '.join(plan.learned_in())}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}"
     path = plan.out / f"{plan.algorithm}.safetensors"
     yield finish(
@@ -246,11 +246,11 @@ def measure_all(plan: AdversaryPlan) -> Callable[[Driver], dict[str, float]]:
 
 def command_of(plan: AdversaryPlan) -> str:
     """Return the command that repeats the training."""
-    words = ["ssad", "train", "adversary", plan.algorithm]
+    arguments = ["ssad", "train", "adversary", plan.algorithm]
     defaults = AdversaryPlan("", Path())
-    words += ["--ego", plan.ego] if plan.ego != defaults.ego else []
-    words += ["--scenarios", ",".join(plan.scenarios)] if plan.scenarios != defaults.scenarios else []
-    words += ["--test", ",".join(plan.test)] if plan.test != defaults.test else []
-    words += ["--literal"] if plan.literal else []
-    words += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != defaults.off_road else []
-    return shlex.join([*words, *set_words(plan.changes)])
+    arguments += ["--ego", plan.ego] if plan.ego != defaults.ego else []
+    arguments += ["--scenarios", ",".join(plan.scenarios)] if plan.scenarios != defaults.scenarios else []
+    arguments += ["--test", ",".join(plan.test)] if plan.test != defaults.test else []
+    arguments += ["--literal"] if plan.literal else []
+    arguments += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != defaults.off_road else []
+    return shlex.join([*arguments, *set_words(plan.changes)])

@@ -76,20 +76,20 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
             "feasible": partial(self._feasible, off_road=off_road),
         }[reward]
         self._hindsight = Hindsight(num_envs, self.world.agents, dt=self.world.dt) if reward == "feasible" else None
-        self._before = cost_of if reward == "colliding" else distance_to_goal
+        self._previous_cost = cost_of if reward == "colliding" else distance_to_goal
         self._scale, self._action = scale, action
         self._random = generator("adversary episodes", seed)
-        self._who = np.full(num_envs, -1)  # agent of each scene's adversary, -1: none
+        self._adversaries = np.full(num_envs, -1)  # agent of each scene's adversary, -1: none
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
         self._actions: npt.NDArray[Any] = np.zeros((num_envs, 2), np.float32)
 
     def reset(self) -> npt.NDArray[np.float32]:
         """Start all scenes."""
         self._start()
-        self._who[:] = -1
+        self._adversaries[:] = -1
         self._returns[:], self._lengths[:] = 0.0, 0
         self._choose()
-        return self._observe(self._who)
+        return self._observe(self._adversaries)
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Store the actions of the next step."""
@@ -99,10 +99,10 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         self,
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.bool_], list[dict[str, Any]]]:
         """Advance every scene by one step of 0.1 s."""
-        world, adversary = self.world, self._who.copy()
+        world, adversary = self.world, self._adversaries.copy()
         active_scenes = np.flatnonzero(adversary >= 0)
         agents = np.stack([active_scenes, adversary[active_scenes]], 1).astype(np.int32)
-        before_step = self._before(world.state(), agents)
+        before_step = self._previous_cost(world.state(), agents)
         controls = np.zeros((self.num_envs, world.agents, 4), np.float32)
         controls[active_scenes, adversary[active_scenes]] = to_controls(self._action, self._actions[active_scenes])
         self.loop.step(controls)
@@ -117,25 +117,25 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         observation = self._observe(adversary)  # before agents are released or removed
         in_contact = np.zeros(self.num_envs, bool)
         in_contact[active_scenes] = state.touch[active_scenes, adversary[active_scenes]] != 0
-        ended = world.ended() != End.RUNNING
+        has_ended = world.ended() != End.RUNNING
         self._choose()
         arrived = np.zeros(self.num_envs, bool)
         arrived[active_scenes] = (world.state().note[active_scenes, adversary[active_scenes]] & Note.ARRIVED) != 0  # type: ignore[index]
-        released = (adversary >= 0) & ((self._who != adversary) | ended)
-        terminated = released & (in_contact | arrived)
+        is_released = (adversary >= 0) & ((self._adversaries != adversary) | has_ended)
+        terminated = is_released & (in_contact | arrived)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for scene in np.flatnonzero(released).tolist():
+        for scene in np.flatnonzero(is_released).tolist():
             infos[scene] = {
                 "terminal_observation": observation[scene],
                 "TimeLimit.truncated": not terminated[scene],
                 "episode": {"r": float(self._returns[scene]) * self._scale, "l": int(self._lengths[scene]), "t": 0.0},
             }
-        self._returns[released], self._lengths[released] = 0.0, 0
-        ended_scenes = np.flatnonzero(ended)
+        self._returns[is_released], self._lengths[is_released] = 0.0, 0
+        ended_scenes = np.flatnonzero(has_ended)
         if len(ended_scenes):
             self._start(ended_scenes)
-            self._who[ended_scenes] = -1
-        return self._observe(self._who), reward.astype(np.float32), released | (adversary < 0), infos
+            self._adversaries[ended_scenes] = -1
+        return self._observe(self._adversaries), reward.astype(np.float32), is_released | (adversary < 0), infos
 
     def _start(self, scenes: npt.NDArray[np.intp] | None = None) -> None:
         """Restart scenes; None: all."""
@@ -143,13 +143,13 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         if self._hindsight is not None:
             self._hindsight.forget(np.arange(self.num_envs) if scenes is None else scenes)
 
-    def _feasible(self, state: WorldState, agents: I32, before: F64, *, off_road: float) -> F64:
+    def _feasible(self, state: WorldState, agents: I32, previous_cost: F64, *, off_road: float) -> F64:
         """Return the reward `feasible`, with hindsight for adversaries in contact with the ego."""
         assert self._hindsight is not None
         avoidable = hit_ego(state, agents)
         if avoidable.any():
             avoidable[avoidable] = self._hindsight.avoided(state, agents[avoidable])
-        return feasible(state, agents, before, avoidable, off_road=off_road)
+        return feasible(state, agents, previous_cost, avoidable, off_road=off_road)
 
     def _draw(self, count: int) -> I32:
         return self._random.integers(len(self.world.episodes), size=count).astype(np.int32)
@@ -163,14 +163,14 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         self.world.keep_note(choice.note)
         if choice.remove.any():
             self.world.remove(choice.remove)
-        previous = np.zeros(selected.shape, bool)
-        occupied_scenes = np.flatnonzero(self._who >= 0)
-        previous[occupied_scenes, self._who[occupied_scenes]] = True
-        if (previous & ~selected).any():
-            self.world.take(previous & ~selected, None)
-        if (selected & ~previous).any():
-            self.world.take(selected & ~previous, Controller.EXTERNAL, policy=_ADVERSARY)
-        self._who = adversary
+        is_taken = np.zeros(selected.shape, bool)
+        occupied_scenes = np.flatnonzero(self._adversaries >= 0)
+        is_taken[occupied_scenes, self._adversaries[occupied_scenes]] = True
+        if (is_taken & ~selected).any():
+            self.world.take(is_taken & ~selected, None)
+        if (selected & ~is_taken).any():
+            self.world.take(selected & ~is_taken, Controller.EXTERNAL, policy=_ADVERSARY)
+        self._adversaries = adversary
 
     def _observe(self, who: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
         """[num_envs, 24]; zeros where there is no adversary."""

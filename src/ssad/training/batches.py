@@ -21,12 +21,12 @@ from ssad.core.types import F64, U8
 from ssad.training.recipe import Recipe
 
 GREY = 0.447
-SHRUNK = 0.7  # zoom below which images are halved first
-ROOM = 0.6  # share of the free memory for images
+HALVING_ZOOM = 0.7  # zoom below which images are halved first
+MEMORY_SHARE = 0.6  # share of the free memory for images
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class TrainingImage:
     """One image: a function that reads it (uint8 RGB [H, W, 3]), and its truth."""
 
     read: Callable[[], U8]
@@ -37,7 +37,7 @@ class Item:
 class OnDisk:
     """Images that are read on access: uint8 [n, H, W, 3] for indices [n] or a slice."""
 
-    items: Sequence[Item]
+    items: Sequence[TrainingImage]
     shape: tuple[int, ...]
 
     @property
@@ -62,7 +62,7 @@ class PictureSet:
         return len(self.truth)
 
 
-def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = None) -> PictureSet:
+def fill(items: Sequence[TrainingImage], *, device: str = "cpu", threads: int | None = None) -> PictureSet:
     """Read all images, in parallel, into the fastest memory that has room for them.
 
     That is the device, else the host; if neither has room, images stay on disk and are read on access.
@@ -83,24 +83,26 @@ def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = No
     shape = items[0].read().shape
     truth = tuple(item.truth for item in items)
     required_bytes = len(items) * math.prod(shape)
-    device = next((candidate for candidate in (device, "cpu") if required_bytes < ROOM * free_memory(candidate)), "")
+    device = next(
+        (candidate for candidate in (device, "cpu") if required_bytes < MEMORY_SHARE * free_memory(candidate)), ""
+    )
     if not device:
         return PictureSet(OnDisk(items, shape), truth)
     images = torch.empty((len(items), *shape), dtype=torch.uint8, device=device)
 
-    def load(start: int) -> None:
-        block = [_read(items, index, shape) for index in range(start, min(start + 32, len(items)))]
-        images[start : start + len(block)] = torch.stack(block).to(device)
+    def load(first_index: int) -> None:
+        block = [_read(items, index, shape) for index in range(first_index, min(first_index + 32, len(items)))]
+        images[first_index : first_index + len(block)] = torch.stack(block).to(device)
 
     with ThreadPoolExecutor(threads or max(8, (os.cpu_count() or 8) // 4)) as pool:
         list(pool.map(load, range(0, len(items), 32)))
     return PictureSet(images, truth)
 
 
-def _read(items: Sequence[Item], number: int, shape: tuple[int, ...]) -> Tensor:
-    image = items[number].read()
+def _read(items: Sequence[TrainingImage], image_count: int, shape: tuple[int, ...]) -> Tensor:
+    image = items[image_count].read()
     if image.shape != shape:
-        raise ConfigError(f"picture {number} has the size {image.shape[:2]}, the first {shape[:2]}")
+        raise ConfigError(f"picture {image_count} has the size {image.shape[:2]}, the first {shape[:2]}")
     return torch.from_numpy(np.ascontiguousarray(image))
 
 
@@ -115,33 +117,33 @@ def free_memory(device: str) -> float:
         return math.inf
 
 
-def repeats(truths: Sequence[Truth], least: float) -> F64 | None:
-    """How often to show each picture in an epoch, so that rare classes are seen.
+def repeats(truths: Sequence[Truth], min_share: float) -> F64 | None:
+    """Return the number of repetitions of each image in an epoch, so that rare classes are seen.
 
-    A picture is shown at least once; it is shown sqrt(least / share) times if it shows a class whose share of the
-    pictures is below `least`.
+    An image is shown at least once; it is shown sqrt(min_share / share) times if it shows a class whose share of the
+    images is below `min_share`.
 
     Args:
         truths: The truth of each picture [n]; crowd objects do not count.
-        least: Share of the pictures below which a class counts as rare; 0 or less: each picture is shown once.
+        min_share: Share of the pictures below which a class counts as rare; 0 or less: each picture is shown once.
 
     Returns:
         Times, not rounded [n]; None: all once.
 
     Source: Gupta, Dollár and Girshick, LVIS: A Dataset for Large Vocabulary Instance Segmentation (CVPR 2019).
     """
-    if least <= 0:
+    if min_share <= 0:
         return None
     labels_by_image = [
         torch.unique(image_truth.label if image_truth.crowd is None else image_truth.label[~image_truth.crowd]).tolist()
         for image_truth in truths
     ]
     image_counts = Counter(label for labels in labels_by_image for label in labels)
-    factors = {label: max(1.0, math.sqrt(least * len(truths) / count)) for label, count in image_counts.items()}
+    factors = {label: max(1.0, math.sqrt(min_share * len(truths) / count)) for label, count in image_counts.items()}
     return np.array([max((factors[label] for label in labels), default=1.0) for labels in labels_by_image])
 
 
-def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = None) -> list[list[int]]:
+def order(count: int, batch: int, *, seed: int, epoch: int, weights: F64 | None = None) -> list[list[int]]:
     """Random batches of an epoch.
 
     Args:
@@ -149,7 +151,7 @@ def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = 
         batch: Pictures in a batch; a short last batch is dropped unless it is the only one.
         seed: Seed of the training.
         epoch: Number of the epoch.
-        often: How often each picture is shown [count] (see `repeats`). Fractions are drawn at random such that every
+        weights: How often each picture is shown [count] (see `repeats`). Fractions are drawn at random such that every
             epoch has the same number of batches.
 
     Returns:
@@ -157,8 +159,8 @@ def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = 
     """
     random = np.random.default_rng([seed, epoch])
     shuffled = random.permutation(count)
-    if often is not None:
-        cumulative = np.cumsum(often[shuffled])
+    if weights is not None:
+        cumulative = np.cumsum(weights[shuffled])
         image_count = math.ceil(cumulative[-1] - 1e-9)
         # Systematic sampling: frequencies are met within one, and the total is exact.
         positions = (np.arange(image_count) + random.random()) * (cumulative[-1] / image_count)
@@ -182,8 +184,8 @@ def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
     def transferred(values: list[Tensor | None]) -> list[Tensor | None]:
         if any(value is None for value in values):
             return [None if value is None else _send(value, device) for value in values]
-        present = [value for value in values if value is not None]
-        return list(torch.split(_send(torch.cat(present), device), counts))
+        present_values = [value for value in values if value is not None]
+        return list(torch.split(_send(torch.cat(present_values), device), counts))
 
     columns = {
         name: transferred([getattr(image_truth, name) for image_truth in truths]) for name in ("label", "box", "crowd")
@@ -211,7 +213,7 @@ def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class Augmentation:
     """Geometric augmentation of one image: mirrored, then scaled by `zoom` and moved by `shift` (x, y) pixels."""
 
     mirror: bool
@@ -221,7 +223,7 @@ class Change:
 
 def draw_change(
     recipe: Recipe, size: tuple[int, int], rng: np.random.Generator, *, lens: Tensor | None = None
-) -> Change:
+) -> Augmentation:
     """A random change of a picture of `size` (height, width).
 
     With an intrinsic `lens` [3, 3] the zoom is about the principal point, as a lens zooms: where the ground meets an
@@ -236,22 +238,22 @@ def draw_change(
     if lens is not None:
         crop_position = [float(lens[0, 2]) / size[1], float(lens[1, 2]) / size[0]]
         crop_position[0] = 1.0 - crop_position[0] if mirror else crop_position[0]
-    return Change(mirror, zoom, (crop_position[0] * free_range[0], crop_position[1] * free_range[1] + row_shift))
+    return Augmentation(mirror, zoom, (crop_position[0] * free_range[0], crop_position[1] * free_range[1] + row_shift))
 
 
 def change_truths(
-    truths: Sequence[Truth], changes: Sequence[Change], size: tuple[int, int], *, keep: float
+    truths: Sequence[Truth], changes: Sequence[Augmentation], size: tuple[int, int], *, min_visible_share: float
 ) -> list[Truth]:
     """Return the truth of augmented images.
 
-    In 2D, an object whose visible share falls below `keep` becomes crowd, and is removed once it is invisible. In
-    3D, an object is removed when its centre leaves the image.
+    In 2D, an object whose visible share falls below `min_visible_share` becomes crowd, and is removed once it is
+    invisible. In 3D, an object is removed when its centre leaves the image.
 
     Args:
         truths: Truth before the augmentation, all with or all without 3D boxes.
         changes: Augmentation of each image.
         size: Height and width, the same for all images.
-        keep: Minimum visible share of an object that counts, in 2D.
+        min_visible_share: Minimum visible share of an object that counts, in 2D.
 
     Returns:
         Truth after the augmentation.
@@ -277,7 +279,7 @@ def change_truths(
         if truths[0].solid is None or intrinsics is None
         else _mirrored([image_truth.solid for image_truth in truths], mirror[image_index])
     )
-    crowd = torch.cat(
+    is_crowd = torch.cat(
         [
             torch.zeros(len(image_truth.box), dtype=torch.bool) if image_truth.crowd is None else image_truth.crowd
             for image_truth in truths
@@ -289,7 +291,7 @@ def change_truths(
         is_kept = (centre >= 0).all(-1) & (centre[:, 0] < width) & (centre[:, 1] < height)
         is_kept &= (solid.centre[:, 2] > 0) & (visible_share > 0)
     else:
-        crowd |= visible_share < keep
+        is_crowd |= visible_share < min_visible_share
         is_kept = visible_share > 0.02
     kept_counts = torch.bincount(image_index[is_kept], minlength=len(truths)).tolist()
 
@@ -299,7 +301,7 @@ def change_truths(
     labels, boxes, crowds = (
         split_kept(torch.cat([image_truth.label for image_truth in truths])),
         split_kept(clipped),
-        split_kept(crowd),
+        split_kept(is_crowd),
     )
     solids: list[Solids | None] = [None] * len(truths)
     if solid is not None:
@@ -323,10 +325,10 @@ def _changed_lens(
     lenses: Sequence[Tensor | None], mirror: Tensor, zoom: Tensor, shift: Tensor, width: int
 ) -> Tensor | None:
     """Intrinsics [B, 3, 3] of the changed pictures; None where there are none."""
-    present = [matrix for matrix in lenses if matrix is not None]
-    if len(present) < len(lenses):
+    present_lenses = [matrix for matrix in lenses if matrix is not None]
+    if len(present_lenses) < len(lenses):
         return None
-    intrinsics = torch.stack(present)
+    intrinsics = torch.stack(present_lenses)
     intrinsics[:, 0, 2] = torch.where(mirror, width - intrinsics[:, 0, 2], intrinsics[:, 0, 2])
     intrinsics[:, :2, :2] *= zoom.to(intrinsics)[:, None, None]
     intrinsics[:, :2, 2] = zoom.to(intrinsics)[:, None] * intrinsics[:, :2, 2] + shift.to(intrinsics)
@@ -335,71 +337,71 @@ def _changed_lens(
 
 def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
     """Return all solids in one table, those of mirrored images mirrored."""
-    present = [solid for solid in solids if solid is not None]
-    table = Solids.cat(present)
+    present_solids = [solid for solid in solids if solid is not None]
+    table = Solids.cat(present_solids)
     sign = torch.where(mirror, -1.0, 1.0).to(table.centre)[:, None]
-    unchanged = torch.ones_like(sign)
+    ones = torch.ones_like(sign)
     return replace(
         table,
-        centre=table.centre * torch.cat([sign, unchanged, unchanged], 1),
-        velocity=table.velocity * torch.cat([sign, unchanged], 1),
+        centre=table.centre * torch.cat([sign, ones, ones], 1),
+        velocity=table.velocity * torch.cat([sign, ones], 1),
         yaw=torch.where(mirror, torch.pi - table.yaw, table.yaw),
     )
 
 
-def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
-    """Pictures float [B, 3, H, W] after their changes; grey where there is nothing.
+def change_pictures(images: Tensor, changes: Sequence[Augmentation]) -> Tensor:
+    """Return images, float [B, 3, H, W], after their augmentation; grey where there is nothing.
 
-    Below a zoom of `SHRUNK` samples are taken from the picture averaged to half its size: at full size they would skip
-    pixels, which no camera does.
+    Below a zoom of `HALVING_ZOOM` samples are taken from the image averaged to half its size: at full size they would
+    skip pixels, which no camera does.
     """
     if all(not change.mirror and change.zoom == 1.0 for change in changes):
-        return pictures
-    height, width = pictures.shape[2:]
+        return images
+    height, width = images.shape[2:]
     matrices = []
     for change in changes:
         sign = -1.0 if change.mirror else 1.0
         x = sign * (1 / change.zoom - 2 * change.shift[0] / (change.zoom * width) - 1)
         y = 1 / change.zoom - 2 * change.shift[1] / (change.zoom * height) - 1
         matrices.append([[sign / change.zoom, 0.0, x], [0.0, 1 / change.zoom, y]])
-    transforms = _send(torch.tensor(matrices, dtype=pictures.dtype), pictures.device)
-    grid = affine_grid(transforms, list(pictures.shape), align_corners=False)
+    transforms = _send(torch.tensor(matrices, dtype=images.dtype), images.device)
+    grid = affine_grid(transforms, list(images.shape), align_corners=False)
     # grid_sample pads with zeros, so grey must be zero.
-    offsets = pictures - GREY
+    offsets = images - GREY
     augmented = torch.empty_like(offsets)
     half_size = (max(height // 2, 1), max(width // 2, 1))
     for is_small in (False, True):
-        member_indices = [index for index, change in enumerate(changes) if (change.zoom < SHRUNK) == is_small]
+        member_indices = [index for index, change in enumerate(changes) if (change.zoom < HALVING_ZOOM) == is_small]
         if member_indices:
-            selected = _send(torch.tensor(member_indices), pictures.device)
+            selected = _send(torch.tensor(member_indices), images.device)
             source = adaptive_avg_pool2d(offsets[selected], half_size) if is_small else offsets[selected]
             augmented[selected] = grid_sample(source, grid[selected], align_corners=False)
     return augmented + GREY
 
 
-def change_colours(pictures: Tensor, recipe: Recipe, draws: torch.Generator) -> Tensor:
+def change_colours(images: Tensor, recipe: Recipe, rng: torch.Generator) -> Tensor:
     """Brightness, contrast, saturation and gamma of each picture moved at random; noise added; in [0, 1]."""
     if recipe.jitter <= 0 and recipe.noise <= 0:
-        return pictures
-    device = pictures.device
+        return images
+    device = images.device
 
     def random_factor(spread: float) -> Tensor:
-        value = torch.rand((len(pictures), 1, 1, 1), generator=draws)
+        value = torch.rand((len(images), 1, 1, 1), generator=rng)
         return _send(1.0 + spread * (2 * value - 1), device)
 
-    luminance = pictures.mean(1, keepdim=True)
-    pictures = luminance + (pictures - luminance) * random_factor(1.5 * recipe.jitter)
-    mean_value = pictures.mean((1, 2, 3), keepdim=True)
-    pictures = (mean_value + (pictures - mean_value) * random_factor(recipe.jitter)) * random_factor(recipe.jitter)
-    tint = 1.0 + recipe.jitter * 0.15 * (torch.rand((len(pictures), 3, 1, 1), generator=draws) * 2 - 1)
-    pictures = pictures * _send(tint, device)
-    pictures = pictures.clamp(1e-4, 1.0) ** random_factor(recipe.jitter)
+    luminance = images.mean(1, keepdim=True)
+    images = luminance + (images - luminance) * random_factor(1.5 * recipe.jitter)
+    mean_value = images.mean((1, 2, 3), keepdim=True)
+    images = (mean_value + (images - mean_value) * random_factor(recipe.jitter)) * random_factor(recipe.jitter)
+    tint = 1.0 + recipe.jitter * 0.15 * (torch.rand((len(images), 3, 1, 1), generator=rng) * 2 - 1)
+    images = images * _send(tint, device)
+    images = images.clamp(1e-4, 1.0) ** random_factor(recipe.jitter)
     if recipe.noise > 0:
-        noise_level = _send(torch.rand((len(pictures), 1, 1, 1), generator=draws), device) ** 2 * recipe.noise
+        noise_level = _send(torch.rand((len(images), 1, 1, 1), generator=rng), device) ** 2 * recipe.noise
         # Noise is drawn on the device; its seed comes from the key of the batch.
-        noise_generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=draws)))
-        pictures = pictures + torch.randn(pictures.shape, generator=noise_generator, device=device) * noise_level
-    return pictures.clamp(0.0, 1.0)
+        noise_generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=rng)))
+        images = images + torch.randn(images.shape, generator=noise_generator, device=device) * noise_level
+    return images.clamp(0.0, 1.0)
 
 
 def make_batch(
@@ -412,5 +414,5 @@ def make_batch(
     images = bank.pictures[selected].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
     size = (images.shape[2], images.shape[3])
     changes = [draw_change(recipe, size, random, lens=bank.truth[index].intrinsic) for index in indices]
-    truths = change_truths([bank.truth[index] for index in indices], changes, size, keep=recipe.keep)
+    truths = change_truths([bank.truth[index] for index in indices], changes, size, min_visible_share=recipe.keep)
     return change_colours(change_pictures(images, changes), recipe, torch_random), move(truths, device)

@@ -19,7 +19,7 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.core import errors, safeio
-from ssad.core.checkpoints import Card, hash_state, load_weights, save_weights, start_from
+from ssad.core.checkpoints import WeightsCard, hash_state, load_weights, save_weights, start_from
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -29,9 +29,9 @@ from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import score_2d, score_3d
-from ssad.training.batches import Item, PictureSet, fill
+from ssad.training.batches import PictureSet, TrainingImage, fill
 from ssad.training.data import nuscenes_items
-from ssad.training.loop import LAST, LOG, Share, read_last, read_rows, train, write_row
+from ssad.training.loop import LAST_CHECKPOINT, LOG, Share, read_last, read_rows, train, write_row
 from ssad.training.recipe import Recipe, find_recipe, recipe_data, set_words
 
 Say = Callable[[str], None]
@@ -39,7 +39,7 @@ VAL_SCENES = 4  # scenes of a nuScenes data set for validation during training; 
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class DetectorPlan:
     """Plan of a detector training.
 
     Attributes:
@@ -69,18 +69,18 @@ class Plan:
     val_data: Path | None = None
 
 
-def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
+def parse_changes(settings: Sequence[str]) -> tuple[tuple[str, Any], ...]:
     """Parse key=value pairs, values as YAML.
 
     Raises:
         ConfigError: A pair has no "=".
     """
     changes = []
-    for text in texts:
-        key, equals, value = text.partition("=")
+    for setting in settings:
+        key, equals, value = setting.partition("=")
         if not equals:
-            raise ConfigError(f"--set {text}: expected key=value")
-        parsed = safeio.parse_yaml(value, text)
+            raise ConfigError(f"--set {setting}: expected key=value")
+        parsed = safeio.parse_yaml(value, setting)
         changes.append((key.strip(), tuple(parsed) if isinstance(parsed, list) else parsed))
     return tuple(changes)
 
@@ -102,7 +102,7 @@ def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
     ]
 
 
-def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
+def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[TrainingImage]]:
     """Return classes and images of a split of recordings.
 
     Raises:
@@ -114,16 +114,16 @@ def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
     data = read_coco(path)
     truths = coco_truth(data)
     return data.classes, [
-        Item(partial(read_image, image.file), truth) for image, truth in zip(data.images, truths, strict=True)
+        TrainingImage(partial(read_image, image.file), truth) for image, truth in zip(data.images, truths, strict=True)
     ]
 
 
-def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
+def run_training(plan: DetectorPlan, *, report: Say = print) -> Iterator[str]:
     """Train a detector, and write OUT/NAME.safetensors with its card.
 
     Args:
         plan: Plan of the training.
-        say: Called with progress messages.
+        report: Called with progress messages.
 
     Yields:
         Lines about what was written.
@@ -141,7 +141,7 @@ def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
         with _one_line():
             spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)  # type: ignore[no-untyped-call]
     else:
-        _run(plan, recipe, device, Share(), say)
+        _run(plan, recipe, device, Share(), report)
     log_lines = safeio.read_text(plan.out / LOG).splitlines()
     yield (
         f"{plan.out / f'{recipe.detector}.safetensors'}: {len(log_lines)} epochs; card, {LOG} and curves.png beside it"
@@ -162,12 +162,12 @@ def _one_line() -> Iterator[None]:
         raise getattr(errors, name)(text) from None
 
 
-def _device(wanted: str) -> str:
-    if wanted not in ("auto", "cpu", "cuda"):
-        raise ConfigError(f"--device {wanted}: expected auto, cpu or cuda")
-    if wanted == "cuda" and not torch.cuda.is_available():
+def _device(requested: str) -> str:
+    if requested not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"--device {requested}: expected auto, cpu or cuda")
+    if requested == "cuda" and not torch.cuda.is_available():
         raise ConfigError("--device cuda: no CUDA device is usable here (see: ssad doctor); use --device cpu")
-    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+    return "cuda" if requested != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def _free_port() -> int:
@@ -176,7 +176,7 @@ def _free_port() -> int:
         return int(listener.getsockname()[1])
 
 
-def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> None:
+def _worker(rank: int, plan: DetectorPlan, recipe: Recipe, port: int, backend: str) -> None:
     """Run the training in one of several processes."""
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     process_count = plan.gpus
@@ -190,20 +190,20 @@ def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> N
         distributed.destroy_process_group()
 
 
-def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
+def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: Say) -> None:
     """Run data loading, training and validation. All settings are checked before images are read."""
-    sources, options = _items(plan, three=recipe.three)
+    sources, options = _items(plan, is_3d=recipe.three)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
         unmatched_weights = start_from(detector, load_weights(plan.weights), str(plan.weights))
         if unmatched_weights:
-            say(
+            report(
                 f"{plan.weights}: {len(unmatched_weights)} weights do not fit and start fresh: "
                 f"{', '.join(unmatched_weights)}"
             )
     fingerprint = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(sources))[:16]
-    checkpoint = read_last(plan.out / LAST, recipe, fingerprint)
-    validate = _validation(plan, device, three=recipe.three)
+    checkpoint = read_last(plan.out / LAST_CHECKPOINT, recipe, fingerprint)
+    validate = _validation(plan, device, is_3d=recipe.three)
     initial_weights = _before(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"
     completed, last_epoch = (
@@ -212,12 +212,12 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
         else (0, 1)
     )
     if completed >= last_epoch and _card_epochs(weights) == completed:
-        say(f"all {completed} epochs are done, and {weights.name} is there")
+        report(f"all {completed} epochs are done, and {weights.name} is there")
         return
     del checkpoint
     # Equal shares: all processes must take the same number of steps.
     own_sources = sources[share.rank :: share.world][: len(sources) // share.world]
-    say(f"{len(sources)} pictures to learn from, {sum(len(source.truth.label) for source in sources)} objects")
+    report(f"{len(sources)} pictures to learn from, {sum(len(source.truth.label) for source in sources)} objects")
     trained = train(
         detector,
         fill(own_sources, device=device),
@@ -225,7 +225,7 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
         out=plan.out,
         device=device,
         validate=lambda candidate: validate(candidate, quick=True),
-        say=say,
+        report=report,
         share=share,
         seconds=plan.seconds,
         about=fingerprint,
@@ -235,11 +235,11 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     metrics = validate(trained, quick=False)
     row = read_rows(plan.out)[-1]
     write_row(plan.out, row | metrics)
-    say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
+    report("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
     if row["epoch"] < row["of"]:
-        say(f"stopped after {row['epoch']} of {row['of']} epochs; run it again to go on")
+        report(f"stopped after {row['epoch']} of {row['of']} epochs; run it again to go on")
     folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
-    card = Card(
+    card = WeightsCard(
         data="; ".join(map(describe_data, folders)),
         command=command_of(plan),
         seed=recipe.seed,
@@ -276,12 +276,12 @@ def _card_epochs(weights: Path) -> int:
     return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
 
 
-def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:
+def _items(plan: DetectorPlan, *, is_3d: bool) -> tuple[list[TrainingImage], dict[str, Any]]:
     """Pictures of all folders, and options of the detector. ConfigError: none, or options that do nothing."""
     options: dict[str, Any] = {}
-    if not three and plan.val_data is not None:
+    if not is_3d and plan.val_data is not None:
         raise ConfigError("--val-data is for 3D detectors; clips have a split of their own to validate on")
-    if three:
+    if is_3d:
         sources = [source for folder in plan.data for source in nuscenes_items(folder, None, plan.split)]
     else:
         sources = []
@@ -296,7 +296,7 @@ def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:
     return sources, options
 
 
-def _hash_items(items: Sequence[Item]) -> str:
+def _hash_items(items: Sequence[TrainingImage]) -> str:
     """Of what is to be learned: labels and boxes of all pictures, in their order."""
     digest_state = hashlib.sha256()
     for source in items:
@@ -334,7 +334,7 @@ def describe_data(folder: Path) -> str:
     return " ".join(["ssad record", folder.name, *arguments])
 
 
-def command_of(plan: Plan) -> str:
+def command_of(plan: DetectorPlan) -> str:
     """Return the command that repeats the training, with the names of the folders."""
     arguments = ["ssad", "train", "detector", plan.recipe, "--data", plan.data[0].name]
     for folder in plan.data[1:]:
@@ -351,9 +351,9 @@ def command_of(plan: Plan) -> str:
     return shlex.join([*arguments, *set_words(plan.changes)])
 
 
-def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
+def _validation(plan: DetectorPlan, device: str, *, is_3d: bool) -> Callable[..., dict[str, float]]:
     """Metrics of a detector on the validation split."""
-    if three:
+    if is_3d:
         root = plan.val_data or plan.data[0]
         with NuScenes(root) as dataset:
             version = dataset.version

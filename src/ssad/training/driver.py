@@ -71,10 +71,12 @@ def _town(name: str) -> LaneGraph:
     return load_town(name)
 
 
-def find_scenarios(refs: Sequence[str]) -> tuple[list[Scenario], dict[str, LaneGraph]]:
+def find_scenarios(references: Sequence[str]) -> tuple[list[Scenario], dict[str, LaneGraph]]:
     """The scenarios of some sets and files, each once, and the lane graphs of their towns."""
-    scenarios = list({member.name: member for reference in refs for member in load_scenarios(reference)}.values())
-    return scenarios, {town: _town(town) for town in sorted({member.town for member in scenarios})}
+    scenarios = list(
+        {scenario.name: scenario for reference in references for scenario in load_scenarios(reference)}.values()
+    )
+    return scenarios, {town: _town(town) for town in sorted({scenario.town for scenario in scenarios})}
 
 
 def draw_episodes(
@@ -117,12 +119,12 @@ def measure(driver: Driver, episodes: Sequence[Episode], graphs: Mapping[str, La
     }
 
 
-def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
+def run_driver_training(plan: DriverPlan, *, report: Say = print) -> Iterator[str]:
     """Train a driver, and write OUT/ALGORITHM.safetensors with its card, log.jsonl and curves.png.
 
     Args:
         plan: Plan of the training.
-        say: Called with progress messages.
+        report: Called with progress messages.
 
     Yields:
         Lines about what was written.
@@ -140,7 +142,7 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     for reference in plan.test:
         find_scenarios([reference])
     episodes = draw_episodes(scenarios, graphs, draws=learning.draws, seed=0)
-    say(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}")
+    report(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}")
     from ssad.world.sb3 import SB3VecEnv
 
     environment = VectorEnv(
@@ -162,19 +164,19 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
         metrics = measure(PolicyDriver(policy, name="candidate"), validation_episodes, graphs)
         return metrics | {"score": metrics["RC"] - metrics["CR"] - 2.0 * metrics["OF"]}
 
-    episode_keys = (safeio.dump_json([member.key, member.seed]) for member in episodes)
+    episode_keys = (safeio.dump_json([episode.key, episode.seed]) for episode in episodes)
     fingerprint = digest("driver training", *episode_keys, *([start_hash] if start_hash else []))[:16]
     state = learn(
         model,
         learning,
         plan.out,
         validate=validate,
-        say=say,
+        report=report,
         seconds=plan.seconds,
         about=fingerprint,
     )
     if state["steps"] < learning.steps:
-        say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
+        report(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
     description = f"{', '.join(plan.scenarios)}: {len(scenarios)} scenarios in {', '.join(graphs)}"
     path = plan.out / f"{plan.algorithm}.safetensors"
     yield finish(
@@ -182,12 +184,12 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     )
 
 
-def measure_all(refs: Sequence[str]) -> Callable[[Driver], dict[str, float]]:
+def measure_all(references: Sequence[str]) -> Callable[[Driver], dict[str, float]]:
     """A function that measures a driver on the nominal episodes of some sets, as `SET_CR`, `SET_RC` and `SET_OF`."""
 
     def test_driver(driver: Driver) -> dict[str, float]:
         metrics: dict[str, float] = {}
-        for reference in refs:
+        for reference in references:
             scenarios, graphs = find_scenarios([reference])
             set_metrics = measure(driver, draw_episodes(scenarios, graphs, draws=1, seed=0), graphs)
             metrics |= {f"{Path(reference).stem}_{name}": round(value, 4) for name, value in set_metrics.items()}
@@ -198,11 +200,11 @@ def measure_all(refs: Sequence[str]) -> Callable[[Driver], dict[str, float]]:
 
 def command_of(plan: DriverPlan) -> str:
     """Return the command that repeats the training."""
-    words = ["ssad", "train", "driver", plan.algorithm]
+    arguments = ["ssad", "train", "driver", plan.algorithm]
     if plan.scenarios != ("training",):
-        words += ["--scenarios", ",".join(plan.scenarios)]
+        arguments += ["--scenarios", ",".join(plan.scenarios)]
     if plan.test != ("precrash", "natural"):
-        words += ["--test", ",".join(plan.test)]
+        arguments += ["--test", ",".join(plan.test)]
     if plan.start is not None:
-        words += ["--start", str(plan.start)]
-    return shlex.join([*words, *set_words(plan.changes)])
+        arguments += ["--start", str(plan.start)]
+    return shlex.join([*arguments, *set_words(plan.changes)])

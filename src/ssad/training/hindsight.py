@@ -16,7 +16,7 @@ from ssad.drivers.careful.sight import BEHIND, Path, encounters_on_paths
 from ssad.metrics.criticality import time_to_collision
 from ssad.scenarios.dynamic.frozen import braked
 
-AHEAD = 120  # points of the ego's route, 1 m apart
+ROUTE_POINTS = 120  # points of the ego's route, 1 m apart
 
 
 class Hindsight:
@@ -41,7 +41,7 @@ class Hindsight:
         rows = round(EARLIEST / dt) + 1
         self._motion = np.zeros((rows, scenes, agents, 4))  # x, y, yaw, speed; the last row is now
         self._point = np.zeros((rows, scenes), np.int64)  # of the ego's route
-        self._known = np.zeros(scenes, np.int64)
+        self._known_steps = np.zeros(scenes, np.int64)
 
     def note(self, state: WorldState) -> None:
         """Record the state of a step."""
@@ -49,11 +49,11 @@ class Hindsight:
             rows[:-1] = rows[1:]
         self._motion[-1, ..., :3], self._motion[-1, ..., 3] = state.pose, state.speed
         self._point[-1] = state.progress[:, 0]
-        self._known += 1
+        self._known_steps += 1
 
     def forget(self, scenes: npt.ArrayLike) -> None:
         """Clear the record of restarted scenes."""
-        self._known[np.asarray(scenes)] = 0
+        self._known_steps[np.asarray(scenes)] = 0
 
     def avoided(self, state: WorldState, agents: I32) -> Bool:
         """Return [N] True where the careful driver stays clear until 5 s after now.
@@ -69,38 +69,40 @@ class Hindsight:
         last_row = len(self._motion) - 1
         time_since_now: F64 = np.asarray((rows - last_row) * self.dt, np.float64)
         # Rows after now do not exist yet: the last one is extrapolated.
-        other = _stopping(self._motion[np.minimum(rows, last_row), scene[:, None], agent[:, None]], time_since_now)
-        start = self._motion[danger_row, scene, 0]
-        start_pose = start[:, None, :3]
+        stopped_motion = _stopping(
+            self._motion[np.minimum(rows, last_row), scene[:, None], agent[:, None]], time_since_now
+        )
+        ego_start = self._motion[danger_row, scene, 0]
+        start_pose = ego_start[:, None, :3]
         first_point, point_count = np.moveaxis(state.route[scene, 0], -1, 0)
-        route_point = np.maximum(self._point[danger_row, scene] - 2, 0)[:, None] + np.arange(AHEAD)
+        route_point = np.maximum(self._point[danger_row, scene] - 2, 0)[:, None] + np.arange(ROUTE_POINTS)
         route = to_local(
             start_pose, state.roads.path[first_point[:, None] + np.minimum(route_point, point_count[:, None] - 1), :2]
         )
         path = Path(route)
-        place: F64 = np.asarray(to_local(start_pose, other[..., :2]), np.float64)
-        yaw = other[..., 2] - start[:, None, 2]
+        local_positions: F64 = np.asarray(to_local(start_pose, stopped_motion[..., :2]), np.float64)
+        yaw = stopped_motion[..., 2] - ego_start[:, None, 2]
         other_size = np.broadcast_to(state.size[scene, agent][:, None].astype(np.float64), (*yaw.shape, 2))
         ego_size = state.size[scene, 0].astype(np.float64)
-        speed = np.maximum(start[:, 3], 0.0)
+        speed = np.maximum(ego_start[:, 3], 0.0)
         encounter = encounters_on_paths(
             path,
             half_extent=0.5 * ego_size,
-            places=place,
+            places=local_positions,
             yaw=yaw,
-            speed=other[..., 3],
+            speed=stopped_motion[..., 3],
             size=other_size,
             own_speed=speed,
             own_accel=speed * 0.0,
         )
-        driven = self._drive(path, squared_bend_speeds(route), encounter, 0.5 * ego_size[:, 0])
-        ego = np.concatenate([driven, np.broadcast_to(ego_size[:, None], (*yaw.shape, 2))], -1)
-        distance = obb_distance(ego, np.concatenate([place, yaw[..., None], other_size], -1))
+        ego_path = self._drive(path, squared_bend_speeds(route), encounter, 0.5 * ego_size[:, 0])
+        ego = np.concatenate([ego_path, np.broadcast_to(ego_size[:, None], (*yaw.shape, 2))], -1)
+        distance = obb_distance(ego, np.concatenate([local_positions, yaw[..., None], other_size], -1))
         return np.asarray(((distance > 0.0) | (rows > last_row + round(AFTER / self.dt))).all(1))
 
     def _begins(self, state: WorldState, scene: int, agent: int) -> int:
         """Return the row at which the danger begins."""
-        first_row = max(len(self._motion) - int(self._known[scene]), 0)
+        first_row = max(len(self._motion) - int(self._known_steps[scene]), 0)
         motion = self._motion[first_row:, scene][:, [0, agent]]
         size = np.broadcast_to(state.size[scene, [0, agent]], (*motion.shape[:2], 2))
         boxes = np.concatenate([motion[..., :3], size], -1)
@@ -108,36 +110,48 @@ class Hindsight:
         on_course = time_to_collision(boxes[:, 0], boxes[:, 1], velocity[:, 0] - velocity[:, 1]) <= HORIZON
         return first_row + conflict_start(on_course)
 
-    def _drive(self, path: Path, allowed: F64, met: Encounter, half: F64) -> F64:
-        """Poses of the careful driver [N, T, 3]: it starts at the origin and keeps to its path.
+    def _drive(self, path: Path, speed_caps: F64, encounter: Encounter, half_length: F64) -> F64:
+        """Return the poses [N, T, 3] of the careful driver, which starts at the origin and keeps to its path.
 
         Args:
             path: The path.
-            allowed: What its bends allow.
-            met: The other at each step, as if the driver stayed where it is.
-            half: [N] half the length of its body, m.
+            speed_caps: Speed limits by its bends.
+            encounter: The other at each step, as if the driver stayed where it is.
+            half_length: [N] half the length of its body, m.
         """
-        v, bend = met.speed[:, 0], np.arange(allowed.shape[1]) - 1.0  # a driver sees its route from a metre ahead on
-        keeps = np.maximum(v, 1.0)
-        here, left, _ = (part[:, 0] for part in path.project(np.zeros((len(v), 1, 2))))
-        x, accel, memory, poses = np.zeros(len(v)), np.zeros(len(v)), initial_reaction(v.shape), []
-        for t in range(met.gap.shape[1]):
-            aside = left * np.maximum(1.0 - x / 10.0, 0.0)
-            poses.append(np.concatenate([path.at(here + x, aside), path.heading(here + x)[:, None]], 1))
-            now = {name: value[:, t] for name, value in vars(met).items()}
-            e = Encounter(**now | {"speed": v, "accel": accel, "gap": now["gap"] - x})
-            asked, memory = react(self.model, e, memory, self.dt)
-            slow = bend_speed(allowed, bend - (here - BEHIND + x)[:, None])
-            push = np.clip(2.0 * (np.minimum(keeps, slow) - v), -2.0 * EASY, PULL)
-            push = np.where(is_coming(e), np.minimum(push, 0.0), push)
-            asked = np.where(is_in_the_way(e, half) & (v < 1.5), np.maximum(asked, 2.0 * EASY), asked)
-            after = np.maximum(v + np.where(asked > 0.0, np.minimum(push, -asked), push) * self.dt, 0.0)
-            x, accel, v = x + 0.5 * (v + after) * self.dt, (after - v) / self.dt, after
+        speed = encounter.speed[:, 0]
+        bend_positions = np.arange(speed_caps.shape[1]) - 1.0  # a driver sees its route from a metre ahead on
+        kept_speed = np.maximum(speed, 1.0)
+        arc_position, left, _ = (part[:, 0] for part in path.project(np.zeros((len(speed), 1, 2))))
+        x, accel, memory, poses = np.zeros(len(speed)), np.zeros(len(speed)), initial_reaction(speed.shape), []
+        for t in range(encounter.gap.shape[1]):
+            lateral_offset = left * np.maximum(1.0 - x / 10.0, 0.0)
+            poses.append(
+                np.concatenate([path.at(arc_position + x, lateral_offset), path.heading(arc_position + x)[:, None]], 1)
+            )
+            current_values = {name: value[:, t] for name, value in vars(encounter).items()}
+            current_encounter = Encounter(
+                **current_values | {"speed": speed, "accel": accel, "gap": current_values["gap"] - x}
+            )
+            requested_accel, memory = react(self.model, current_encounter, memory, self.dt)
+            bend_limit = bend_speed(speed_caps, bend_positions - (arc_position - BEHIND + x)[:, None])
+            free_accel = np.clip(2.0 * (np.minimum(kept_speed, bend_limit) - speed), -2.0 * EASY, PULL)
+            free_accel = np.where(is_coming(current_encounter), np.minimum(free_accel, 0.0), free_accel)
+            requested_accel = np.where(
+                is_in_the_way(current_encounter, half_length) & (speed < 1.5),
+                np.maximum(requested_accel, 2.0 * EASY),
+                requested_accel,
+            )
+            next_speed = np.maximum(
+                speed + np.where(requested_accel > 0.0, np.minimum(free_accel, -requested_accel), free_accel) * self.dt,
+                0.0,
+            )
+            x, accel, speed = x + 0.5 * (speed + next_speed) * self.dt, (next_speed - speed) / self.dt, next_speed
         return np.stack(poses, 1)
 
 
-def _stopping(motion: F64, late: F64) -> F64:
-    """Rows [N, T, 4] of x, y, yaw and speed of who brakes to a stop straight ahead from `late` = 0 s on."""
+def _stopping(motion: F64, delay: F64) -> F64:
+    """Return rows [N, T, 4] of x, y, yaw and speed of an agent that brakes to a stop from `delay` = 0 s on."""
     x, y, yaw, speed = np.moveaxis(motion, -1, 0)
-    distance, speed_left = braked(speed, late)
+    distance, speed_left = braked(speed, delay)
     return np.stack([x + distance * np.cos(yaw), y + distance * np.sin(yaw), yaw, speed_left], -1)

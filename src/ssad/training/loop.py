@@ -24,7 +24,7 @@ from ssad.training.batches import PictureSet, make_batch, order, repeats
 from ssad.training.recipe import Recipe, recipe_data
 
 LOG = "log.jsonl"
-LAST = "last.pt"
+LAST_CHECKPOINT = "last.pt"
 
 
 class Step(nn.Module):
@@ -66,7 +66,7 @@ def train(
     out: Path,
     device: str = "cpu",
     validate: Callable[[Any], dict[str, float]] | None = None,
-    say: Callable[[str], None] = lambda line: None,
+    report: Callable[[str], None] = lambda line: None,
     share: Share = Share(),
     seconds: float | None = None,
     about: str = "",
@@ -82,7 +82,7 @@ def train(
         out: Folder to write to.
         device: Where to train.
         validate: Metrics of a detector; called every `recipe.validate` epochs but the last.
-        say: Called with a line about progress.
+        report: Called with a line about progress.
         share: The part of the work of this process.
         seconds: Stop after the epoch in which this time runs out, s; it can be resumed.
         about: What else the result depends on (data, first weights); it must be the same when the training is resumed.
@@ -114,10 +114,12 @@ def train(
     update_average = _follower(average, detector)
     local_batch = max(recipe.batch // share.world, 1)
     frequencies = repeats(bank.truth, recipe.rare)
-    per_epoch = _same(len(order(len(bank), local_batch, seed=0, epoch=0, often=frequencies)), share, target_device)
-    epoch, step, time_spent, fastest = _resume(out / LAST, detector, average, optimizer, recipe, about)
-    start = time.monotonic()
-    while epoch < (last_epoch := _same(recipe.last_epoch(epoch, time_spent, fastest), share, target_device)):
+    per_epoch = _common_count(
+        len(order(len(bank), local_batch, seed=0, epoch=0, weights=frequencies)), share, target_device
+    )
+    epoch, step, time_spent, fastest = _resume(out / LAST_CHECKPOINT, detector, average, optimizer, recipe, about)
+    start_time = time.monotonic()
+    while epoch < (last_epoch := _common_count(recipe.last_epoch(epoch, time_spent, fastest), share, target_device)):
         total_steps = per_epoch * last_epoch
         _training_mode(detector, recipe)
         loss_sums: dict[str, Tensor] = {}
@@ -125,7 +127,7 @@ def train(
         learning_rate = recipe.lr
         seed = recipe.seed * 1000 + share.rank
         for batch_index, indices in enumerate(
-            order(len(bank), local_batch, seed=seed, epoch=epoch, often=frequencies)[:per_epoch]
+            order(len(bank), local_batch, seed=seed, epoch=epoch, weights=frequencies)[:per_epoch]
         ):
             learning_rate = recipe.rate(step, total_steps, per_epoch)
             for group in optimizer.param_groups:
@@ -162,7 +164,7 @@ def train(
             raise ConfigError(f"the loss is not finite in epoch {epoch}; use a smaller lr")
         # All processes hold the same weights; the first one writes them.
         if share.rank == 0:
-            final = average if average is not None else detector
+            final_detector = average if average is not None else detector
             state = {
                 "model": detector.state_dict(),
                 "average": None if average is None else average.state_dict(),
@@ -176,15 +178,15 @@ def train(
             }
             _save(out, state, row)
             if validate is not None and epoch % recipe.validate == 0 and epoch < final_epoch:
-                row |= validate(final.eval())
+                row |= validate(final_detector.eval())
                 write_row(out, row)
-            say(
+            report(
                 "  ".join(
                     f"{column} {entry:.4g}" if isinstance(entry, float) else f"{column} {entry}"
                     for column, entry in row.items()
                 )
             )
-        if seconds is not None and _over(time.monotonic() - start > seconds, share, target_device):
+        if seconds is not None and _time_is_over(time.monotonic() - start_time > seconds, share, target_device):
             break
     result = average if average is not None else detector
     return result.requires_grad_(False).eval()
@@ -226,35 +228,35 @@ def harden(step: Step, images: Tensor, truth: list[Truth], recipe: Recipe, *, ke
     noise = 2 * torch.rand(images.shape, generator=generator, device=images.device) - 1
     attacked = budget.project(images + budget.start(noise, "uniform"), images)
     step_length = budget.radius * min(1.25, 2.5 / recipe.attack_steps)
-    modes = [(module, module.training) for module in detector.modules()]
-    for module, _ in modes:
+    training_modes = [(module, module.training) for module in detector.modules()]
+    for module, _ in training_modes:
         # Attack steps must not update running statistics.
         module.training = module.training and not isinstance(module, nn.modules.batchnorm._BatchNorm)
     for _ in range(recipe.attack_steps):
         variable = attacked.detach().requires_grad_()
         (gradient,) = torch.autograd.grad(torch.stack(list(step(variable, truth).values())).sum(), variable)
         attacked = budget.project(attacked + step_length * budget.steepest(gradient), images)
-    for module, mode in modes:
+    for module, mode in training_modes:
         module.training = mode
     return attacked
 
 
-def _same(count: int, share: Share, where: torch.device) -> int:
+def _common_count(count: int, share: Share, device: torch.device) -> int:
     """The least of all processes' counts: their shares of the data differ, their numbers of steps must not."""
     if share.world == 1:
         return count
-    smallest = torch.tensor(float(count), device=where)
-    distributed.all_reduce(smallest, distributed.ReduceOp.MIN)
-    return int(smallest)
+    minimum = torch.tensor(float(count), device=device)
+    distributed.all_reduce(minimum, distributed.ReduceOp.MIN)
+    return int(minimum)
 
 
-def _over(mine: bool, share: Share, where: torch.device) -> bool:
-    """Whether time is over, as the first process says: all must stop after the same epoch."""
+def _time_is_over(is_over: bool, share: Share, device: torch.device) -> bool:
+    """Return whether the time is over in the first process: all must stop after the same epoch."""
     if share.world == 1:
-        return mine
-    flag = torch.tensor(float(mine), device=where)
-    distributed.broadcast(flag, 0)
-    return bool(flag)
+        return is_over
+    vote = torch.tensor(float(is_over), device=device)
+    distributed.broadcast(vote, 0)
+    return bool(vote)
 
 
 def _unfreeze(detector: Any, recipe: Recipe) -> None:
@@ -284,8 +286,8 @@ def _optimizer(detector: Any, recipe: Recipe) -> torch.optim.Optimizer:
     ]
     if recipe.optimizer == "sgd":
         return torch.optim.SGD(groups, lr=recipe.lr, momentum=recipe.momentum)
-    fused = all(parameter.is_cuda for parameter in trainable)
-    return torch.optim.AdamW(groups, lr=recipe.lr, betas=(recipe.momentum, 0.999), fused=fused)
+    use_fused = all(parameter.is_cuda for parameter in trainable)
+    return torch.optim.AdamW(groups, lr=recipe.lr, betas=(recipe.momentum, 0.999), fused=use_fused)
 
 
 def _follower(average: Any, detector: Any) -> Callable[[float], None]:
@@ -316,7 +318,7 @@ def _follower(average: Any, detector: Any) -> Callable[[float], None]:
 def _save(out: Path, state: dict[str, Any], row: dict[str, Any]) -> None:
     safeio.make_folder(out)
     try:
-        with safeio.atomic_path(out / LAST) as path:
+        with safeio.atomic_path(out / LAST_CHECKPOINT) as path:
             torch.save(state, path)
     except OSError as error:
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None

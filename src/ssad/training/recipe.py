@@ -112,17 +112,17 @@ class Recipe:
         """True for 3D detectors."""
         return self.detector.startswith(("fcos3d", "pgd"))
 
-    def last_epoch(self, done: int, spent: float, quickest: float) -> int:
+    def last_epoch(self, completed: int, elapsed_seconds: float, fastest_epoch: float) -> int:
         """The epoch after which the training ends, as far as can be told.
 
         Args:
-            done: Epochs that are done.
-            spent: Time that they took, s.
-            quickest: Time that the quickest took, s; inf before the first.
+            completed: Epochs that are done.
+            elapsed_seconds: Time that they took, s.
+            fastest_epoch: Time that the quickest took, s; inf before the first.
         """
-        if not self.within or not done:
+        if not self.within or not completed:
             return self.epochs
-        return min(self.epochs, done + max(0, int((self.within - spent) / max(quickest, 1e-9))))
+        return min(self.epochs, completed + max(0, int((self.within - elapsed_seconds) / max(fastest_epoch, 1e-9))))
 
     def rate(self, step: int, total: int, per_epoch: int) -> float:
         """Return the learning rate of a step out of `total`."""
@@ -200,7 +200,9 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
-    return checked(partial(replace, RECIPES[name]), changes, what=f"recipe {name}", kind=Recipe, fixed="detector")
+    return checked(
+        partial(replace, RECIPES[name]), changes, subject=f"recipe {name}", kind=Recipe, name_field="detector"
+    )
 
 
 def set_words(changes: Iterable[tuple[str, Any]]) -> list[str]:

@@ -19,7 +19,7 @@ import torch
 from pydantic.dataclasses import dataclass
 
 from ssad.core import safeio
-from ssad.core.checkpoints import Card, read_state, save_weights
+from ssad.core.checkpoints import WeightsCard, read_state, save_weights
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.core.schema import VALUES, Above, Part, Whole, checked
@@ -27,13 +27,13 @@ from ssad.training.recipe import Decay, FromNone
 from ssad.world.actions import ACTIONS, CHOICES
 from ssad.world.policy import Policy, PolicyDriver, policy_of, tensors_of
 
-LOG, LAST = "log.jsonl", "last.pt"
+LOG, LAST_CHECKPOINT = "log.jsonl", "last.pt"
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, config=VALUES)
 class Learning:
-    """How a policy is trained: all that decides the result but the scenarios.
+    """Settings of a policy training: all that decides the result but the scenarios.
 
     Attributes:
         algorithm: ppo, sac, td3, ddpg or dqn (which chooses between actions, see `ssad.world.actions.CHOICES`).
@@ -102,7 +102,9 @@ def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str
     """
     if name not in table:
         raise unknown_name("algorithm", name, table)
-    return checked(partial(replace, table[name]), changes, what=f"training {name}", kind=Learning, fixed="algorithm")
+    return checked(
+        partial(replace, table[name]), changes, subject=f"training {name}", kind=Learning, name_field="algorithm"
+    )
 
 
 def require() -> Any:
@@ -128,7 +130,7 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
     def rate_schedule(left: float) -> float:
         return final_rate + (initial_rate - final_rate) * left
 
-    common: dict[str, Any] = {
+    common_options: dict[str, Any] = {
         "learning_rate": rate_schedule,
         "gamma": learning.gamma,
         "batch_size": learning.batch,
@@ -146,7 +148,7 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
             gae_lambda=learning.gae,
             ent_coef=learning.entropy,
             policy_kwargs=policy_options,
-            **common,
+            **common_options,
         )
     off_policy_options: dict[str, Any] = {
         "buffer_size": learning.buffer,
@@ -171,7 +173,7 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
             "exploration_final_eps": learning.noise,
             "target_update_interval": 1_000,
         }
-    return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **off_policy_options, **common)
+    return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **off_policy_options, **common_options)
 
 
 def begin_with(model: Any, learning: Learning, folder: Path) -> str:
@@ -189,7 +191,7 @@ def begin_with(model: Any, learning: Learning, folder: Path) -> str:
         ConfigError: The folder has no checkpoint.
         FormatError: The checkpoint is broken, or its networks have other sizes.
     """
-    path = folder / LAST
+    path = folder / LAST_CHECKPOINT
     state = read_state(path, "key")
     if state is None:
         raise ConfigError(f"{path}: not found; start from the folder of a training with {learning.algorithm}")
@@ -225,7 +227,7 @@ def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dic
 def policy_now(model: Any, learning: Learning) -> Policy:
     """Return the current policy of a model."""
     tensors, policy_config = export(model, learning)
-    return policy_of(Card("", "", learning.seed, (), config=policy_config), tensors, "training")
+    return policy_of(WeightsCard("", "", learning.seed, (), config=policy_config), tensors, "training")
 
 
 def learn(
@@ -234,7 +236,7 @@ def learn(
     out: Path,
     *,
     validate: Callable[[Policy], dict[str, float]] | None = None,
-    say: Say = print,
+    report: Say = print,
     seconds: float | None = None,
     about: str = "",
 ) -> dict[str, Any]:
@@ -248,7 +250,7 @@ def learn(
         learning: The recipe.
         out: Folder to write to.
         validate: Metrics of a policy, of which `score` says which one is best.
-        say: Called with a line about progress.
+        report: Called with a line about progress.
         seconds: Stop after this time, s; run it again to go on.
         about: What else the result depends on; it must be the same when the training goes on.
 
@@ -263,12 +265,12 @@ def learn(
     """
     require()
     key = safeio.dump_json({"learning": asdict(learning), "about": about})
-    state = _read_last(out / LAST, key)
+    state = _read_last(out / LAST_CHECKPOINT, key)
     if state is not None:
-        _put_back(model, state, out / LAST)
+        _restore(model, state, out / LAST_CHECKPOINT)
     if model.num_timesteps >= learning.steps and state is not None:
         return state
-    callback = _keeper(model, learning, out, key=key, state=state, validate=validate, say=say, seconds=seconds)
+    callback = _keeper(model, learning, out, key=key, state=state, validate=validate, say=report, seconds=seconds)
     try:
         model.learn(learning.steps - model.num_timesteps, callback=callback, reset_num_timesteps=False)
     except ValueError as error:  # torch's distributions reject NaN
@@ -297,12 +299,14 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
                 self.keep()
 
         def _on_step(self) -> bool:
-            limit = options["seconds"]
-            return limit is None or time.monotonic() - self.began < limit
+            time_limit = options["seconds"]
+            return time_limit is None or time.monotonic() - self.began < time_limit
 
         def diverged(self) -> None:
             checkpoint_info = (
-                f"{out / LAST} is of step {self.state['steps']}" if self.state["steps"] else "there is no checkpoint"
+                f"{out / LAST_CHECKPOINT} is of step {self.state['steps']}"
+                if self.state["steps"]
+                else "there is no checkpoint"
             )
             raise ConfigError(
                 f"the training diverged before step {self.num_timesteps}: weights are not "
@@ -330,7 +334,7 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
             best_row = self.state["best_row"]
             if self.state["best"] is None or row.get("score", 0.0) >= best_row.get("score", 0.0):
                 self.state |= {"best": tensors, "best_row": row}
-            self.state |= {"steps": steps, "key": options["key"]} | _taken(model)
+            self.state |= {"steps": steps, "key": options["key"]} | _snapshot(model)
             _write(out, self.state, row)
             options["say"](
                 "  ".join(
@@ -345,7 +349,7 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
 _MEMORY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-def _taken(model: Any) -> dict[str, Any]:
+def _snapshot(model: Any) -> dict[str, Any]:
     """Return the complete state of a model."""
     policy = model.policy
     state = {"policy": policy.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in _optimizers(model)]}
@@ -370,7 +374,7 @@ def _optimizers(model: Any) -> list[Any]:
     return [model.policy.optimizer]
 
 
-def _put_back(model: Any, state: Mapping[str, Any], path: Path) -> None:
+def _restore(model: Any, state: Mapping[str, Any], path: Path) -> None:
     """Restore a model from its checkpoint. FormatError if it does not fit."""
     try:
         model.policy.load_state_dict(state["policy"])
@@ -400,7 +404,7 @@ def _read_last(path: Path, key: str) -> dict[str, Any] | None:
 def _write(out: Path, state: Mapping[str, Any], row: Mapping[str, Any]) -> None:
     safeio.make_folder(out)
     try:
-        with safeio.atomic_path(out / LAST) as path:
+        with safeio.atomic_path(out / LAST_CHECKPOINT) as path:
             torch.save(dict(state), path)
         earlier_rows = [earlier for earlier in read_log(out) if earlier["step"] < row["step"]]
         safeio.write_atomic(out / LOG, "".join(safeio.dump_json(earlier) + "\n" for earlier in [*earlier_rows, row]))
@@ -462,9 +466,9 @@ def finish(
     best_row = state["best_row"]
     recipe_values = {recipe_field.name: getattr(learning, recipe_field.name) for recipe_field in fields(learning)}
     config = export(model, learning)[1] | recipe_values | {"steps_done": best_row["step"], **(about or {})}
-    draft_card = Card("", "", learning.seed, (), config=config)
+    draft_card = WeightsCard("", "", learning.seed, (), config=config)
     metrics = test(PolicyDriver(policy_of(draft_card, state["best"], str(path.parent)), name=path.stem))
-    card = Card(data=data, command=command, seed=learning.seed, classes=(), metrics=metrics, config=config)
+    card = WeightsCard(data=data, command=command, seed=learning.seed, classes=(), metrics=metrics, config=config)
     save_weights(path, state["best"], card=card)
     draw_curves(path.parent)
     summary = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssad.core.checkpoints import Card, load_card
+from ssad.core.checkpoints import WeightsCard, load_card
 from ssad.core.driving import Observation
 from ssad.core.errors import FormatError
 from ssad.core.types import F32, Controller, Episode
@@ -43,7 +43,7 @@ class Policy:
     action: str
     layers: tuple[tuple[Tensor, Tensor], ...]
     squash: str
-    card: Card
+    card: WeightsCard
 
     def actions(self, rows: F32) -> F32:
         """Return actions in [-1, 1].
@@ -118,7 +118,7 @@ def load_policy(path: str | Path) -> Policy:
     return policy_of(card, state, str(path))
 
 
-def policy_of(card: Card, state: Mapping[str, Tensor], location: str) -> Policy:
+def policy_of(card: WeightsCard, state: Mapping[str, Tensor], location: str) -> Policy:
     """Build a policy from its card and tensors; `location` names them in error messages.
 
     Raises:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ssad.core.errors import ConfigError, install_extra
-from ssad.core.top_view import Moment, TopView
+from ssad.core.top_view import TopView, TopViewScene
 from ssad.core.types import U8
 from ssad.world.world import World
 
@@ -35,7 +35,7 @@ class SceneViews:
         signals = [(*map(float, graph.signal_xy[signal]), int(signal_states[signal])) for signal in near_signals]
         time, completion = float(state.time[scene]), float(state.route_complete[scene])
         return self._towns[episode.town].draw(
-            Moment(
+            TopViewScene(
                 pose,
                 state.size[scene],
                 state.kind[scene],

@@ -252,14 +252,14 @@ def equal_scenes(one: list[SceneData], two: list[SceneData]) -> bool:
 @pytest.fixture
 def on_disk(monkeypatch: pytest.MonkeyPatch, ssad_home: Path) -> Path:
     """Every index goes to a file; the folder of these."""
-    monkeypatch.setattr(index, "SMALL", 0)
+    monkeypatch.setattr(index, "MEMORY_LIMIT_BYTES", 0)
     return ssad_home / "cache" / "nuscenes"
 
 
 def test_file_index_equals_memory_index(tiny: Path, on_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from_file = load_all(tiny)
     assert len(list(on_disk.iterdir())) == 1
-    monkeypatch.setattr(index, "SMALL", 1 << 30)
+    monkeypatch.setattr(index, "MEMORY_LIMIT_BYTES", 1 << 30)
     assert equal_scenes(from_file, load_all(tiny))
 
 
@@ -299,7 +299,7 @@ def test_other_processes(tiny: Path, on_disk: Path) -> None:
     assert len(data.scene("scene-0916").frames) == 49
     script = (
         "import sys, multiprocessing\nfrom pathlib import Path\nfrom ssad.datasets.nuscenes import index\n"
-        "from ssad.datasets.nuscenes.reader import NuScenes\nindex.SMALL = 0\n"
+        "from ssad.datasets.nuscenes.reader import NuScenes\nindex.MEMORY_LIMIT_BYTES = 0\n"
         "data = NuScenes(Path(sys.argv[1]))\ndata.scenes()\n"
         "def count(name): return len(data.scene(name).frames)\n"
         "with multiprocessing.get_context('fork').Pool(2) as pool:\n"
@@ -314,7 +314,7 @@ def test_other_processes(tiny: Path, on_disk: Path) -> None:
 def test_two_builds_at_once(tiny: Path, on_disk: Path) -> None:
     script = (
         "import sys\nfrom pathlib import Path\nfrom ssad.datasets.nuscenes import index\n"
-        "from ssad.datasets.nuscenes.reader import NuScenes\nindex.SMALL = 0\n"
+        "from ssad.datasets.nuscenes.reader import NuScenes\nindex.MEMORY_LIMIT_BYTES = 0\n"
         "print(len(NuScenes(Path(sys.argv[1])).scene('scene-0103').frames))\n"
     )
     command = [sys.executable, "-c", script, str(tiny)]
@@ -351,7 +351,7 @@ def test_broken_table_leaves_no_index(copy: Path, on_disk: Path) -> None:
 @pytest.fixture
 def small(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, ssad_home: Path) -> int:
     """Tables of fewer bytes are indexed in memory."""
-    monkeypatch.setattr(index, "SMALL", request.param)
+    monkeypatch.setattr(index, "MEMORY_LIMIT_BYTES", request.param)
     return int(request.param)
 
 

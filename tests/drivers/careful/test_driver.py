@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssad.core.traces import first_difference
-from ssad.core.types import Controller, EpisodeAgent, Limits, Pose, SignalState
+from ssad.core.types import Controller, EpisodeAgent, EpisodeLimits, Pose, SignalState
 from ssad.drivers import make_system
 from ssad.drivers.careful.sight import Path
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -53,7 +53,7 @@ def test_they_keep_a_route_with_bends_and_stop_for_red() -> None:
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_scene_is_driven_alone_as_in_a_batch_and_again_the_same(name: str) -> None:
     cars = [EpisodeAgent(f"c{k}", "car", Controller.NONE, Pose(30.0 + 12.0 * k, 0.5 * k, 0.0)) for k in range(3)]
-    crowd = [episode(ego(speed=8.0), car, key=car.name, limits=Limits(max_steps=60)) for car in cars]
+    crowd = [episode(ego(speed=8.0), car, key=car.name, limits=EpisodeLimits(max_steps=60)) for car in cars]
     driver = make_system(name)
     together = rollout(World(crowd, GRAPHS), driver)
     for one, trace in zip(crowd, together, strict=True):

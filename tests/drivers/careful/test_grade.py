@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssad.core.types import Condition, Controller, Episode, EpisodeAgent, EpisodeTrace, Limits, Phase, Pose
+from ssad.core.types import Controller, Episode, EpisodeAgent, EpisodeLimits, EpisodeTrace, Phase, PhaseTrigger, Pose
 from ssad.drivers import make_system
 from ssad.drivers.careful import grade
 from ssad.drivers.careful.grade import Grade, grade_collision, grade_collisions
@@ -20,7 +20,7 @@ from tests.world.worlds import GRAPHS, ego, episode, line_route
 def walker(distance: float, trigger: float, speed: float = 2.5) -> EpisodeAgent:
     """Walks into the road 60 m down it once the ego is near."""
     start = Pose(60.0, -distance, np.pi / 2)
-    phases = (Phase(speed, Condition("ego_distance", trigger, 0)),)
+    phases = (Phase(speed, PhaseTrigger("ego_distance", trigger, 0)),)
     return EpisodeAgent("walker", "walker", Controller.SCRIPT, start, phases=phases)
 
 
@@ -104,7 +104,7 @@ def test_a_grade_is_the_same_again_and_leaves_the_recorded_drive_as_it_was() -> 
     trace = drive(one)
     first, second = (grade_collision(one, GRAPHS["Straight"], trace) for _ in range(2))
     assert first == second
-    short = replace(one, limits=Limits(max_steps=len(trace.x) - 1))
+    short = replace(one, limits=EpisodeLimits(max_steps=len(trace.x) - 1))
     assert grade_collision(short, GRAPHS["Straight"], trace).avoids == first.avoids
 
 

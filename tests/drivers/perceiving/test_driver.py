@@ -17,7 +17,7 @@ from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.traces import trace_hash
-from ssad.core.types import AgentKind, Episode, Limits
+from ssad.core.types import AgentKind, Episode, EpisodeLimits
 from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
@@ -32,7 +32,7 @@ def episodes(name: str = "StraightObstacle", count: int = 2, steps: int = 60) ->
     scenarios = load_scenarios(name)[:count]
     town = load_town(scenarios[0].town)
     made = [build_episode(scenario, town, seed=0) for scenario in scenarios]
-    return [replace(one, limits=Limits(max_steps=steps)) for one in made], town
+    return [replace(one, limits=EpisodeLimits(max_steps=steps)) for one in made], town
 
 
 def run(driver: Any, made: list[Episode], town: Any, **more: Any) -> list[Any]:

@@ -13,7 +13,7 @@ from helpers.gap_parts import Ahead, Brake, Last, boxes
 from ssad import World, build_episode, load_scenarios, load_town, make_system, rollout
 from ssad.core.driving import Believer, Observation
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.types import AgentKind, Controller, Episode, Limits
+from ssad.core.types import AgentKind, Controller, Episode, EpisodeLimits
 from ssad.drivers.perceiving.check import PartCheckError, check_perceiver, check_planner, check_tracker
 from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
@@ -37,7 +37,7 @@ def episodes() -> list[Episode]:
     scenarios = load_scenarios("LaneChanging")[:2]
     town = load_town(scenarios[0].town)
     made = [build_episode(scenario, town, seed=0) for scenario in scenarios]
-    return [replace(one, limits=Limits(max_steps=120)) for one in made]
+    return [replace(one, limits=EpisodeLimits(max_steps=120)) for one in made]
 
 
 @pytest.fixture(scope="module")

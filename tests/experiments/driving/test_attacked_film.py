@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ssad.core.errors import FormatError, SSADError
-from ssad.core.types import AgentKind, Controller, EpisodeTrace, Limits
+from ssad.core.types import AgentKind, Controller, EpisodeLimits, EpisodeTrace
 from ssad.experiments.driving.attacked_film import attacked_frames, first_ahead
 from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.scene_edit import SceneEdit
@@ -44,7 +44,7 @@ def trace() -> EpisodeTrace:
     """Two steps; another car stands 12 m before the ego."""
     scenario = next(s for s in load_scenarios("precrash") if s.name == "RedlightRunning/00")
     town = load_town("ProvingGround")
-    episode = replace(build_episode(scenario, town, seed=0), limits=Limits(max_steps=2))
+    episode = replace(build_episode(scenario, town, seed=0), limits=EpisodeLimits(max_steps=2))
     (made,) = rollout(World([episode], {town.name: town}), Standing())
     x, y, yaw = made.x.copy(), made.y.copy(), made.yaw.copy()
     cos, sin = np.cos(yaw[:, 0]), np.sin(yaw[:, 0])
@@ -69,7 +69,7 @@ def test_the_car_before_the_ego_is_attacked(trace: EpisodeTrace) -> None:
 
 def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:
     attack = AgentEdit(white, TargetCar(paint="black"), agent=1)
-    frames = list(attacked_frames(trace, load_town("ProvingGround"), attack, width=160, every=2))
+    frames = list(attacked_frames(trace, load_town("ProvingGround"), attack, width=160, frame_stride=2))
     assert len(frames) == 2
     for frame in frames:
         left, right = np.split(frame[:90].astype(int), 2, axis=1)
@@ -90,7 +90,9 @@ def test_a_light_is_exported_and_shines_in_a_drive(trace: EpisodeTrace, tmp_path
     for name in ("projector", "flashlight"):
         made = load_exported_attack(tmp_path / name)
         night = at_hour(DAY, made.hour)
-        frames = attacked_frames(trace, load_town("ProvingGround"), made.live(1), width=160, every=9, weather=night)
+        frames = attacked_frames(
+            trace, load_town("ProvingGround"), made.live(1), width=160, frame_stride=9, weather=night
+        )
         left, right = np.split(next(frames)[:90].astype(int), 2, axis=1)
         brighter = (right - left).max(-1) > 30
         assert 20 < brighter.sum() < 0.3 * brighter.size, name

@@ -17,12 +17,12 @@ from ssad.core.types import EpisodeTrace, LaneType
 from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.recorder import PerceptionRecorder
-from ssad.experiments.gap.drive_sheet import Seen
+from ssad.experiments.gap.drive_sheet import RecordedDrive
 from ssad.experiments.gap.mcap import need_mcap, write_mcap
 from ssad.world.rollout import rollout
 
 
-def driven() -> tuple[EpisodeTrace, Seen, Any]:
+def driven() -> tuple[EpisodeTrace, RecordedDrive, Any]:
     scenario = next(one for one in load_scenarios("precrash") if one.name == "StraightObstacle/00")
     town = load_town(scenario.town)
     cameras = nuscenes_cameras(96)
@@ -30,7 +30,7 @@ def driven() -> tuple[EpisodeTrace, Seen, Any]:
     episode = build_episode(scenario, town, seed=0)
     (trace,) = rollout(World([episode], {town.name: town}), Perceiving(PerfectEyes(cameras), watch=watcher))
     pictures = [(0.2 * k, np.full((54, 96, 3), 20 * k, np.uint8)) for k in range(5)]
-    return trace, Seen("", trace, watcher.perceived(0), pictures), town
+    return trace, RecordedDrive("", trace, watcher.perceived(0), pictures), town
 
 
 def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
 
     trace, seen, town = driven()
     above = (np.full((40, 60, 3), 90, np.uint8) for _ in range(len(trace.x)))
-    path = write_mcap(tmp_path / "drive.mcap", trace, town, seen=seen, above=above)
+    path = write_mcap(tmp_path / "drive.mcap", trace, town, recorded_drive=seen, top_views=above)
     told: dict[str, list[tuple[float, Any]]] = {}
     with path.open("rb") as file:
         for schema, channel, message, decoded in make_reader(
@@ -88,8 +88,8 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
             tmp_path / "again.mcap",
             trace,
             town,
-            seen=seen,
-            above=(np.full((40, 60, 3), 90, np.uint8) for _ in range(steps)),
+            recorded_drive=seen,
+            top_views=(np.full((40, 60, 3), 90, np.uint8) for _ in range(steps)),
         ).read_bytes()
     )
 

@@ -20,7 +20,7 @@ from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition
 from ssad.experiments.perception.scored_data import Victims
 from ssad.experiments.perception.shifts.kind import Detection
-from ssad.metrics.target_attacks import Sighting
+from ssad.metrics.target_attacks import TargetSighting
 from ssad.scenarios.static.catalogue import parse_perturbation
 from ssad.scenarios.static.perturbation import Perturbation
 
@@ -107,11 +107,11 @@ def test_what_acts_on_a_target_is_refused_on_scenes_with_the_same_words(family: 
             condition.present(examination, data, [])
 
 
-def seen(score: float) -> Sighting:
+def seen(score: float) -> TargetSighting:
     """A target that is found with a score; 0: it is not."""
     box = np.array([[0.0, 0.0, 9.0, 9.0]])
     found = box if score else np.zeros((0, 4))
-    return Sighting("a", found, np.full(len(found), score), box, np.zeros(1, bool))
+    return TargetSighting("a", found, np.full(len(found), score), box, np.zeros(1, bool))
 
 
 def test_the_floor_is_the_same_and_the_clean_target_is_seen_once(
@@ -126,7 +126,7 @@ def test_the_floor_is_the_same_and_the_clean_target_is_seen_once(
     images = LightableClips(tmp_path, 1)
     shown: list[Any] = []
 
-    def sightings(detector: Any, given: Any) -> Iterator[Sighting]:
+    def sightings(detector: Any, given: Any) -> Iterator[TargetSighting]:
         shown.extend(given)
         yield seen(0.0)
 

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError, RouteError
-from ssad.core.types import Actor, Controller, Limits, Pose, Route, Scenario, SignalPlan, SignalState, TrafficPlan
+from ssad.core.types import (
+    Actor,
+    Controller,
+    EpisodeLimits,
+    Pose,
+    Route,
+    Scenario,
+    SignalPlan,
+    SignalState,
+    TrafficPlan,
+)
 from ssad.scenarios.dynamic import build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.episode import _start
 from ssad.world.models import model
@@ -81,9 +91,9 @@ def test_what_a_scenario_leaves_open_is_its_types() -> None:
     assert episode.scenario.signals == kind.signals == SignalPlan("green", "green")
     assert (episode.limits.max_distance, episode.limits.max_steps) == (150.0, 300)
     assert set(episode.signal_override.values()) == {SignalState.GREEN}
-    own = replace(scenario, signals=SignalPlan("red", until=4.0), limits=Limits(max_steps=7, max_distance=80.0))
+    own = replace(scenario, signals=SignalPlan("red", until=4.0), limits=EpisodeLimits(max_steps=7, max_distance=80.0))
     episode = build_episode(own, town, seed=0)
-    assert (episode.limits, episode.override_until) == (Limits(max_steps=7, max_distance=80.0), 4.0)
+    assert (episode.limits, episode.override_until) == (EpisodeLimits(max_steps=7, max_distance=80.0), 4.0)
     assert set(episode.signal_override.values()) == {SignalState.RED}
     (scenario,) = load_scenarios("natural-unselected/Twinford_00/01")
     town = load_town("Twinford")

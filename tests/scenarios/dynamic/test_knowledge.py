@@ -13,11 +13,11 @@ from ssad.core.errors import ConfigError, RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import (
     Actor,
-    Condition,
     Controller,
     EpisodeAgent,
     LaneType,
     Phase,
+    PhaseTrigger,
     Pose,
     Route,
     Scenario,
@@ -70,7 +70,7 @@ def test_walker_stands_one_lane_right_of_the_outer_lane_and_faces_the_road(cross
     # one lane is crossed (the shoulder is narrower than 2 m): 45 + 1.5 m on, one lane width right of x = 5.25
     assert at(walker) == (5.25 + 3.5, -80.0 + 46.5, -math.pi)
     assert at(blocker) == (1.75 + 0.9 * 7.0, -80.0 + 0.9 * 46.5, 0.0)
-    assert walker.phases == (Phase(2.5, Condition("ego_distance", 20.0, 0)),)
+    assert walker.phases == (Phase(2.5, PhaseTrigger("ego_distance", 20.0, 0)),)
     assert (walker.model, walker.controller) == ("walker", Controller.SCRIPT)
     assert (blocker.model, blocker.controller, blocker.phases) == ("vending_machine", Controller.NONE, ())
 
@@ -91,14 +91,14 @@ def test_walker_parameters(crossroads: LaneGraph, routes: Any) -> None:
     s = scenario("StraightObstacle", trigger=Pose(5.25, -80.0, math.pi / 2), parameters=values)
     walker, _ = build(s, crossroads, routes.straight_outer)
     assert at(walker) == (5.25 + 1.75, -40.0, -math.pi + 0.3)
-    assert walker.phases == (Phase(1.0, Condition("ego_distance", 30.0, 0)),)
+    assert walker.phases == (Phase(1.0, PhaseTrigger("ego_distance", 30.0, 0)),)
 
 
 def test_cyclist_stands_right_of_the_exit_road_after_a_left_turn(crossroads: LaneGraph, routes: Any) -> None:
     (cyclist,) = build(scenario("TurningObstacle"), crossroads, routes.left)
     # westwards; 8 m on, one lane to the right and so 1 m more, one lane width right of y = 5.25
     assert at(cyclist) == (-15.0 - 9.0, 5.25 + 3.5, -math.pi / 2)
-    assert cyclist.phases == (Phase(10.0, Condition("ego_distance", 20.0, 0)),)
+    assert cyclist.phases == (Phase(10.0, PhaseTrigger("ego_distance", 20.0, 0)),)
 
 
 def test_leader_and_neighbour(crossroads: LaneGraph, routes: Any) -> None:
@@ -106,8 +106,8 @@ def test_leader_and_neighbour(crossroads: LaneGraph, routes: Any) -> None:
     leader, neighbour = build(s, crossroads, routes.straight_outer)
     assert at(leader) == (5.25, -45.0, math.pi / 2)
     assert at(neighbour) == (1.75, -44.0, math.pi / 2)
-    start = Phase(12.0, Condition("ego_distance", 35.0, 0))
-    assert leader.phases == (start, Phase(2.0, Condition("travelled", 5.0)))
+    start = Phase(12.0, PhaseTrigger("ego_distance", 35.0, 0))
+    assert leader.phases == (start, Phase(2.0, PhaseTrigger("travelled", 5.0)))
     assert neighbour.phases == (start,)
     assert leader.route is neighbour.route is None
 
@@ -118,7 +118,7 @@ def test_parked_and_oncoming_car(crossroads: LaneGraph, routes: Any) -> None:
     assert at(parked) == (1.75, -44.0, math.pi / 2)
     assert at(oncoming) == (-1.75, -19.0, -math.pi / 2)
     assert parked.controller == Controller.NONE
-    assert oncoming.phases == (Phase(8.0, Condition("ego_distance", 45.0, 0)),)
+    assert oncoming.phases == (Phase(8.0, PhaseTrigger("ego_distance", 45.0, 0)),)
 
 
 def test_a_missing_left_lane_is_an_error(crossroads: LaneGraph, routes: Any) -> None:
@@ -143,8 +143,8 @@ def test_a_given_place_is_kept(kind: str, crossroads: LaneGraph, routes: Any) ->
     (car,) = build(s, crossroads, getattr(routes, way))
     assert at(car) == (-18.0, -1.75, 0.0)
     assert car.route is None
-    expected = (Phase(0.0 if waits else speed, Condition("ego_distance", trigger, 0)),)
-    assert car.phases == expected + ((Phase(speed, Condition("ego_speed", 0.5)),) if waits else ())
+    expected = (Phase(0.0 if waits else speed, PhaseTrigger("ego_distance", trigger, 0)),)
+    assert car.phases == expected + ((Phase(speed, PhaseTrigger("ego_speed", 0.5)),) if waits else ())
 
 
 @pytest.mark.parametrize("kind", JUNCTION)
@@ -218,7 +218,7 @@ def test_signals_of_the_ego_and_of_the_others(crossroads: LaneGraph, routes: Any
 
 
 def test_custom_actors_are_taken_as_written(crossroads: LaneGraph, routes: Any) -> None:
-    phases = (Phase(3.0, Condition("time", 2.0)),)
+    phases = (Phase(3.0, PhaseTrigger("time", 2.0)),)
     actors = (
         Actor("dog", "walker", Pose(4.0, -50.0, 1.0), phases, path=((4.0, -50.0), (4.0, -45.0), (0.0, -45.0))),
         Actor("cone", "cone", Pose(2.0, -40.0)),

@@ -19,7 +19,7 @@ from ssad.core.errors import ConfigError, RouteError
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import Actor, Condition, Episode, Phase, Pose, Route, Scenario
+from ssad.core.types import Actor, Episode, Phase, PhaseTrigger, Pose, Route, Scenario
 from ssad.scenarios.dynamic import (
     PRECRASH,
     Parameter,
@@ -47,7 +47,7 @@ CUSTOM = Scenario(
     "Custom",
     "ProvingGround",
     (Pose(217.0, -5.25), Pose(317.0, -5.25)),
-    actors=(Actor("van", "van", Pose(260.0, -5.25), (Phase(6.0, Condition("ego_distance", 25.0)),)),),
+    actors=(Actor("van", "van", Pose(260.0, -5.25), (Phase(6.0, PhaseTrigger("ego_distance", 25.0)),)),),
 )
 
 

@@ -25,12 +25,12 @@ from benchmarks.make_scenario_sets import (
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import (
-    Condition,
     Controller,
     Episode,
     EpisodeAgent,
     LaneType,
     Phase,
+    PhaseTrigger,
     Pose,
     Scenario,
     SignalState,
@@ -95,7 +95,7 @@ def test_who_crosses_the_way_is_counted_once_and_nobody_else() -> None:
     """The ego would be at x = 50 m after 6.6 s."""
 
     def actor(x: float, y: float, yaw: float) -> EpisodeAgent:
-        phases = (Phase(8.0, Condition("always")),)
+        phases = (Phase(8.0, PhaseTrigger("always")),)
         return EpisodeAgent(f"{x} {y}", "car", Controller.SCRIPT, Pose(x, y, yaw), 8.0, 8.0, phases=phases)
 
     def across(seconds: float) -> EpisodeAgent:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.types import (
     Actor,
-    Condition,
-    Limits,
+    EpisodeLimits,
     Phase,
+    PhaseTrigger,
     Pose,
     Scenario,
     SignalPlan,
@@ -50,7 +50,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     actors: tuple[Actor, ...] = ()
     if kind == "Custom":
         condition = st.builds(
-            Condition,
+            PhaseTrigger,
             st.sampled_from(["always", "ego_distance", "ego_speed", "travelled", "time", "after"]),
             positive,
             st.just(0),
@@ -74,7 +74,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         actors=actors,
         signals=draw(st.builds(SignalPlan, light, light, st.floats(0.0, 100.0))),
         traffic=draw(st.none() | st.builds(TrafficPlan, st.floats(0, 1), st.integers(0, 5), st.integers(5, 20))),
-        limits=draw(st.builds(Limits, st.integers(1, 1000), positive, positive)),
+        limits=draw(st.builds(EpisodeLimits, st.integers(1, 1000), positive, positive)),
         target_speed=draw(st.floats(0.5, 30.0)),
         seed=draw(st.integers(0, 2**40)),
         group=draw(texts),
@@ -132,7 +132,7 @@ def test_a_custom_scenario_needs_no_python(tmp_path: Path) -> None:
     path.write_text(CUSTOM)
     (scenario,) = load_scenarios(path)
     assert [a.name for a in scenario.actors] == ["van", "jogger"]
-    assert scenario.actors[0].phases[1] == Phase(0.0, Condition("travelled", 20.0))
+    assert scenario.actors[0].phases[1] == Phase(0.0, PhaseTrigger("travelled", 20.0))
     assert scenario.actors[1].path == ((60.0, -6.0), (60.0, 6.0))
 
 

@@ -16,7 +16,7 @@ from ssad import World, build_episode, load_scenarios, load_town
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.images import read_image
-from ssad.core.types import Controller, Limits
+from ssad.core.types import Controller, EpisodeLimits
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.physical.lit_images import LightableClips
@@ -72,7 +72,7 @@ def episode() -> tuple[Any, Any]:
     scenario = load_scenarios("LaneChanging/00")[0]
     town = load_town(scenario.town)
     built = build_episode(scenario, town, seed=0)
-    return replace(built, limits=Limits(max_steps=STEPS)), town
+    return replace(built, limits=EpisodeLimits(max_steps=STEPS)), town
 
 
 def drive(perturbation: Perturbation | None) -> list[Any]:

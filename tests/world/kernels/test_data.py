@@ -8,7 +8,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from ssad.core.types import ENDS, Condition
+from ssad.core.types import ENDS, PhaseTrigger
 from ssad.world import kernels
 from ssad.world.kernels.data import End, When
 
@@ -17,7 +17,7 @@ SOURCES = sorted(Path(kernels.__file__).parent.glob("*.py"))
 
 
 def test_every_condition_of_a_phase_has_a_code() -> None:
-    kinds = get_args(get_type_hints(Condition)["kind"])
+    kinds = get_args(get_type_hints(PhaseTrigger)["kind"])
     assert [when.name.lower() for when in When] == sorted(kinds, key=lambda kind: When[kind.upper()])
 
 

@@ -10,20 +10,20 @@ import pytest
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import (
     ENDS,
-    Condition,
     Controller,
     Episode,
     EpisodeAgent,
+    EpisodeLimits,
     LaneType,
-    Limits,
     Phase,
+    PhaseTrigger,
     Pose,
     SignalState,
 )
 from ssad.world.world import World
 from tests.world.worlds import GRAPHS, NO_PASSING, ego, episode, line_route, straight_graph
 
-LONG = Limits(max_steps=600)
+LONG = EpisodeLimits(max_steps=600)
 
 
 def drive(scene: Episode, graphs: dict[str, LaneGraph], seconds: float = 50.0) -> dict[str, np.ndarray]:
@@ -254,7 +254,7 @@ def test_who_is_taken_over_while_passing_changes_no_lane_any_more() -> None:
 def test_a_pass_on_the_oncoming_lane_is_broken_off_when_somebody_comes(back: bool) -> None:
     """Who comes is slow and far away when the pass begins, and fast soon afterwards; it sees nobody."""
     coming = steady("coming", 190.0, 3.5, 1.0, yaw=np.pi)
-    fast = Phase(14.0, when=Condition("time", 4.5 if back else 6.5))
+    fast = Phase(14.0, when=PhaseTrigger("time", 4.5 if back else 6.5))
     coming = replace(coming, phases=(*coming.phases, fast))
     found = drive(episode(autopilot(), parked(80.0), coming, limits=LONG), GRAPHS)
     x, y = found["pose"][:, 0, 0], found["pose"][:, 0, 1]

@@ -8,7 +8,7 @@ import pytest
 from ssad.core.lane_graph import SignKind
 from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
-from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario
+from ssad.core.types import Controller, Episode, EpisodeAgent, EpisodeLimits, LaneType, Pose, Route, Scenario
 from ssad.recorders.drives import make_drive
 from ssad.rendering.street.region import survey
 from ssad.world.roads import LaneGraph, random_route, route_along
@@ -17,7 +17,7 @@ from tests.world.roads.towns import built_in
 
 RINGS = (((220.0, 170.0), 22.0), ((450.0, 170.0), 20.0))
 MOTORWAY = 22.0  # m/s, a higher limit
-LIMITS = Limits(max_steps=10_000, max_time=1e4)
+LIMITS = EpisodeLimits(max_steps=10_000, max_time=1e4)
 
 
 def agent(name: str, route: Route, speed: float, body: str = "car") -> EpisodeAgent:

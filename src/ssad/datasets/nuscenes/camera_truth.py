@@ -34,33 +34,36 @@ def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
     return scenes
 
 
-def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) -> Truth:
-    """What a camera should find of a sample's boxes: those of the ten classes whose middle is in the picture.
+def camera_truth(frame: SensorFrame, annotations: Annotations, *, require_points: bool = True) -> Truth:
+    """Return the boxes of a sample that a camera should find: of the ten classes, with their middle in the image.
 
     Boxes are as `ssad.core.detections` defines them; velocity is in the camera's x and z; box is the hull of the
     projected corners, clipped to the picture.
 
     Args:
         frame: The camera frame.
-        found: Annotations of its sample.
-        hit: Whether only boxes with a LiDAR point count: what nobody can see is not learned.
+        annotations: Annotations of its sample.
+        require_points: Whether only boxes with a LiDAR point count: what nobody can see is not learned.
     """
     import torch
 
-    rows, box, world_to_camera = boxes_in_picture(frame, found, hit=hit)
+    rows, box, world_to_camera = boxes_in_picture(frame, annotations, require_points=require_points)
     assert frame.intrinsic is not None
-    visible, camera_centres = found.take(rows), found.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    axes = visible.axes()[:, :, 0] @ world_to_camera[:3, :3].T
-    velocities = visible.velocity @ world_to_camera[:3, :3].T
-    labels = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[name])) for name in visible.category]
-    attributes = [_attribute(names) for names in visible.attributes]
+    visible_boxes, camera_centres = (
+        annotations.take(rows),
+        annotations.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3],
+    )
+    axes = visible_boxes.axes()[:, :, 0] @ world_to_camera[:3, :3].T
+    velocities = visible_boxes.velocity @ world_to_camera[:3, :3].T
+    labels = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[name])) for name in visible_boxes.category]
+    attributes = [_attribute(names) for names in visible_boxes.attributes]
 
     def floats(values: F64) -> torch.Tensor:
         return torch.from_numpy(np.array(values, np.float32))
 
     solids = Solids(
         floats(camera_centres[rows]),
-        floats(visible.size_lwh[:, size_columns("lwh", "lhw")]),
+        floats(visible_boxes.size_lwh[:, size_columns("lwh", "lhw")]),
         floats(camera_yaw(axes)),
         floats(velocities[:, [0, 2]]),
         torch.tensor(attributes, dtype=torch.int64),
@@ -69,14 +72,14 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
 
 
 def boxes_in_picture(
-    frame: SensorFrame, found: Annotations, *, hit: bool = True
+    frame: SensorFrame, annotations: Annotations, *, require_points: bool = True
 ) -> tuple[npt.NDArray[np.intp], F64, F64]:
-    """Which boxes of a sample a camera should find: those of the ten classes whose middle is in its picture.
+    """Select the boxes of a sample that a camera should find: of the ten classes, with their middle in the image.
 
     Args:
         frame: The camera frame.
-        found: Annotations of its sample.
-        hit: Whether only boxes with a LiDAR point count.
+        annotations: Annotations of its sample.
+        require_points: Whether only boxes with a LiDAR point count.
 
     Returns:
         Their rows [N]; hulls of their corners [N, 4], pixels; from the world into the camera's frame [4, 4].
@@ -86,18 +89,20 @@ def boxes_in_picture(
     """
     if frame.intrinsic is None:
         raise ConfigError(f"{frame.channel} is no camera")
-    is_visible = np.array([CATEGORY_TO_CLASS.get(category) in MMDET3D_CLASSES for category in found.category], bool)
-    if hit and len(found):
-        is_visible &= found.lidar_points > 0
+    is_visible = np.array(
+        [CATEGORY_TO_CLASS.get(category) in MMDET3D_CLASSES for category in annotations.category], bool
+    )
+    if require_points and len(annotations):
+        is_visible &= annotations.lidar_points > 0
     world_to_camera: F64 = np.asarray(np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego), np.float64)
-    camera_centres = found.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    camera_centres = annotations.centre @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     projected = camera_centres @ frame.intrinsic.T
     # Points in the camera's plane divide by zero; the depth test below drops them.
     with np.errstate(all="ignore"):
         middle = projected[:, :2] / projected[:, 2:]
     is_visible &= (projected[:, 2] > NEAR) & (middle >= 0).all(1)
     is_visible &= (middle[:, 0] < frame.width) & (middle[:, 1] < frame.height)
-    box, has_area = _hulls(frame, found, world_to_camera)
+    box, has_area = _hulls(frame, annotations, world_to_camera)
     rows = np.flatnonzero(is_visible & has_area)
     return rows, box[rows], world_to_camera
 
@@ -106,9 +111,9 @@ def _attribute(names: Sequence[str]) -> int:
     return MMDET3D_ATTRIBUTES.index(names[0]) if names and names[0] in MMDET3D_ATTRIBUTES else NO_ATTRIBUTE
 
 
-def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool]:
+def _hulls(frame: SensorFrame, annotations: Annotations, rotation: F64) -> tuple[F64, Bool]:
     """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
     assert frame.intrinsic is not None
-    camera_corners = found.corners() @ turn[:3, :3].T + turn[:3, 3]
+    camera_corners = annotations.corners() @ rotation[:3, :3].T + rotation[:3, 3]
     box = hulls(camera_corners, frame.intrinsic, (frame.width, frame.height))
     return box, np.asarray(((box[:, 2:] - box[:, :2]) > 1.0).all(1))

@@ -24,7 +24,7 @@ from ssad.core.seeding import digest
 from ssad.datasets.nuscenes.schema import TABLES, TableRecord
 from ssad.datasets.nuscenes.tables import stream, table_path
 
-SMALL = 32 << 20  # size of all tables, bytes; below it an index in memory is faster than a file
+MEMORY_LIMIT_BYTES = 32 << 20  # size of all tables, bytes; below it an index in memory is faster than a file
 LAYOUT = 1
 PARENT: Final = {"sample": "scene_token", "sample_data": "sample_token", "sample_annotation": "sample_token"}
 _NAME: Final = {kind: name for name, kind in TABLES.items()}
@@ -64,20 +64,22 @@ def fingerprint(root: Path, version: str) -> tuple[tuple[str, int, int], ...]:
     return tuple(states)
 
 
-def open_index(root: Path, version: str, *, small: int | None = None) -> Index:
+def open_index(root: Path, version: str, *, memory_limit_bytes: int | None = None) -> Index:
     """The index of a version folder, built where there is none yet.
 
     Args:
         root: The nuScenes root.
         version: Name of the version.
-        small: Bytes of all tables below which the index is held in memory; None: `SMALL`.
+        memory_limit_bytes: Bytes of all tables below which the index is held in memory; None: `MEMORY_LIMIT_BYTES`.
 
     Raises:
         FormatError: The tables are broken, or changed while they were indexed.
         StoreError: The index cannot be written.
     """
     table_state = fingerprint(root, version)
-    if sum(size for _, size, _ in table_state) < (SMALL if small is None else small):
+    if sum(size for _, size, _ in table_state) < (
+        MEMORY_LIMIT_BYTES if memory_limit_bytes is None else memory_limit_bytes
+    ):
         return MemoryIndex(root, version)
     folder_digest = digest(str((root / version).resolve()))[:16]
     folder = home() / "cache" / "nuscenes"

@@ -143,7 +143,7 @@ class NuScenes:
         while token:
             sample = remaining.pop(token, None)
             location = f"{self._path(Scene if source == 'scene' else Sample)}: scene '{scene.name}'"
-            if sample is None and any(token == earlier.token for earlier in ordered):
+            if sample is None and any(token == visited_sample.token for visited_sample in ordered):
                 raise FormatError(f"{location}: the chain of samples comes back to '{token}'")
             if sample is None:
                 raise FormatError(f"{location}: sample '{token}' is not among its samples in sample.json")
@@ -258,14 +258,14 @@ class NuScenes:
             )
         return boxes
 
-    def _neighbours(self, rows: Sequence[SampleAnnotation], place: dict[str, int], time: Any) -> tuple[I32, I32]:
+    def _neighbours(self, rows: Sequence[SampleAnnotation], row_by_token: dict[str, int], time: Any) -> tuple[I32, I32]:
         """Rows [N] of the boxes before and after each box of the same instance, -1 where there is none."""
         neighbours = np.full((2, len(rows)), -1, np.int32)
         for row_index, row in enumerate(rows):
             for side, token in enumerate((row.prev, row.next)):
                 if not token:
                     continue
-                neighbour = place.get(token)
+                neighbour = row_by_token.get(token)
                 if neighbour is None:
                     raise self._dangling(SampleAnnotation, SampleAnnotation, token)
                 if (time[neighbour] >= time[row_index]) if side == 0 else (time[neighbour] <= time[row_index]):

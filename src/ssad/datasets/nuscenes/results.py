@@ -65,7 +65,7 @@ class _File(msgspec.Struct):
 
 
 @dataclass(frozen=True)
-class Results:
+class DetectionResults:
     """A results file.
 
     Attributes:
@@ -84,7 +84,7 @@ class Results:
 
 def read_results(
     path: str | Path, samples: Sequence[str] | None = None, *, subset: bool = False, max_boxes: int = MAX_BOXES
-) -> Results:
+) -> DetectionResults:
     """Read a results file. Velocities may be NaN (also written null).
 
     Args:
@@ -114,7 +114,7 @@ def read_results(
         raise FormatError(f"{path}: sample {unexpected} is not in the split; leave it out or choose its split")
     with uncollected():
         boxes, points = _columns(path, sample_boxes, sample_index, max_boxes=max_boxes)
-    return Results(sample_tokens, boxes, points, meta)
+    return DetectionResults(sample_tokens, boxes, points, meta)
 
 
 def with_ego(boxes: BoxTable, ego: F64) -> BoxTable:
@@ -131,15 +131,15 @@ def with_ego(boxes: BoxTable, ego: F64) -> BoxTable:
 
 
 def _columns(
-    path: str | Path, found: dict[str, msgspec.Raw], index: Mapping[str, int], *, max_boxes: int
+    path: str | Path, boxes_by_sample: dict[str, msgspec.Raw], index: Mapping[str, int], *, max_boxes: int
 ) -> tuple[BoxTable, I32]:
-    """Boxes and their points; `index` gives the number of each sample; `found` is emptied to free the text."""
+    """Return boxes and their points, samples numbered by `index`; empties `boxes_by_sample` to free the text."""
     decoder = msgspec.json.Decoder(list[_Box])
     value_blocks: list[F64] = []
     labels: list[npt.NDArray[np.int8]] = []
     attributes: list[npt.NDArray[np.int8]] = []
-    counts = np.zeros(len(found), np.int64)
-    for sample_number, (token, encoded) in enumerate(found.items()):
+    counts = np.zeros(len(boxes_by_sample), np.int64)
+    for sample_number, (token, encoded) in enumerate(boxes_by_sample.items()):
         try:
             boxes = decoder.decode(encoded)
         except msgspec.MsgspecError as error:
@@ -160,8 +160,8 @@ def _columns(
             raise FormatError(
                 f"{path}: sample {token}: box {box_number}: its sample_token is '{boxes[box_number].sample_token}'"
             )
-    sample = np.repeat(np.array([index[token] for token in found], np.int32), counts)
-    found.clear()
+    sample = np.repeat(np.array([index[token] for token in boxes_by_sample], np.int32), counts)
+    boxes_by_sample.clear()
     table = np.concatenate(value_blocks) if value_blocks else np.zeros((0, _WIDTH))
     value_blocks.clear()
     for name, columns in (("translation", _TRANSLATION), ("size", _SIZE), ("rotation", _ROTATION), ("score", [_SCORE])):
@@ -238,7 +238,7 @@ def _read(path: str | Path) -> bytes | bytearray:
 def _without_nan(file: BinaryIO) -> bytearray:
     """The text block by block; a NaN is inside of a string where an odd number of quotation marks goes before."""
     output = bytearray()
-    counted, quotes = 0, 0  # quotation marks among the first `counted` bytes of out
+    counted_bytes, quotes = 0, 0  # quotation marks among the first `counted` bytes of out
     remainder = b""
     while True:
         chunk = file.read(BLOCK)
@@ -248,8 +248,8 @@ def _without_nan(file: BinaryIO) -> bytearray:
         head, *tails = block.split(b"NaN")
         output += head
         for tail in tails:
-            quotes += _quotes(output[counted:])
-            counted = len(output)
+            quotes += _quotes(output[counted_bytes:])
+            counted_bytes = len(output)
             output += (b"null" if quotes % 2 == 0 else b"NaN") + tail
         if not chunk:
             return output

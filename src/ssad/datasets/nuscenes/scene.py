@@ -100,10 +100,10 @@ class SceneData:
         frame, and at a key frame's own time, the boxes are that key frame's.
         """
         times = [sample.timestamp for sample in self.samples]
-        following = bisect_left(times, timestamp_us)
-        if following == len(times) or timestamp_us == times[following]:
-            return self.boxes[self.samples[min(following, len(times) - 1)].token]
-        return self._between(following, timestamp_us)
+        next_index = bisect_left(times, timestamp_us)
+        if next_index == len(times) or timestamp_us == times[next_index]:
+            return self.boxes[self.samples[min(next_index, len(times) - 1)].token]
+        return self._between(next_index, timestamp_us)
 
     def annotations_of(self, frame: SensorFrame) -> Annotations:
         """Return the boxes of a frame as the official get_boxes does: those of its sample, moved for sweeps."""
@@ -114,15 +114,15 @@ class SceneData:
                 return self._between(sample_index, frame.timestamp_us)
         return self.annotations(frame.sample_token)
 
-    def _between(self, number: int, timestamp_us: int) -> Annotations:
-        """Boxes of sample `number`, moved towards the sample before it; times beyond the two are clipped."""
-        sample = self.samples[number]
+    def _between(self, sample_number: int, timestamp_us: int) -> Annotations:
+        """Boxes of sample `sample_number`, moved towards the sample before it; times beyond the two are clipped."""
+        sample = self.samples[sample_number]
         current = self.boxes[sample.token]
-        if number == 0:
+        if sample_number == 0:
             return current
-        previous_sample = self.samples[number - 1]
+        previous_sample = self.samples[sample_number - 1]
         previous = self.boxes[previous_sample.token]
-        share = min(
+        fraction = min(
             max((timestamp_us - previous_sample.timestamp) / (sample.timestamp - previous_sample.timestamp), 0.0), 1.0
         )
         previous_rows = {instance: position for position, instance in enumerate(previous.instance)}
@@ -135,33 +135,33 @@ class SceneData:
             return current
         current_index, previous_index = np.array(pairs).T
         centre, rotation = current.centre.copy(), current.rotation.copy()
-        centre[current_index] = previous.centre[previous_index] + share * (
+        centre[current_index] = previous.centre[previous_index] + fraction * (
             current.centre[current_index] - previous.centre[previous_index]
         )
-        rotation[current_index] = slerp(previous.rotation[previous_index], current.rotation[current_index], share)
+        rotation[current_index] = slerp(previous.rotation[previous_index], current.rotation[current_index], fraction)
         return replace(current, centre=frozen(centre), rotation=frozen(rotation))
 
 
-def velocities(centre: F64, time: npt.NDArray[np.int64], before: I32, after: I32) -> F64:
+def velocities(centre: F64, time: npt.NDArray[np.int64], previous_rows: I32, next_rows: I32) -> F64:
     """Return the velocities of boxes by differences over their neighbours.
 
     Args:
         centre: Centres [N, 3], m.
         time: Times [N], us.
-        before: Row of the previous box of the same instance [N]; -1: none.
-        after: Row of the next box of the same instance [N]; -1: none.
+        previous_rows: Row of the previous box of the same instance [N]; -1: none.
+        next_rows: Row of the next box of the same instance [N]; -1: none.
 
     Returns:
         Velocities [N, 3], m/s; NaN without a neighbour, or if the neighbours are too far apart in time.
     """
     rows = np.arange(len(centre))
-    start, end = np.where(before >= 0, before, rows), np.where(after >= 0, after, rows)
+    start_rows, end_rows = np.where(previous_rows >= 0, previous_rows, rows), np.where(next_rows >= 0, next_rows, rows)
     # Converted before subtracting, as in the devkit.
-    seconds = 1e-6 * time[end] - 1e-6 * time[start]
-    time_limit = np.where((before >= 0) & (after >= 0), 2.0 * MAX_TIME_DIFF, MAX_TIME_DIFF)
-    is_valid = (start != end) & (seconds <= time_limit)
+    seconds = 1e-6 * time[end_rows] - 1e-6 * time[start_rows]
+    time_limit = np.where((previous_rows >= 0) & (next_rows >= 0), 2.0 * MAX_TIME_DIFF, MAX_TIME_DIFF)
+    is_valid = (start_rows != end_rows) & (seconds <= time_limit)
     with np.errstate(divide="ignore", invalid="ignore"):  # broken tables may have two boxes at one time
-        return np.where(is_valid[:, None], (centre[end] - centre[start]) / seconds[:, None], np.nan)
+        return np.where(is_valid[:, None], (centre[end_rows] - centre[start_rows]) / seconds[:, None], np.nan)
 
 
 def frozen(array: F64) -> F64:

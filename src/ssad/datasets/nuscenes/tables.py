@@ -68,7 +68,7 @@ def stream(path: Path, kind: type[T], *, block: int = BLOCK) -> Iterator[list[T]
 
 
 def _last(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line: int) -> list[T]:
-    """What stands between the last cut and the end of the list."""
+    """Decode the records between the last cut and the end of the list."""
     elements = text.lstrip(_SPACE)
     if elements[:1] == b",":
         elements = elements[1:]
@@ -81,7 +81,7 @@ def _last(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line:
 
 
 def _error(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line: int) -> FormatError:
-    """Which record is wrong, and how: the elements are decoded one by one."""
+    """Make the error that names the wrong record, by decoding the elements one by one."""
     elements: list[msgspec.Raw]
     list_text = text.lstrip(_SPACE).removeprefix(b",")
     try:

@@ -158,11 +158,11 @@ class _Tables:
         for block in stream(table_path(self.root, self.version, name), kind):
             yield from block
 
-    def find(self, known: Mapping[str, str], token: str, name: str) -> str:
+    def find(self, token_map: Mapping[str, str], token: str, name: str) -> str:
         """The entry of a token. FormatError."""
-        if token not in known:
+        if token not in token_map:
             raise FormatError(f"{table_path(self.root, self.version, name)}: it has no record '{token}' that is used")
-        return known[token]
+        return token_map[token]
 
 
 def _ego(tables: _Tables, index: Mapping[str, int]) -> F64:
@@ -197,7 +197,7 @@ def _ego(tables: _Tables, index: Mapping[str, int]) -> F64:
 
 
 def _annotations(
-    tables: _Tables, chosen: Sequence[Sample], index: Mapping[str, int]
+    tables: _Tables, selected_samples: Sequence[Sample], index: Mapping[str, int]
 ) -> tuple[BoxTable, I32, I8, BikeRacks]:
     """Boxes, their points and visibility, and the bicycle racks of the samples."""
     category_names = {
@@ -217,7 +217,7 @@ def _annotations(
     }
     path = table_path(tables.root, tables.version, "sample_annotation")
     # neighbours, which velocities need, may lie in samples that are not selected
-    scenes = {sample.scene_token for sample in chosen}
+    scenes = {sample.scene_token for sample in selected_samples}
     timestamp_by_sample = {
         sample.token: sample.timestamp for sample in tables.rows("sample", Sample) if sample.scene_token in scenes
     }
@@ -286,23 +286,27 @@ def _annotations(
     return boxes, columns[box_rows, 4].astype(np.int32), columns[box_rows, 3].astype(np.int8), racks
 
 
-def _label(path: Path, a: _Annotation, label_of: Mapping[str, int]) -> int:
+def _label(path: Path, annotation: _Annotation, label_of: Mapping[str, int]) -> int:
     """Class of an annotation, -1 for one that does not count."""
-    label = label_of.get(a.instance_token)
+    label = label_of.get(annotation.instance_token)
     if label is None:
-        raise FormatError(f"{path}: annotation {a.token}: instance.json has no record '{a.instance_token}'")
+        raise FormatError(
+            f"{path}: annotation {annotation.token}: instance.json has no record '{annotation.instance_token}'"
+        )
     return label
 
 
-def _attribute(path: Path, a: _Annotation, known: Mapping[str, int]) -> int:
+def _attribute(path: Path, annotation: _Annotation, attribute_index: Mapping[str, int]) -> int:
     """Index of an annotation's attribute, -1 for none."""
-    if not a.attribute_tokens:
+    if not annotation.attribute_tokens:
         return -1
-    if len(a.attribute_tokens) > 1:
-        raise FormatError(f"{path}: annotation {a.token} has more than one attribute")
-    attribute = known.get(a.attribute_tokens[0], -1)
+    if len(annotation.attribute_tokens) > 1:
+        raise FormatError(f"{path}: annotation {annotation.token} has more than one attribute")
+    attribute = attribute_index.get(annotation.attribute_tokens[0], -1)
     if attribute < 0:
-        raise FormatError(f"{path}: annotation {a.token}: unknown attribute '{a.attribute_tokens[0]}'")
+        raise FormatError(
+            f"{path}: annotation {annotation.token}: unknown attribute '{annotation.attribute_tokens[0]}'"
+        )
     return attribute
 
 

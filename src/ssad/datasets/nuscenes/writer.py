@@ -138,7 +138,7 @@ class NuScenesWriter:
         sensor_token = _token("sensor", channel)
         if sensor_token not in self._rows[Sensor]:
             self._add(Sensor(sensor_token, channel, modality))
-        calibration_token = _token("calibrated_sensor", self._known(Scene, scene).name, channel)
+        calibration_token = _token("calibrated_sensor", self._record_of(Scene, scene).name, channel)
         matrix = tuple(tuple(float(value) for value in row) for row in intrinsic)
         self._add(CalibratedSensor(calibration_token, sensor_token, _floats(translation), _floats(rotation), matrix))
         self._mounted[scene, channel] = calibration_token, modality
@@ -146,7 +146,7 @@ class NuScenesWriter:
 
     def add_sample(self, scene: str, timestamp_us: int) -> str:
         """Add a key frame of a scene, in any order."""
-        name = self._known(Scene, scene).name
+        name = self._record_of(Scene, scene).name
         return self._add(Sample(_token("sample", name, timestamp_us), timestamp_us, scene))
 
     def add_sensor_frame(
@@ -177,11 +177,11 @@ class NuScenesWriter:
         Returns:
             Token of the file's record.
         """
-        record = self._known(Scene, scene)
+        record = self._record_of(Scene, scene)
         if (scene, channel) not in self._mounted:
             raise ValueError(f"scene '{record.name}' has no sensor '{channel}': call add_sensor first")
         calibration, modality = self._mounted[scene, channel]
-        if sample is not None and self._known(Sample, sample).scene_token != scene:
+        if sample is not None and self._record_of(Sample, sample).scene_token != scene:
             raise ValueError(f"sample '{sample}' is of another scene")
         suffix, kind = _FORMATS[modality]
         folder = "sweeps" if sample is None else "samples"
@@ -208,9 +208,9 @@ class NuScenesWriter:
 
     def add_instance(self, scene: str, key: str, *, category: str) -> str:
         """Add an object of a scene, such as key 'car-3'; its annotations are added one per sample."""
-        token = _token("instance", self._known(Scene, scene).name, key)
+        token = _token("instance", self._record_of(Scene, scene).name, key)
         self._instance_scene[token] = scene
-        return self._add(Instance(token, self._named(Category, category)))
+        return self._add(Instance(token, self._token_of(Category, category)))
 
     def add_annotation(
         self,
@@ -239,17 +239,17 @@ class NuScenesWriter:
         Returns:
             Token of the annotation.
         """
-        self._known(Instance, instance)
-        if self._instance_scene[instance] != self._known(Sample, sample).scene_token:
+        self._record_of(Instance, instance)
+        if self._instance_scene[instance] != self._record_of(Sample, sample).scene_token:
             raise ValueError(f"instance '{instance}' and sample '{sample}' are of different scenes")
-        self._known(Visibility, visibility)
+        self._record_of(Visibility, visibility)
         return self._add(
             SampleAnnotation(
                 _token("sample_annotation", sample, instance),
                 sample_token=sample,
                 instance_token=instance,
                 visibility_token=visibility,
-                attribute_tokens=tuple(self._named(Attribute, name) for name in attributes),
+                attribute_tokens=tuple(self._token_of(Attribute, name) for name in attributes),
                 translation=_floats(translation),
                 size=_floats(size),
                 rotation=_floats(rotation),
@@ -287,13 +287,13 @@ class NuScenesWriter:
         table[record.token] = record
         return record.token
 
-    def _known(self, kind: type[R], token: str) -> R:
+    def _record_of(self, kind: type[R], token: str) -> R:
         record: R | None = self._rows[kind].get(token)
         if record is None:
             raise ValueError(f"no {kind.__name__} has the token '{token}'")
         return record
 
-    def _named(self, kind: type[Category] | type[Attribute], name: str) -> str:
+    def _token_of(self, kind: type[Category] | type[Attribute], name: str) -> str:
         """Return the token of a category or attribute; one that the original does not have is added."""
         token = _token("category" if kind is Category else "attribute", name)
         if token not in self._rows[kind]:
@@ -329,8 +329,8 @@ class NuScenesWriter:
             row = frame.row
             if not row.sample_token:
                 samples = self._order[frame.scene]
-                following = bisect_left([sample.timestamp for sample in samples], row.timestamp)
-                row = msgspec.structs.replace(row, sample_token=samples[min(following, len(samples) - 1)].token)
+                next_index = bisect_left([sample.timestamp for sample in samples], row.timestamp)
+                row = msgspec.structs.replace(row, sample_token=samples[min(next_index, len(samples) - 1)].token)
             self._rows[SampleData][row.token] = row
             chains.setdefault((frame.scene, frame.channel), []).append(row)
         for rows in chains.values():

@@ -10,15 +10,15 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.lane_strips import strips
 from ssad.core.types import F64, U8, EpisodeTrace
 
-GROUND, ROAD, SIDE, MARK = (236, 240, 238), (196, 199, 203), (221, 222, 224), (255, 255, 255)
-EGO, ADVERSARY, OTHER, DARK = (39, 106, 201), (205, 55, 47), (120, 126, 134), (40, 44, 48)
+GROUND, ROAD, SIDEWALK, MARKING = (236, 240, 238), (196, 199, 203), (221, 222, 224), (255, 255, 255)
+EGO, ADVERSARY, BYSTANDER, DARK = (39, 106, 201), (205, 55, 47), (120, 126, 134), (40, 44, 48)
 """RGB."""
-BEFORE = 6.0  # s of the motion that is shown
+SHOWN_SECONDS = 6.0  # s of the motion that is shown
 MARGIN = 14.0  # m
 
 
 def found_view(
-    trace: EpisodeTrace, graph: LaneGraph, adversaries: list[int], *, size: int = 420, last: int | None = None
+    trace: EpisodeTrace, graph: LaneGraph, adversaries: list[int], *, size: int = 420, last_step: int | None = None
 ) -> U8:
     """Draw a scenario from above: paths of the last seconds, bodies each second faint, and at the end in full.
 
@@ -27,16 +27,18 @@ def found_view(
         graph: Its town.
         adversaries: Agents drawn as adversaries.
         size: Size of the picture, pixels.
-        last: Step that is shown; None: the first contact, or the end.
+        last_step: Step that is shown; None: the first contact, or the end.
 
     Returns:
         [size, size, 3] RGB.
     """
     contact_steps = np.flatnonzero(trace.contact)
-    if last is None:
-        last = int(contact_steps[0]) if len(contact_steps) else len(trace.x) - 1
-    first_step = max(0, last - round(BEFORE / trace.dt))
-    positions = np.stack([trace.x[first_step : last + 1], trace.y[first_step : last + 1]], -1).astype(np.float64)
+    if last_step is None:
+        last_step = int(contact_steps[0]) if len(contact_steps) else len(trace.x) - 1
+    first_step = max(0, last_step - round(SHOWN_SECONDS / trace.dt))
+    positions = np.stack([trace.x[first_step : last_step + 1], trace.y[first_step : last_step + 1]], -1).astype(
+        np.float64
+    )
     visible_points = positions[:, [0, *adversaries]].reshape(-1, 2)
     centre = 0.5 * (visible_points.min(0) + visible_points.max(0))
     half_width = max(float(np.ptp(visible_points, axis=0).max()) / 2 + MARGIN, 22.0)
@@ -46,35 +48,35 @@ def found_view(
         pixels = (np.asarray(xy) - centre) * [scale, -scale] + size / 2
         return np.asarray(np.round(pixels * 16), np.int32)  # in sixteenths of a pixel
 
-    picture = np.full((size, size, 3), GROUND, np.uint8)
+    canvas = np.full((size, size, 3), GROUND, np.uint8)
     visible_strips = [  # a straight strip may have no corner in the picture
         strip
         for strip in strips(graph)
         if (strip.ring.min(0) < centre + half_width).all() and (strip.ring.max(0) > centre - half_width).all()
     ]
     for strip in visible_strips:
-        cv2.fillPoly(picture, [to_pixels(strip.ring)], ROAD if strip.layer >= 2 else SIDE, cv2.LINE_AA, 4)
+        cv2.fillPoly(canvas, [to_pixels(strip.ring)], ROAD if strip.layer >= 2 else SIDEWALK, cv2.LINE_AA, 4)
     for strip in visible_strips:
         if strip.layer == 3 and not strip.junction:
             for edge in (strip.left, strip.right):
-                cv2.polylines(picture, [to_pixels(edge)], False, MARK, 1, cv2.LINE_AA, 4)
+                cv2.polylines(canvas, [to_pixels(edge)], False, MARKING, 1, cv2.LINE_AA, 4)
     colours = {0: EGO, **dict.fromkeys(adversaries, ADVERSARY)}
     # Adversaries and then the ego last, so that they are drawn over other traffic.
     for agent in sorted(range(trace.x.shape[1]), key=lambda index: (index == 0, index in adversaries)):
-        colour = colours.get(agent, OTHER)
-        present = trace.active[first_step : last + 1, agent]
-        if agent in colours and present.any():
-            cv2.polylines(picture, [to_pixels(positions[present, agent])], False, colour, 2, cv2.LINE_AA, 4)
-        for step in [*(range(last, first_step, -round(1 / trace.dt))[1:] if agent in colours else []), last]:
+        colour = colours.get(agent, BYSTANDER)
+        is_present = trace.active[first_step : last_step + 1, agent]
+        if agent in colours and is_present.any():
+            cv2.polylines(canvas, [to_pixels(positions[is_present, agent])], False, colour, 2, cv2.LINE_AA, 4)
+        for step in [*(range(last_step, first_step, -round(1 / trace.dt))[1:] if agent in colours else []), last_step]:
             if not trace.active[step, agent]:
                 continue
             outline = to_pixels(_corners(trace, step, agent))
-            if step == last:
-                cv2.fillPoly(picture, [outline], colour, cv2.LINE_AA, 4)
+            if step == last_step:
+                cv2.fillPoly(canvas, [outline], colour, cv2.LINE_AA, 4)
                 front_edge = to_pixels(_corners(trace, step, agent)[[0, 3]])
-                cv2.polylines(picture, [front_edge], False, DARK, 2, cv2.LINE_AA, 4)
-            cv2.polylines(picture, [outline], True, colour if step < last else DARK, 1, cv2.LINE_AA, 4)
-    return picture
+                cv2.polylines(canvas, [front_edge], False, DARK, 2, cv2.LINE_AA, 4)
+            cv2.polylines(canvas, [outline], True, colour if step < last_step else DARK, 1, cv2.LINE_AA, 4)
+    return canvas
 
 
 def _corners(trace: EpisodeTrace, row: int, agent: int) -> F64:

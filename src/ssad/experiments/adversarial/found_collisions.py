@@ -30,7 +30,7 @@ def collides(base: Base) -> bool:
 
 
 def saved_collisions(
-    path: Path, base: Base, row: Sequence[Outcome], *, keep: int, stem: str
+    path: Path, base: Base, row: Sequence[Outcome], *, limit: int, stem: str
 ) -> tuple[list[Outcome], list[Scenario]]:
     """Write the most distinct collisions of a search as scenarios, if there are any.
 
@@ -38,7 +38,7 @@ def saved_collisions(
         path: The YAML file.
         base: What was searched.
         row: What came of each rollout.
-        keep: How many are written.
+        limit: How many are written.
         stem: Of their names.
 
     Returns:
@@ -47,7 +47,7 @@ def saved_collisions(
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 
-    collisions = distinct([outcome for outcome in row if outcome.valid])[:keep]
+    collisions = distinct([outcome for outcome in row if outcome.valid])[:limit]
     scenarios = [scenario_of(outcome, base, name=f"{stem}-{index}") for index, outcome in enumerate(collisions)]
     if scenarios:
         save_scenarios(path, scenarios)
@@ -65,9 +65,9 @@ def grades(rows: Sequence[Mapping[str, float]], collisions: Sequence[Base]) -> d
         return {}
     is_avoidable = [any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit") for row in rows]
     avoidable_moving = [avoidable for avoidable, base in zip(is_avoidable, collisions, strict=True) if _moves(base)]
-    shares = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    shares["attributable"] = float(np.mean(is_avoidable))
-    return shares | ({"attributable_moving": float(np.mean(avoidable_moving))} if avoidable_moving else {})
+    shares_by_model = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    shares_by_model["attributable"] = float(np.mean(is_avoidable))
+    return shares_by_model | ({"attributable_moving": float(np.mean(avoidable_moving))} if avoidable_moving else {})
 
 
 def _moves(base: Base) -> bool:
@@ -78,23 +78,23 @@ def _moves(base: Base) -> bool:
 def transfer(
     systems: Sequence[str],
     bases: Sequence[Base],
-    made: Sequence[Sequence[Scenario]],
+    scenarios_by_base: Sequence[Sequence[Scenario]],
     device: str,
     *,
     seeds: Sequence[int],
 ) -> list[dict[str, dict[str, float]]]:
-    """How other systems fare in what was found against one.
+    """Drive other systems through the scenarios that were found against one.
 
     Args:
         systems: The others.
         bases: What was searched.
-        made: What was found in each, at least one scenario.
+        scenarios_by_base: What was found in each, at least one scenario.
         device: Where the world computes.
         seeds: Of the episodes of each base.
 
     Returns:
-        For each base: name of a system -> `base`, whether it collides in the base, and `found`, the share of `made` in
-        which it does.
+        For each base: name of a system -> `base`, whether it collides in the base, and `found`, the share
+        of `scenarios_by_base` in which it does.
     """
     from ssad.drivers import make_system
     from ssad.scenarios.dynamic.generate import Trials
@@ -102,7 +102,7 @@ def transfer(
     rows: list[dict[str, dict[str, float]]] = [{} for _ in bases]
     episode_groups = [
         [(episode_spec, base.graph, seed) for episode_spec in (base.scenario, *scenarios)]
-        for base, scenarios, seed in zip(bases, made, seeds, strict=True)
+        for base, scenarios, seed in zip(bases, scenarios_by_base, seeds, strict=True)
     ]
     for name in systems:
         trials = Trials(partial(make_system, name), make_system, device=device)

@@ -171,12 +171,12 @@ class Adversarial(ScenarioKind):
         results: dict[str, dict[str, Any]] = {}
         for cell in cells:
             base = bases[cell.key]
-            refused, survived = refusal(factory, base.episode), not collides(base)
-            if survived and not refused:
+            refusal_reason, is_survived = refusal(factory, base.episode), not collides(base)
+            if is_survived and not refusal_reason:
                 surviving_cells.append(cell)
                 continue
-            metrics: dict[str, Any] = {"applies": not refused, "survived": survived}
-            results[cell.key] = {"metrics": metrics, "case": motion_hash(base.trace), "refused": refused}
+            metrics: dict[str, Any] = {"applies": not refusal_reason, "survived": is_survived}
+            results[cell.key] = {"metrics": metrics, "case": motion_hash(base.trace), "refused": refusal_reason}
         if not surviving_cells:
             return results
         start_time = time.process_time()
@@ -229,7 +229,7 @@ class Adversarial(ScenarioKind):
         stem = f"{base.scenario.name}/{cell.spec['generator']}{suffix}"
         artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
         collisions, saved_scenarios = saved_collisions(
-            folder / artefacts["scenarios"], base, row, keep=cell.spec["keep"], stem=stem
+            folder / artefacts["scenarios"], base, row, limit=cell.spec["keep"], stem=stem
         )
         if not collisions:
             return {}, []
@@ -238,11 +238,11 @@ class Adversarial(ScenarioKind):
         return {"artefacts": artefacts, "adversaries": list(collisions[0].adversaries)}, saved_scenarios
 
     def _drive_again(
-        self, cells: Sequence[Cell], bases: Sequence[Base], made: Sequence[Sequence[Scenario]], trials: Any
+        self, cells: Sequence[Cell], bases: Sequence[Base], scenarios_by_base: Sequence[Sequence[Scenario]], trials: Any
     ) -> list[dict[str, Any]]:
         """Drives what was saved again, grades it, and drives it with other systems; of all cells side by side."""
         records: list[dict[str, Any]] = [{"metrics": {"replayed": None}} for _ in cells]
-        cell_indices = [cell_index for cell_index, scenarios in enumerate(made) if scenarios]
+        cell_indices = [cell_index for cell_index, scenarios in enumerate(scenarios_by_base) if scenarios]
         # another seed: a saved collision must not depend on the seed of its search
         seeds = [cells[cell_index].seed + 1 for cell_index in cell_indices]
         replayed_bases = iter(
@@ -250,19 +250,19 @@ class Adversarial(ScenarioKind):
                 [
                     (scenario, bases[cell_index].graph, seed)
                     for cell_index, seed in zip(cell_indices, seeds, strict=True)
-                    for scenario in made[cell_index]
+                    for scenario in scenarios_by_base[cell_index]
                 ]
             )
         )
         transfer_records = transfer(
             cells[0].spec["transfer"],
             [bases[cell_index] for cell_index in cell_indices],
-            [made[cell_index] for cell_index in cell_indices],
+            [scenarios_by_base[cell_index] for cell_index in cell_indices],
             trials.device,
             seeds=seeds,
         )
         collisions = [
-            [base for base in (next(replayed_bases) for _ in made[cell_index]) if collides(base)]
+            [base for base in (next(replayed_bases) for _ in scenarios_by_base[cell_index]) if collides(base)]
             for cell_index in cell_indices
         ]
         is_graded = cells[0].spec["grade"]
@@ -280,7 +280,7 @@ class Adversarial(ScenarioKind):
         for cell_index, repeated_collisions, transfer_record in zip(
             cell_indices, collisions, transfer_records, strict=True
         ):
-            metrics = {"replayed": len(repeated_collisions) / len(made[cell_index])}
+            metrics = {"replayed": len(repeated_collisions) / len(scenarios_by_base[cell_index])}
             if is_graded:
                 metrics |= grades([next(collision_grades).metrics() for _ in repeated_collisions], repeated_collisions)
             records[cell_index] = {"metrics": metrics, "transfer": transfer_record}

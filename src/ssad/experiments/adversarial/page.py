@@ -22,7 +22,7 @@ from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import NATURAL, SOURCE
 from ssad.report.records import Line, field, metric_of
-from ssad.report.tables import METHODS, Cell, Row, Table
+from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -97,14 +97,14 @@ def careful_table(run: Run) -> Table | None:
 def transfer_table(run: Run) -> Table | None:
     """Return the CR of other systems in the saved scenarios, against the bases; None if none was transferred."""
 
-    def metric(drives: Sequence[tuple[Line, str]], column: str) -> Cell:
+    def metric(drives: Sequence[tuple[Line, str]], column: str) -> TableCell:
         with_adversary, base = (
             {str(line["key"]): _case(line, float(line["transfer"][system][condition])) for line, system in drives}
             for condition in ("found", "base")
         )
         if column == "difference":
-            return Cell.of(paired_difference(with_adversary, base))
-        return Cell.of(estimate((with_adversary if column == "found" else base).values(), "bounded"))
+            return TableCell.of(paired_difference(with_adversary, base))
+        return TableCell.of(estimate((with_adversary if column == "found" else base).values(), "bounded"))
 
     table = Table.pivot(
         "transfer",
@@ -126,14 +126,14 @@ def transfer_table(run: Run) -> Table | None:
 def budget_table(run: Run) -> Table:
     """Return the CR within parts of the budget."""
     budget = int(run.suite.get("budget", 1))
-    rollout_limits = sorted({max(1, round(budget * share)) for share in (0.125, 0.25, 0.5, 1.0)})
+    rollout_limits = sorted({max(1, round(budget * fraction)) for fraction in (0.125, 0.25, 0.5, 1.0)})
     return Table.pivot(
         "budget",
         "CR by rollouts spent",
         run.lines,
         rows=SEARCH,
         columns={count: f"CR within {count}" for count in rollout_limits},
-        metric=lambda lines, count: _mean(lines, partial(_within, most=count), "share"),
+        metric=lambda lines, count: _mean(lines, partial(_within, max_rollouts=count), "share"),
         note=METHODS,
     )
 
@@ -142,7 +142,7 @@ def against_table(run: Run) -> Table | None:
     """Return the CR of each generator minus that of random search, over the same bases."""
     random_lines = {system: lines for (generator, system), lines in _searches(run).items() if generator == RANDOM}
 
-    def metric(lines: Sequence[Line], _: str) -> Cell:
+    def metric(lines: Sequence[Line], _: str) -> TableCell:
         generator_cases, random_cases = (
             {
                 f"{line['cluster']}#{line['spec']['repetition']}": _case(line, _within(line))
@@ -151,7 +151,7 @@ def against_table(run: Run) -> Table | None:
             }
             for search_lines in (lines, random_lines[str(lines[0]["system"])])
         )
-        return Cell.of(paired_difference(generator_cases, random_cases, kind="share"))
+        return TableCell.of(paired_difference(generator_cases, random_cases, kind="share"))
 
     table = Table.pivot(
         "against_random",
@@ -189,16 +189,20 @@ def traffic_table(run: Run) -> Table | None:
     if not natural_lines:
         return None
 
-    def metric(drives: Sequence[tuple[Line, str]], column: str) -> Cell:
+    def metric(drives: Sequence[tuple[Line, str]], column: str) -> TableCell:
         collided = {str(line["key"]): 1.0 - metric_of(line, "survived") for line, _ in drives}
-        natural = {str(line["key"]): _case(line, collided[str(line["key"])]) for line, _ in drives}
+        natural_cases = {str(line["key"]): _case(line, collided[str(line["key"])]) for line, _ in drives}
         adversarial = {
-            str(line["key"]): _case(line, max(collided[str(line["key"])], _found(line))) for line, _ in drives
+            str(line["key"]): _case(line, max(collided[str(line["key"])], _has_found(line))) for line, _ in drives
         }
         among_adversaries = drives[0][1] == "Adv.PPO"
         if column == "CR":
-            return Cell.of(estimate((adversarial if among_adversaries else natural).values(), "share"))
-        return Cell.of(paired_difference(adversarial, natural, kind="share")) if among_adversaries else Cell.value(None)
+            return TableCell.of(estimate((adversarial if among_adversaries else natural_cases).values(), "share"))
+        return (
+            TableCell.of(paired_difference(adversarial, natural_cases, kind="share"))
+            if among_adversaries
+            else TableCell.value(None)
+        )
 
     return Table.pivot(
         "traffic",
@@ -211,8 +215,8 @@ def traffic_table(run: Run) -> Table | None:
         },
         columns={"CR": "CR", "increase": "more than in natural traffic"},
         metric=metric,
-        below=[
-            Row.of_published((system, "natural" if traffic == "Autopilot" else traffic, town), (rate, None))
+        footer_rows=[
+            TableRow.of_published((system, "natural" if traffic == "Autopilot" else traffic, town), (rate, None))
             for (system, traffic), by_town in NATURAL.items()
             for town, (rate, _, _) in by_town.items()
         ],
@@ -223,7 +227,7 @@ def traffic_table(run: Run) -> Table | None:
     )
 
 
-def _found(line: Line) -> float:
+def _has_found(line: Line) -> float:
     """Return whether any collision with an adversary was found; 0 where none was tried, NaN where the cell failed."""
     if line["status"] != "ok":
         return math.nan
@@ -243,8 +247,8 @@ def views(run: Run) -> list[dict[str, str]]:
             graph = load_graph(run.folder / "towns" / town_file(trace.town))
         except SSADError:
             continue  # named on the page as missing or damaged
-        picture = found_view(trace, graph, [int(agent) for agent in line["adversaries"]])
-        encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
+        image = found_view(trace, graph, [int(agent) for agent in line["adversaries"]])
+        encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
         caption = f"{generator} against {system} in {line['cluster']}"
         command = f"ssad run quick --set scenarios={run.folder / line['artefacts']['scenarios']} --set systems={system}"
         uri = f"data:image/png;base64,{base64.b64encode(encoded).decode()}"
@@ -265,17 +269,17 @@ def _by_search(run: Run) -> list[Line]:
     return [line for lines in _searches(run).values() for line in lines]
 
 
-def _within(line: Line, most: float = math.inf) -> float:
-    """Whether a search has found a collision within so many rollouts; NaN: nothing to search, or it failed."""
+def _within(line: Line, max_rollouts: float = math.inf) -> float:
+    """Return 1 if a search has found a collision within so many rollouts, else 0; NaN without a search."""
     metrics = line.get("metrics") or {}
     if line["status"] != "ok" or metrics.get("CR") is None:
         return math.nan
-    return float(bool(metrics["CR"]) and metrics["rollouts"] <= most)
+    return float(bool(metrics["CR"]) and metrics["rollouts"] <= max_rollouts)
 
 
-def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> Cell:
+def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> TableCell:
     """Return the mean of a value of searches, over their base scenarios."""
-    return Cell.of(estimate([_case(line, value(line)) for line in lines], kind))
+    return TableCell.of(estimate([_case(line, value(line)) for line in lines], kind))
 
 
 def _case(line: Line, value: float) -> CaseValue:

@@ -21,11 +21,11 @@ from ssad.world.roads.edge import edge_distances
 from ssad.world.roads.query import LaneQuery
 
 EPISODES: Final = 12  # of the reference
-MOVED: Final = 5.0  # m; who moves less is parked and says nothing
-APART: Final = 1.0  # m by which motions before contact differ on average, to count as distinct
-BEFORE: Final = 3.0  # s of motion that are compared
+MIN_TRAVEL: Final = 5.0  # m; who moves less is parked and says nothing
+MIN_DIFFERENCE: Final = 1.0  # m by which motions before contact differ on average, to count as distinct
+COMPARED_SECONDS: Final = 3.0  # s of motion that are compared
 MOVING: Final = 0.5  # m/s; an ego that is slower when it is hit stands
-SHOWN: Final = ("speed", "acceleration", "yaw_rate", "nearest")
+REPORTED_FEATURES: Final = ("speed", "acceleration", "yaw_rate", "nearest")
 
 
 def summary(row: Sequence[Outcome]) -> dict[str, Any]:
@@ -35,8 +35,8 @@ def summary(row: Sequence[Outcome]) -> dict[str, Any]:
     first_rollout = next((rollout for rollout, outcome in enumerate(row, 1) if outcome.valid), None)
 
     def mean(values: Sequence[float | bool | None]) -> float | None:
-        numbers = [float(number) for number in values if number is not None]
-        return float(np.mean(numbers)) if numbers else None
+        measured = [float(value) for value in values if value is not None]
+        return float(np.mean(measured)) if measured else None
 
     return {
         "CR": bool(valid),
@@ -62,7 +62,10 @@ def distinct(outcomes: Sequence[Outcome]) -> list[Outcome]:
     distinct_approaches: list[tuple[Outcome, np.ndarray[Any, Any]]] = []
     for outcome in outcomes:
         motion = _approach(outcome)
-        if all(float(np.hypot(*(motion - other_motion).T).mean()) >= APART for _, other_motion in distinct_approaches):
+        if all(
+            float(np.hypot(*(motion - other_motion).T).mean()) >= MIN_DIFFERENCE
+            for _, other_motion in distinct_approaches
+        ):
             distinct_approaches.append((outcome, motion))
     return [outcome for outcome, _ in distinct_approaches]
 
@@ -75,7 +78,7 @@ def _approach(outcome: Outcome) -> np.ndarray[Any, Any]:
     contact_step = round(outcome.time / trace.dt)
     agent = int(trace.contact_agent[contact_step])
     # A contact in the first 3 s repeats the first step, so that all motions have one length.
-    steps = np.clip(np.arange(contact_step - round(BEFORE / trace.dt) + 1, contact_step + 1), 0, None)
+    steps = np.clip(np.arange(contact_step - round(COMPARED_SECONDS / trace.dt) + 1, contact_step + 1), 0, None)
     x, y = (getattr(trace, name)[steps] for name in ("x", "y"))
     cos, sin = np.cos(trace.yaw[steps, 0]), np.sin(trace.yaw[steps, 0])
     dx, dy = x[:, agent] - x[:, 0], y[:, agent] - y[:, 0]
@@ -87,20 +90,23 @@ def motions(trace: EpisodeTrace, graph: LaneGraph, agents: Sequence[int]) -> lis
     features = []
     query = LaneQuery(graph)
     for agent in agents:
-        travel = np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent]))
-        if travel < MOVED or not AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE:
+        travelled = np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent]))
+        if travelled < MIN_TRAVEL or not AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE:
             continue
         path = np.stack([trace.x[:, agent], trace.y[:, agent]], 1).astype(np.float64)
         features.append(motion_features(trace, agent, edge_distances(query, path)))
     return features
 
 
-def likeness(row: Sequence[Outcome], graph: LaneGraph, usual: Mapping[str, F64]) -> dict[str, float]:
+def likeness(row: Sequence[Outcome], graph: LaneGraph, reference_motions: Mapping[str, F64]) -> dict[str, float]:
     """Realism score and distances of the adversaries that have collided with the ego; NaN if none has."""
     collided = [outcome for outcome in row if outcome.valid and outcome.trace is not None]
     features = pooled([motion for outcome in collided for motion in motions(outcome.trace, graph, outcome.adversaries)])  # type: ignore[arg-type]
-    feature_distances = wasserstein(features, usual)
-    return {"realism": realism(features, usual), **{f"w_{name}": feature_distances[name] for name in SHOWN}}
+    feature_distances = wasserstein(features, reference_motions)
+    return {
+        "realism": realism(features, reference_motions),
+        **{f"w_{name}": feature_distances[name] for name in REPORTED_FEATURES},
+    }
 
 
 def reference(folder: Path, device: str) -> dict[str, F64]:

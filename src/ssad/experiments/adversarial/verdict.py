@@ -42,5 +42,5 @@ def verdict(run: Run) -> list[str]:
     return sentences
 
 
-def _found_in(generator: str, hits: int, tried: int, failed: int) -> str:
-    return f"{generator} in {hits} of {tried}{f' ({failed} failed)' if failed else ''}"
+def _found_in(generator: str, found_count: int, tried_count: int, failed_count: int) -> str:
+    return f"{generator} in {found_count} of {tried_count}{f' ({failed_count} failed)' if failed_count else ''}"

@@ -17,7 +17,7 @@ from ssad.rendering.agent_edit import AgentEdit
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.onboard import DAY, Onboard
 
-NEAR = 40.0  # m ahead of the ego within which an agent is worth filming
+FILMING_RANGE = 40.0  # m ahead of the ego within which an agent is worth filming
 
 
 def first_ahead(trace: EpisodeTrace, kind: AgentKind = AgentKind.CAR) -> int | None:
@@ -26,8 +26,8 @@ def first_ahead(trace: EpisodeTrace, kind: AgentKind = AgentKind.CAR) -> int | N
     cos, sin = np.cos(trace.yaw[:, :1]), np.sin(trace.yaw[:, :1])
     forward, lateral = dx * cos + dy * sin, dy * cos - dx * sin
     # A cone of 27 degrees to either side stands for the view of the camera.
-    visible = trace.active & (forward > 2.0 * np.abs(lateral)) & (forward < NEAR) & (trace.kind == kind)
-    visible_steps = visible[:, 1:].sum(0)
+    is_ahead = trace.active & (forward > 2.0 * np.abs(lateral)) & (forward < FILMING_RANGE) & (trace.kind == kind)
+    visible_steps = is_ahead[:, 1:].sum(0)
     return int(visible_steps.argmax()) + 1 if visible_steps.size and visible_steps.max() > 0 else None
 
 
@@ -38,7 +38,7 @@ def attacked_frames(
     *,
     detector: Detector | None = None,
     width: int = 640,
-    every: int = 2,
+    frame_stride: int = 2,
     weather: SceneWeather = DAY,
 ) -> Iterator[U8]:
     """The drive as the ego's camera sees it, without the attack on the left and with it on the right.
@@ -49,7 +49,7 @@ def attacked_frames(
         attack: What is changed.
         detector: Whose boxes are drawn; None: none.
         width: Of each of the two pictures, px.
-        every: Steps from one frame to the next.
+        frame_stride: Steps from one frame to the next.
         weather: Of the drive.
 
     Yields:
@@ -60,13 +60,13 @@ def attacked_frames(
     """
     camera_model = Camera.typical(width, width * 9 // 16)
     intrinsic = torch.tensor(camera_model.intrinsic, dtype=torch.float32)
-    variants = [
+    appearance_variants = [
         (title, Onboard(weather=weather, attack=variant_edit).camera(camera_model))
         for title, variant_edit in (("clean", None), (f"agent {attack.agent} attacked", attack))
     ]
-    for step in range(0, len(trace.x), every):
+    for step in range(0, len(trace.x), frame_stride):
         tiles = []
-        for title, onboard_camera in variants:
+        for title, onboard_camera in appearance_variants:
             (rendered,) = onboard_camera.of_trace(trace, graph, steps=[step])
             image = np.ascontiguousarray(np.moveaxis(rendered, 0, -1))
             if detector is not None:

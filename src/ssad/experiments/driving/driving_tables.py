@@ -11,7 +11,7 @@ from ssad.experiments.driving.episodes import DrivingRun
 from ssad.metrics import FAMILIES, METRICS, Estimate
 from ssad.metrics.driving import DIVISORS, normalised
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS, SOURCE
-from ssad.report.tables import METHODS, Cell, Row, Table
+from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
 SHOWN = ("CR", "OR", "DR", "RC")
 AVERAGE = FAMILIES["pre-crash"]
@@ -23,10 +23,10 @@ def precrash_table(run: DrivingRun) -> Table | None:
     if not systems:
         return None
 
-    def published(row: tuple[str, str]) -> list[Row]:
+    def published(row: tuple[str, str]) -> list[TableRow]:
         symbol, system = row
         rows_of_paper = PRECRASH[symbol].items() if system == systems[-1] else ()
-        return [Row.of_published((symbol, name), values) for name, values in rows_of_paper]
+        return [TableRow.of_published((symbol, name), values) for name, values in rows_of_paper]
 
     return Table.listing(
         "precrash",
@@ -42,24 +42,24 @@ def precrash_table(run: DrivingRun) -> Table | None:
     )
 
 
-def _cell(run: DrivingRun, key: tuple[str, str], symbol: str) -> Cell:
+def _cell(run: DrivingRun, key: tuple[str, str], symbol: str) -> TableCell:
     """Return a metric of a system in a group; n/a where the system has no episodes in it."""
-    return Cell.of(run.numbers[key][symbol]) if key in run.numbers else Cell.value(None)
+    return TableCell.of(run.numbers[key][symbol]) if key in run.numbers else TableCell.value(None)
 
 
 def _counts(run: DrivingRun, systems: list[str]) -> str:
     """Return in a sentence how many episodes and scenarios are behind the numbers."""
-    parts = []
+    count_texts = []
     for system in systems:
         cells = [estimates["CR"] for group in SCENARIOS if (estimates := run.numbers.get((system, group)))]
         ranges = [
-            str(low) if low == high else f"{low} to {high}"
-            for low, high in (
+            str(fewest) if fewest == largest else f"{fewest} to {largest}"
+            for fewest, largest in (
                 (min(counts), max(counts)) for counts in ([cell.n for cell in cells], [cell.clusters for cell in cells])
             )
         ]
-        parts.append(f"{system} {ranges[0]} in {ranges[1]} clusters")
-    return f"Episodes in a cell: {', '.join(parts)}."
+        count_texts.append(f"{system} {ranges[0]} in {ranges[1]} clusters")
+    return f"Episodes in a cell: {', '.join(count_texts)}."
 
 
 def natural_table(run: DrivingRun) -> Table | None:
@@ -78,8 +78,8 @@ def natural_table(run: DrivingRun) -> Table | None:
         },
         columns={symbol: symbol for symbol in SHOWN},
         metric=partial(_cell, run),
-        below=[
-            Row.of_published((system, traffic, town), (*numbers, None))
+        footer_rows=[
+            TableRow.of_published((system, traffic, town), (*numbers, None))
             for (system, traffic), by_town in NATURAL.items()
             for town, numbers in by_town.items()
         ],
@@ -109,11 +109,11 @@ def full_table(run: DrivingRun) -> Table:
 def normalised_table(run: DrivingRun) -> Table:
     """Return the terms of SafeBench's overall score, each 0 (best) to 1 (worst), and the two scores made of them."""
 
-    def metric(key: tuple[str, str], column: str) -> Cell:
+    def metric(key: tuple[str, str], column: str) -> TableCell:
         estimate = run.numbers[key]["OS" if column == "FREA" else column]
         if column in ("OR", "DR", "TS"):
-            return Cell.of(_scaled(column, estimate))
-        return Cell.of(estimate.scaled(-1.0, 1.0) if column in ("RC", "FREA") else estimate)
+            return TableCell.of(_scaled(column, estimate))
+        return TableCell.of(estimate.scaled(-1.0, 1.0) if column in ("RC", "FREA") else estimate)
 
     return Table.listing(
         "normalised",
@@ -140,8 +140,8 @@ def _scaled(name: str, estimate: Estimate) -> Estimate:
         value if math.isnan(value) else normalised(name, value)
         for value in (estimate.mean, estimate.low, estimate.high)
     )
-    mean, low, high = scaled_values
-    return replace(estimate, mean=mean, low=low, high=high)
+    mean, lower, upper = scaled_values
+    return replace(estimate, mean=mean, low=lower, high=upper)
 
 
 def summary_table(run: DrivingRun) -> Table:

@@ -152,10 +152,13 @@ def _lines(graph: LaneGraph, lane: int) -> list[int]:
     return line_codes
 
 
-def _flat(xy: npt.NDArray[np.float64], ox: float, oy: float) -> list[float]:
-    return [round(float(value), 2) for value in (xy - [ox, oy]).reshape(-1)]
+def _flat(xy: npt.NDArray[np.float64], origin_x: float, origin_y: float) -> list[float]:
+    return [round(float(value), 2) for value in (xy - [origin_x, origin_y]).reshape(-1)]
 
 
-def _crosswalks(graph: LaneGraph, ox: float, oy: float) -> list[list[float]]:
-    ends: Sequence[int] = graph.crosswalk_offset.tolist()
-    return [_flat(graph.crosswalk_xy[first:end].astype(np.float64), ox, oy) for first, end in itertools.pairwise(ends)]
+def _crosswalks(graph: LaneGraph, origin_x: float, origin_y: float) -> list[list[float]]:
+    offsets: Sequence[int] = graph.crosswalk_offset.tolist()
+    return [
+        _flat(graph.crosswalk_xy[start:end].astype(np.float64), origin_x, origin_y)
+        for start, end in itertools.pairwise(offsets)
+    ]

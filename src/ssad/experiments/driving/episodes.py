@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ssad.metrics import FAMILIES, Estimate, Outcome, aggregate_groups
+from ssad.metrics import FAMILIES, EpisodeOutcome, Estimate, aggregate_groups
 from ssad.report.load import Run
 from ssad.report.paper import SCENARIOS
 
@@ -33,7 +33,7 @@ class EpisodeRecord:
     status: str
     reason: str
     end: str
-    outcome: Outcome
+    outcome: EpisodeOutcome
     witness: Mapping[str, Any] | None
     trace: str
 
@@ -105,7 +105,7 @@ def _record(line: Mapping[str, Any], episode: Mapping[str, Any]) -> EpisodeRecor
         status=line["status"],
         reason=line.get("reason", ""),
         end=episode.get("end", ""),
-        outcome=Outcome.from_record(line, episode.get("trace_hash", "")),
+        outcome=EpisodeOutcome.from_record(line, episode.get("trace_hash", "")),
         witness=line.get("witness"),
         trace=line.get("artefacts", {}).get("trace", "") if succeeded else "",
     )

@@ -120,9 +120,9 @@ class Driving(ScenarioKind):
             raise ConfigError(f"suite {plan.suite.name}: one worker drives {plan.suite.simulator}; leave out --ray")
         return {"witness": plan.suite.witness}
 
-    def workers(self, plan: Plan, asked: int | None) -> int | None:
+    def workers(self, plan: Plan, requested: int | None) -> int | None:
         """Return one worker for a CARLA server, which runs one world."""
-        return asked if asked == 0 or plan.suite.simulator == EMBEDDED else 1
+        return requested if requested == 0 or plan.suite.simulator == EMBEDDED else 1
 
     def alike(self, cell: Cell) -> Hashable:
         """Return system and simulator; CARLA drives one cell at a time."""

@@ -16,7 +16,7 @@ from ssad.report.artefacts import pictures
 from ssad.report.figures import Interval, interval_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
-from ssad.report.tables import Cell, Table
+from ssad.report.tables import Table, TableCell
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -31,9 +31,9 @@ PICTURES = {
 """How names of pictures begin -> title of their section, and how to make more of them."""
 
 
-def summary(found: Run) -> Table:
+def summary(run: Run) -> Table:
     """Return the table for the terminal."""
-    return summary_table(load_episodes(found))
+    return summary_table(load_episodes(run))
 
 
 def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
@@ -87,7 +87,7 @@ def _tile(run: DrivingRun, system: str) -> dict[str, Any]:
     for family, title in FAMILY_TITLES.items():
         values = run.average(system, family)
         if values:
-            cells = {symbol: Cell.of(values[symbol]) for symbol in ("CR", "RC", "DS")}
+            cells = {symbol: TableCell.of(values[symbol]) for symbol in ("CR", "RC", "DS")}
             has_several = (
                 len(
                     {
@@ -111,7 +111,7 @@ def _collision_rates(run: DrivingRun) -> list[tuple[str, list[Interval]]]:
     """Return the collision rate of every system in every group and average."""
 
     def interval(number: int, system: str, group: str) -> Interval:
-        cell = Cell.of(run.numbers[system, group]["CR"])
+        cell = TableCell.of(run.numbers[system, group]["CR"])
         return Interval(number, cell, f"{system}: {cell.text}, {cell.tip}")
 
     return [
@@ -132,8 +132,8 @@ def _matrix(run: DrivingRun) -> list[dict[str, Any]]:
     groups: dict[str, dict[str, list[dict[str, str]]]] = {}
     for record in run.records:
         reason = record.reason or record.end.replace("_", " ")
-        mark = {"key": record.key, "outcome": outcome_class(record), "scenario": record.scenario, "why": reason}
-        groups.setdefault(record.heading, {}).setdefault(record.system, []).append(mark)
+        cell_mark = {"key": record.key, "outcome": outcome_class(record), "scenario": record.scenario, "why": reason}
+        groups.setdefault(record.heading, {}).setdefault(record.system, []).append(cell_mark)
     return [{"group": name, "systems": systems} for name, systems in groups.items()]
 
 
@@ -152,5 +152,5 @@ def _witness(run: DrivingRun) -> dict[str, Any] | None:
         system_rows = [row for (name, _), row in rows.items() if name == system]
         if len(system_rows) > 1:
             rows[system, "all"] = sum(system_rows, Counter())
-    order = sorted(rows, key=lambda key: run.systems.index(key[0]))
-    return {"rows": {key: rows[key] for key in order}, "columns": {**MODELS, "limit": "any manoeuvre tried"}}
+    ordered_keys = sorted(rows, key=lambda key: run.systems.index(key[0]))
+    return {"rows": {key: rows[key] for key in ordered_keys}, "columns": {**MODELS, "limit": "any manoeuvre tried"}}

@@ -89,21 +89,22 @@ def _witness_words(witness: Mapping[str, Any] | None) -> str:
     if not witness or "avoids" not in witness:
         return ""
     avoiding_models = [name for key, name in MODELS.items() if witness["avoids"].get(key)]
-    words = f"avoided by {', '.join(avoiding_models)}" if avoiding_models else "avoided by no careful driver"
-    limit, manoeuvre = witness["limit"], witness["limit"]["manoeuvre"]
+    sentence = f"avoided by {', '.join(avoiding_models)}" if avoiding_models else "avoided by no careful driver"
+    limit_result, manoeuvre = witness["limit"], witness["limit"]["manoeuvre"]
     if not manoeuvre:
-        return f"{words}; none of {limit['tried']} manoeuvres stays clear"
+        return f"{sentence}; none of {limit_result['tried']} manoeuvres stays clear"
     action = (
         "keep the speed"
         if not manoeuvre["accel"]
         else f"{'brake' if manoeuvre['accel'] < 0 else 'speed up'} {abs(manoeuvre['accel']):.1f} m/s²"
     )
-    side = (
+    side_text = (
         ""
         if not manoeuvre["aside"]
         else f", {abs(manoeuvre['aside']):.1f} m to the {'left' if manoeuvre['aside'] > 0 else 'right'}"
     )
     timing = (
-        f"the last of {limit['clear']} manoeuvres that stay clear begins {limit['latest']:.1f} s before the contact"
+        f"the last of {limit_result['clear']} manoeuvres that stay clear begins {limit_result['latest']:.1f} s "
+        "before the contact"
     )
-    return f"{words}; {timing}, the gentlest: from {manoeuvre['start']:.1f} s on {action}{side}"
+    return f"{sentence}; {timing}, the gentlest: from {manoeuvre['start']:.1f} s on {action}{side_text}"

@@ -16,8 +16,8 @@ from ssad.core.perception import Perceived
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.metrics.perception_in_drive import in_view
 
-WIDTH, TALL, SCALE, BEHIND = 360, 360, 6.0, 8.0  # pixels, pixels a metre, m behind the ego
-GROUND, LANE, THERE, UNSEEN, FOUND, KNOWN, EGO = (
+WIDTH, VIEW_HEIGHT, SCALE, VIEW_BEHIND = 360, 360, 6.0, 8.0  # pixels, pixels a metre, m behind the ego
+GROUND, LANE, VISIBLE, HIDDEN, DETECTED, BELIEVED, EGO = (
     (34, 36, 40),
     (70, 73, 80),
     (205, 205, 205),
@@ -29,12 +29,12 @@ GROUND, LANE, THERE, UNSEEN, FOUND, KNOWN, EGO = (
 LEGEND = "grey: there (dark: out of view), orange: found, blue: believed"
 
 
-def drive_sheet(trace: EpisodeTrace, seen: Perceived, shots: Sequence[tuple[float, U8]], graph: LaneGraph) -> U8:
+def drive_sheet(trace: EpisodeTrace, perceived: Perceived, shots: Sequence[tuple[float, U8]], graph: LaneGraph) -> U8:
     """A row for each of three moments: 2 and 1 s before the first contact and at it, or spread over the drive.
 
     Args:
         trace: The drive.
-        seen: What was perceived in it.
+        perceived: What was perceived in it.
         shots: Pictures that the driver got, with their times, s.
         graph: The town.
     """
@@ -44,11 +44,11 @@ def drive_sheet(trace: EpisodeTrace, seen: Perceived, shots: Sequence[tuple[floa
         if len(contact_steps)
         else [end_time * quarter / 4 for quarter in (1, 2, 3)]
     )
-    return np.vstack([_row(Seen("", trace, seen, shots), time, graph) for time in row_times])
+    return np.vstack([_row(RecordedDrive("", trace, perceived, shots), time, graph) for time in row_times])
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RecordedDrive:
     """Drive with the perception of its driver.
 
     Attributes:
@@ -69,59 +69,61 @@ class Seen:
         return (len(self.trace.x) - 1) * self.trace.dt
 
 
-def drive_film(drives: Sequence[Seen], graph: LaneGraph, *, every: float = 0.2) -> Iterator[U8]:
+def drive_film(drives: Sequence[RecordedDrive], graph: LaneGraph, *, frame_interval: float = 0.2) -> Iterator[U8]:
     """Drives side by side, moment by moment; one that has ended stays at its last moment.
 
     Args:
         drives: The drives; none without pictures.
         graph: Their town.
-        every: s from one frame to the next.
+        frame_interval: s from one frame to the next.
 
     Yields:
         RGB frames [H, W, 3] of one size.
     """
     end_time = max(drive.end for drive in drives)
-    for frame_index in range(int(end_time / every + 1.5)):
-        yield np.hstack([_row(drive, min(frame_index * every, drive.end), graph, exact=True) for drive in drives])
+    for frame_index in range(int(end_time / frame_interval + 1.5)):
+        yield np.hstack(
+            [_row(drive, min(frame_index * frame_interval, drive.end), graph, at_exact_step=True) for drive in drives]
+        )
 
 
-def _row(drive: Seen, time: float, graph: LaneGraph, *, exact: bool = False) -> U8:
-    """Draw a moment of a drive; unless `exact`, all of it is shown at the time of the nearest image."""
+def _row(drive: RecordedDrive, time: float, graph: LaneGraph, *, at_exact_step: bool = False) -> U8:
+    """Draw a moment of a drive; unless `at_exact_step`, all of it is shown at the time of the nearest image."""
     trace, perceived = drive.trace, drive.perceived
     shown_time, image = min(drive.shots, key=lambda timed_image: abs(timed_image[0] - time))
-    shown_time = time if exact else shown_time
+    shown_time = time if at_exact_step else shown_time
     step = min(round(shown_time / trace.dt), len(trace.x) - 1)
-    image_width = image.shape[1] * TALL // image.shape[0]
-    resized = cv2.resize(np.ascontiguousarray(image), (image_width, TALL), interpolation=cv2.INTER_AREA)
+    image_width = image.shape[1] * VIEW_HEIGHT // image.shape[0]
+    resized = cv2.resize(np.ascontiguousarray(image), (image_width, VIEW_HEIGHT), interpolation=cv2.INTER_AREA)
     text = f"{drive.title}{', ' if drive.title else ''}{shown_time:.1f} s, {trace.speed[step, 0]:.1f} m/s"
     camera_panel = captioned(
-        np.asarray(_marked(resized, trace, step, shown_time, perceived), np.uint8), text, image_width
+        np.asarray(_marked_image(resized, trace, step, shown_time, perceived), np.uint8), text, image_width
     )
-    top_panel = captioned(_above(trace, step, shown_time, perceived, graph), LEGEND, WIDTH)
+    top_panel = captioned(_top_view(trace, step, shown_time, perceived, graph), LEGEND, WIDTH)
     row_height = max(len(camera_panel), len(top_panel))
     return np.hstack([_padded(camera_panel, row_height), _padded(top_panel, row_height)])
 
 
-def _padded(picture: U8, height: int) -> U8:
-    return np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0)))
+def _padded(image: U8, height: int) -> U8:
+    return np.pad(image, ((0, height - len(image)), (0, 0), (0, 0)))
 
 
-def _at(seen: Sequence[tuple[float, Any]], time: float) -> Any:
-    """What was noted nearest to a time; None: nothing."""
-    return min(seen, key=lambda record: abs(record[0] - time))[1] if seen else None
+def _nearest_record(records: Sequence[tuple[float, Any]], time: float) -> Any:
+    """Return the record nearest to a time; None without records."""
+    return min(records, key=lambda record: abs(record[0] - time))[1] if records else None
 
 
-def _marked(picture: U8, trace: EpisodeTrace, step: int, time: float, seen: Perceived) -> U8:
+def _marked_image(image: U8, trace: EpisodeTrace, step: int, time: float, perceived: Perceived) -> U8:
     """A stake on the road for each object found (orange) and believed (blue)."""
-    camera = next(iter(seen.cameras.values()))
-    factor = picture.shape[1] / camera.width
+    camera = next(iter(perceived.cameras.values()))
+    factor = image.shape[1] / camera.width
     ego = (float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
-    detections, tracks = _at(seen.looks, time), _at(seen.known, time)
-    for places, colour in (
-        ([] if detections is None else detections.place, FOUND),
-        ([] if tracks is None else tracks.place, KNOWN),
+    detections, tracks = _nearest_record(perceived.looks, time), _nearest_record(perceived.known, time)
+    for positions, colour in (
+        ([] if detections is None else detections.place, DETECTED),
+        ([] if tracks is None else tracks.place, BELIEVED),
     ):
-        for position in places:
+        for position in positions:
             ego_point = to_local(np.array(ego), np.asarray(position))
             stake_ends = []
             for height in (0.0, 1.6):
@@ -130,20 +132,20 @@ def _marked(picture: U8, trace: EpisodeTrace, step: int, time: float, seen: Perc
                     pixel = camera.intrinsic @ camera_point[:3] / camera_point[2] * factor
                     stake_ends.append((round(float(pixel[0])), round(float(pixel[1]))))
             if len(stake_ends) == 2:
-                cv2.line(picture, stake_ends[0], stake_ends[1], colour, 2, cv2.LINE_AA)
-                cv2.circle(picture, stake_ends[0], 3, colour, -1, cv2.LINE_AA)
-    return picture
+                cv2.line(image, stake_ends[0], stake_ends[1], colour, 2, cv2.LINE_AA)
+                cv2.circle(image, stake_ends[0], 3, colour, -1, cv2.LINE_AA)
+    return image
 
 
-def _above(trace: EpisodeTrace, step: int, time: float, seen: Perceived, graph: LaneGraph) -> U8:
+def _top_view(trace: EpisodeTrace, step: int, time: float, perceived: Perceived, graph: LaneGraph) -> U8:
     """From above, the ego's heading up."""
-    canvas = np.full((TALL, WIDTH, 3), GROUND, np.uint8)
+    canvas = np.full((VIEW_HEIGHT, WIDTH, 3), GROUND, np.uint8)
     ego = np.array([trace.x[step, 0], trace.y[step, 0], trace.yaw[step, 0]], np.float64)
 
     def pixels(points: Any) -> Any:
         ego_points = to_local(ego, np.asarray(points, np.float64).reshape(-1, 2))
         columns = WIDTH / 2 - SCALE * ego_points[:, 1]
-        rows = TALL - SCALE * (ego_points[:, 0] + BEHIND)
+        rows = VIEW_HEIGHT - SCALE * (ego_points[:, 0] + VIEW_BEHIND)
         return np.rint(np.stack([columns, rows], 1)).astype(np.int32)
 
     is_near = np.hypot(graph.xy[:, 0] - ego[0], graph.xy[:, 1] - ego[1]) < 90.0
@@ -151,21 +153,21 @@ def _above(trace: EpisodeTrace, step: int, time: float, seen: Perceived, graph: 
         vertices = slice(graph.offset[lane], graph.offset[lane + 1])
         if is_near[vertices].any():
             cv2.polylines(canvas, [pixels(graph.xy[vertices])], False, LANE, 2, cv2.LINE_AA)
-    visible = in_view(trace, [step], seen.cameras)[0]
+    visible = in_view(trace, [step], perceived.cameras)[0]
     for agent in np.flatnonzero(trace.active[step]):
-        colour = EGO if agent == 0 else THERE if visible[agent] else UNSEEN
+        colour = EGO if agent == 0 else VISIBLE if visible[agent] else HIDDEN
         pose = np.array([trace.x[step, agent], trace.y[step, agent], trace.yaw[step, agent]], np.float64)
         size = np.array([trace.length[agent], trace.width[agent]], np.float64)
         cv2.fillPoly(canvas, [pixels(_corners(pose, size))], colour, cv2.LINE_AA)
-    detections, tracks = _at(seen.looks, time), _at(seen.known, time)
+    detections, tracks = _nearest_record(perceived.looks, time), _nearest_record(perceived.known, time)
     if detections is not None:
         for x, y in pixels(detections.place).tolist():
-            cv2.drawMarker(canvas, (x, y), FOUND, cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
+            cv2.drawMarker(canvas, (x, y), DETECTED, cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
     if tracks is not None:
         for place, velocity, yaw, size in zip(tracks.place, tracks.velocity, tracks.yaw, tracks.size, strict=True):
             outline = pixels(_corners(np.array([*place, yaw]), size))
-            cv2.polylines(canvas, [outline], True, KNOWN, 2, cv2.LINE_AA)
-            cv2.polylines(canvas, [pixels([place, place + velocity])], False, KNOWN, 1, cv2.LINE_AA)
+            cv2.polylines(canvas, [outline], True, BELIEVED, 2, cv2.LINE_AA)
+            cv2.polylines(canvas, [pixels([place, place + velocity])], False, BELIEVED, 1, cv2.LINE_AA)
     return canvas
 
 

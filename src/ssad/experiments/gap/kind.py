@@ -20,7 +20,7 @@ from ssad.core.traces import first_difference, load_trace
 from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
 from ssad.experiments.gap import page
-from ssad.experiments.gap.drive_sheet import Seen, drive_film, drive_sheet
+from ssad.experiments.gap.drive_sheet import RecordedDrive, drive_film, drive_sheet
 from ssad.experiments.gap.perceiving_loop import drive_perceiving, drive_repaired
 from ssad.experiments.gap.verdict import verdict
 from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
@@ -41,7 +41,7 @@ from ssad.scenarios.static.perturbation import EGO, Perturbation
 from ssad.scenarios.static.physical.textures.perturbation import signs_of_route
 from ssad.simulators.closed_loop import cached_town, episode_of, system_version
 
-EVERY = 0.2  # s from one frame of a film to the next
+FRAME_INTERVAL = 0.2  # s from one frame of a film to the next
 
 
 class GapSuite(ScenarioSuite, PerturbationTable):
@@ -143,7 +143,7 @@ class Gap(ScenarioKind):
     def _cell(  # noqa: PLR0917  # plain values
         self,
         suite: GapSuite,
-        one: Described,
+        described_scenario: Described,
         condition: Condition,
         repetition: int,
         version: str,
@@ -159,14 +159,15 @@ class Gap(ScenarioKind):
         severity = 0 if perturbation is None else perturbation.severity
         return self.scenario_cell(
             suite,
-            one,
+            described_scenario,
             version,
             suite.seed,
             "" if perturbation is None else perturbation.version(),
             system=condition.system_name,
             chance=("episode", repetition),
             title=(
-                f"{condition.system_name}/{condition_text}{one.scenario.name}{f'#{repetition}' if repetition else ''}"
+                f"{condition.system_name}/{condition_text}{described_scenario.scenario.name}"
+                f"{f'#{repetition}' if repetition else ''}"
             ),
             fields={
                 "perturbation": NONE if perturbation is None else perturbation.name,
@@ -196,7 +197,7 @@ class Gap(ScenarioKind):
         """Drive the episodes as one batch, and measure component and system."""
         seed = job.settings["seed"]
         episodes, traces, perception = drive_perceiving(
-            cells, device=job.device, seed=seed, every=0.5 if job.settings["sheets"] else None
+            cells, device=job.device, seed=seed, image_interval=0.5 if job.settings["sheets"] else None
         )
         repair = cells[0].spec["repair"]
         repaired = drive_repaired(cells, traces, device=job.device, seed=seed) if repair else {}
@@ -207,7 +208,7 @@ class Gap(ScenarioKind):
             record_fields: dict[str, Any] = {name: result["episode"][name] for name in ("end", "trace_hash", "town")}
             if perception is not None:
                 system, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), perception.perceived(index)
-                metrics |= component_metrics(trace, perceived, sure=system.tracking.high)
+                metrics |= component_metrics(trace, perceived, phantom_score=system.tracking.high)
                 metrics |= sign_metrics(trace, perceived, signs_of_route(cached_town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
                 record_fields["cause"] = cause_of_collision(trace, perceived)
@@ -228,11 +229,11 @@ class Gap(ScenarioKind):
         recorded = load_trace(folder / record["artefacts"]["trace"])
         spec, graph = cell.spec, cached_town(recorded.town)
         # The clean drive shows what the perturbation alone changes.
-        clean = replace(cell, spec={**spec, "perturbation": None})
+        clean_cell = replace(cell, spec={**spec, "perturbation": None})
         drives, replayed_traces = [], []
-        for driven_cell in [cell] if spec["perturbation"] is None else [clean, cell]:
+        for driven_cell in [cell] if spec["perturbation"] is None else [clean_cell, cell]:
             _, (trace,), perception = drive_perceiving(
-                [driven_cell], device=plan.device, seed=plan.suite.seed, every=EVERY
+                [driven_cell], device=plan.device, seed=plan.suite.seed, image_interval=FRAME_INTERVAL
             )
             replayed_traces.append(trace)
             if perception is not None:
@@ -242,16 +243,18 @@ class Gap(ScenarioKind):
                     if driven_cell is cell and spec["severity"]
                     else "clean"
                 )
-                drives.append(Seen(title, trace, perception.perceived(0), images))
+                drives.append(RecordedDrive(title, trace, perception.perceived(0), images))
         filmed_drives = [drive for drive in drives if drive.shots]
-        film = (drive_film(filmed_drives, graph, every=EVERY), EVERY) if filmed_drives else None
+        drive_film_frames = (
+            (drive_film(filmed_drives, graph, frame_interval=FRAME_INTERVAL), FRAME_INTERVAL) if filmed_drives else None
+        )
         driver_perception = drives[-1] if drives and drives[-1].trace is replayed_traces[-1] else None
         return Replay(
             cell,
             first_difference(recorded, replayed_traces[-1]),
             replayed_traces[-1],
             graph,
-            film=film,
+            film=drive_film_frames,
             seen=driver_perception,
         )
 

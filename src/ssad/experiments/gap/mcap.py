@@ -22,10 +22,10 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import matrix_to_quaternion, yaw_to_quaternion
 from ssad.core.types import F64, U8, AgentKind, EpisodeTrace, LaneType
 from ssad.drivers.perceiving.objects import SIZES
-from ssad.experiments.gap.drive_sheet import Seen
+from ssad.experiments.gap.drive_sheet import RecordedDrive
 
 WORLD, EGO, ABOVE = "world", "ego", "above"
-AHEAD: Final = 50.0  # m of the route that are shown as the plan
+PLAN_LENGTH: Final = 50.0  # m of the route that are shown as the plan
 QUALITY: Final = 90  # of JPEG
 COLOURS: Final = {
     "truth": (0.8, 0.8, 0.8, 0.4),
@@ -51,8 +51,8 @@ def write_mcap(
     trace: EpisodeTrace,
     graph: LaneGraph,
     *,
-    seen: Seen | None = None,
-    above: Iterable[U8] = (),
+    recorded_drive: RecordedDrive | None = None,
+    top_views: Iterable[U8] = (),
 ) -> Path:
     """Write a drive as MCAP, whole or not at all; its clock starts at 0.
 
@@ -60,8 +60,8 @@ def write_mcap(
         path: Where to.
         trace: The drive.
         graph: Its town.
-        seen: What its driver saw, found and believed, if it is one that perceives.
-        above: The scene from above [H, W, 3], a picture a step.
+        recorded_drive: What its driver saw, found and believed, if it is one that perceives.
+        top_views: The scene from above [H, W, 3], a picture a step.
 
     Returns:
         The path.
@@ -73,7 +73,11 @@ def write_mcap(
     need_mcap()
     from mcap_protobuf.writer import Writer
 
-    messages = [*_scene(trace, graph), *_from_above(trace, above), *(() if seen is None else _perceived(seen))]
+    messages = [
+        *_scene(trace, graph),
+        *_from_above(trace, top_views),
+        *(() if recorded_drive is None else _perceived(recorded_drive)),
+    ]
     with safeio.atomic_path(path) as temporary, temporary.open("wb") as file, Writer(file) as writer:
         # Viewers expect log times in order; the sort is stable, so topics of one time keep theirs.
         for sequence_number, (time, topic, message) in enumerate(
@@ -116,44 +120,44 @@ def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
         # The plan begins where the ego is now, not where the route begins.
         nearest_point = int(np.hypot(*(route - pose[0, :2]).T).argmin())
         route_distance = np.cumsum(np.concatenate([[0.0], np.hypot(*np.diff(route[nearest_point:], axis=0).T)]))
-        line = _line("plan", route[nearest_point:][route_distance <= AHEAD])
+        line = _line("plan", route[nearest_point:][route_distance <= PLAN_LENGTH])
         controls = {name: f"{getattr(trace, name)[step]:.3f}" for name in ("throttle", "brake", "steer")}
         yield time, "/plan", _update("plan", time, lines=[line], words=controls)
 
 
-def _perceived(seen: Seen) -> Iterator[Message]:
-    """What the driver saw, found and believed."""
-    for seconds, image in seen.shots:  # none of a perceiver without cameras
-        name, camera = next(iter(seen.perceived.cameras.items()))
+def _perceived(recorded_drive: RecordedDrive) -> Iterator[Message]:
+    """Yield the images, detections and beliefs of the driver."""
+    for seconds, image in recorded_drive.shots:  # none of a perceiver without cameras
+        name, camera = next(iter(recorded_drive.perceived.cameras.items()))
         camera_rotation, camera_position = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()
         time = _ns(seconds)
         jpeg = encode_jpeg(np.ascontiguousarray(image), QUALITY, "420")
         yield time, "/tf", _transform(time, EGO, name, camera_position, camera_rotation)
         yield time, "/camera", _new("CompressedImage", time, frame_id=name, data=jpeg, format="jpeg")
         yield time, "/camera/calibration", _calibration(time, name, camera)
-    for seconds, detections in seen.perceived.looks:
+    for seconds, detections in recorded_drive.perceived.looks:
         if detections is not None:
             pose = np.column_stack([detections.place, np.nan_to_num(detections.yaw)])
             cubes = _cubes("detections", pose, detections.size, detections.kind)
             metadata = {f"score {row}": f"{score:.3f}" for row, score in enumerate(detections.score.tolist())}
             yield _ns(seconds), "/detections", _update("detections", _ns(seconds), cubes=cubes, words=metadata)
-    for seconds, tracks in seen.perceived.known:
+    for seconds, tracks in recorded_drive.perceived.known:
         cubes = _cubes("tracks", np.column_stack([tracks.place, tracks.yaw]), tracks.size, tracks.kind)
         metadata = {f"track {row}": str(track_id) for row, track_id in enumerate(tracks.ident.tolist())}
         yield _ns(seconds), "/tracks", _update("tracks", _ns(seconds), cubes=cubes, words=metadata)
 
 
-def _from_above(trace: EpisodeTrace, pictures: Iterable[U8]) -> Iterator[Message]:
-    for step, top_view in enumerate(pictures):
+def _from_above(trace: EpisodeTrace, top_views: Iterable[U8]) -> Iterator[Message]:
+    for step, top_view in enumerate(top_views):
         time, jpeg = _ns(step * trace.dt), encode_jpeg(np.ascontiguousarray(top_view), QUALITY, "420")
         yield time, "/above", _new("CompressedImage", time, frame_id=ABOVE, data=jpeg, format="jpeg")
 
 
-def _update(name: str, time: int, *, words: dict[str, str] | None = None, **parts: Any) -> Any:
+def _update(name: str, time: int, *, words: dict[str, str] | None = None, **entities: Any) -> Any:
     """A scene in place of the one before under this name."""
     metadata = [_new("KeyValuePair", key=key, value=value) for key, value in (words or {}).items()]
     # Viewers replace an entity by the next one with the same id.
-    entity = _new("SceneEntity", time, frame_id=WORLD, id=name, metadata=metadata, **parts)
+    entity = _new("SceneEntity", time, frame_id=WORLD, id=name, metadata=metadata, **entities)
     return _new("SceneUpdate", entities=[entity])
 
 
@@ -197,19 +201,19 @@ def _vector(values: Sequence[float]) -> Any:
     return _new("Vector3", x=values[0], y=values[1], z=values[2])
 
 
-def _quaternion(turn: F64) -> Any:
-    w, x, y, z = turn.tolist()
+def _quaternion(rotation: F64) -> Any:
+    w, x, y, z = rotation.tolist()
     return _new("Quaternion", x=x, y=y, z=z, w=w)
 
 
-def _transform(time: int, parent: str, child: str, place: Sequence[float], turn: F64) -> Any:
+def _transform(time: int, parent: str, child: str, translation: Sequence[float], rotation: F64) -> Any:
     return _new(
         "FrameTransform",
         time,
         parent_frame_id=parent,
         child_frame_id=child,
-        translation=_vector(place),
-        rotation=_quaternion(turn),
+        translation=_vector(translation),
+        rotation=_quaternion(rotation),
     )
 
 

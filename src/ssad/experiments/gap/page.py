@@ -14,11 +14,11 @@ from pathlib import Path
 from ssad.core import safeio
 from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.metrics.rank import family_correlation
-from ssad.report.figures import Change, change_plot
+from ssad.report.figures import MetricChange, change_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.records import Line, case_of, field, metric_of
-from ssad.report.tables import METHODS, Cell, Table
+from ssad.report.tables import METHODS, Table, TableCell
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -146,7 +146,7 @@ def error_table(run: Run) -> Table:
     """Return the errors of the detectors, in the settings that give a perfect detector the same errors."""
     lines = [line for lines in clean_lines(run).values() for line in lines]
 
-    def metric(lines: Sequence[Line], name: str) -> Cell:
+    def metric(lines: Sequence[Line], name: str) -> TableCell:
         cell = _cell(lines, name)
         if name == "recall":
             return replace(cell, mean=1.0 - cell.mean, low=1.0 - cell.high, high=1.0 - cell.low)
@@ -161,7 +161,7 @@ def error_table(run: Run) -> Table:
             name: setting for name, setting in ERRORS.items() if not all(math.isnan(metric_of(x, name)) for x in lines)
         },
         metric=metric,
-        having=lambda lines: not all(math.isnan(metric_of(line, "recall")) for line in lines),
+        condition=lambda lines: not all(math.isnan(metric_of(line, "recall")) for line in lines),
         note="Without perturbations. Missed: share of the objects in view that are not found within 2 m; burst: looks "
         "in a row that an object is missed; noise: error of the distance, as a share of it; phantoms: a look.",
     )
@@ -192,12 +192,12 @@ def rank_table(run: Run) -> Table:
     def families(system: str) -> list[str]:
         return [SETTINGS.sub(r"\1", perturbation) for _, perturbation, _ in perturbed[system]]
 
-    def correlation(row: tuple[str, str], system_metric: str) -> Cell:
+    def correlation(row: tuple[str, str], system_metric: str) -> TableCell:
         system, component_metric = row
         sign = 1.0 if system_metric == "collision" else -1.0
         component_losses = [-change(run, condition, component_metric).mean for condition in perturbed[system]]
         system_losses = [sign * change(run, condition, system_metric).mean for condition in perturbed[system]]
-        return Cell.of(family_correlation(component_losses, system_losses, families(system)))
+        return TableCell.of(family_correlation(component_losses, system_losses, families(system)))
 
     return Table.listing(
         "rank",
@@ -219,17 +219,17 @@ def rank_table(run: Run) -> Table:
 def cause_table(run: Run) -> Table:
     """Return how the driver perceived the object that it hit, before each collision."""
 
-    def metric(lines: Sequence[Line], column: str) -> Cell:
+    def metric(lines: Sequence[Line], column: str) -> TableCell:
         causes = [line["cause"] for line in lines if line.get("cause")]
         repaired_drives = [line["repaired"] for line in lines if line.get("repaired")]
         if column == "collisions":
-            return Cell(len(causes), digits=0)
+            return TableCell(len(causes), digits=0)
         if column == "unknown_s":
-            return Cell(sorted(float(record["unknown_s"]) for record in causes)[len(causes) // 2])
+            return TableCell(sorted(float(record["unknown_s"]) for record in causes)[len(causes) // 2])
         if column == "repaired":
-            gone = sum(not record["same"] for record in repaired_drives)
-            return Cell.value(gone if repaired_drives else None, digits=0 if repaired_drives else 2)
-        return Cell(sum(record["cause"] == column for record in causes), digits=0)
+            avoided_count = sum(not record["same"] for record in repaired_drives)
+            return TableCell.value(avoided_count if repaired_drives else None, digits=0 if repaired_drives else 2)
+        return TableCell(sum(record["cause"] == column for record in causes), digits=0)
 
     return Table.pivot(
         "causes",
@@ -243,7 +243,7 @@ def cause_table(run: Run) -> Table:
             "repaired": "gone when repaired",
         },
         metric=metric,
-        having=lambda lines: any(line.get("cause") for line in lines),
+        condition=lambda lines: any(line.get("cause") for line in lines),
         note="Collisions by what the object that was hit was in most of the steps from 3 s to 0.5 s before: out of "
         "view or hidden; in view and not found; found more than 2 m from where it was; found, but not believed yet; "
         "believed where it was (then planning or prediction failed). Unknown: for how long before the contact it was "
@@ -257,10 +257,10 @@ def sign_table(run: Run) -> Table:
     """Return how far stop signs were read, and how many were run."""
     clean = clean_lines(run)
 
-    def metric(lines: Sequence[Line], column: str) -> Cell:
+    def metric(lines: Sequence[Line], column: str) -> TableCell:
         if column != "more":
             return _cell(lines, column)
-        return _change(lines, clean, "stop_signs") if int(lines[0]["severity"]) else Cell.value(None)
+        return _change(lines, clean, "stop_signs") if int(lines[0]["severity"]) else TableCell.value(None)
 
     return Table.pivot(
         "signs",
@@ -269,7 +269,7 @@ def sign_table(run: Run) -> Table:
         rows=CONDITION,
         columns={**SIGNS, "more": "more than clean"},
         metric=metric,
-        having=lambda lines: any((line.get("metrics") or {}).get("sign_recall") is not None for line in lines),
+        condition=lambda lines: any((line.get("metrics") or {}).get("sign_recall") is not None for line in lines),
         note="Of the looks with a stop sign of the way ahead, those in which it was read; attacks on signs are made at "
         "5 to 20 m. Signs run: a drive. More than clean: the rise against the same drives without the perturbation.",
     )
@@ -286,11 +286,14 @@ def scatter(run: Run) -> str:
     families = {line["perturbation"]: family_of_line(line) for line in run.lines}
     points = []
     for system, name, severity in (condition for condition in conditions(run) if condition[2]):
-        fall, rise = (change(run, (system, name, severity), metric) for metric in ("AP", "collision"))
-        if not math.isnan(fall.mean) and not math.isnan(rise.mean):
-            tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
-            lost = replace(fall, mean=-fall.mean, low=-fall.high, high=-fall.low)
-            points.append(Change(lost, rise, f"{name} {severity}", families.get(name, ""), tip))
+        ap_change, collision_change = (change(run, (system, name, severity), metric) for metric in ("AP", "collision"))
+        if not math.isnan(ap_change.mean) and not math.isnan(collision_change.mean):
+            changes_text = f"AP {ap_change.text}, CR {collision_change.text}, {collision_change.count}"
+            tooltip = f"{system}, {name} {severity}: {changes_text}"
+            ap_loss = replace(ap_change, mean=-ap_change.mean, low=-ap_change.high, high=-ap_change.low)
+            points.append(
+                MetricChange(ap_loss, collision_change, f"{name} {severity}", families.get(name, ""), tooltip)
+            )
     return change_plot(
         points,
         COLOURS,
@@ -332,14 +335,14 @@ def values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
     }
 
 
-def _cell(lines: Sequence[Line], name: str) -> Cell:
+def _cell(lines: Sequence[Line], name: str) -> TableCell:
     cases = values(lines, name).values()
     if name == "collision":
-        return Cell.of(estimate(cases, "share"))
-    return Cell.of(estimate(cases, "bounded" if name in BOUNDED else "mean"))
+        return TableCell.of(estimate(cases, "share"))
+    return TableCell.of(estimate(cases, "bounded" if name in BOUNDED else "mean"))
 
 
-def change(run: Run, condition: Condition, name: str) -> Cell:
+def change(run: Run, condition: Condition, name: str) -> TableCell:
     """Return the change of a metric under a condition against the same drives without it.
 
     Drives that the condition does not have, such as those without a car that could wear a texture, do not count.
@@ -352,13 +355,13 @@ def clean_lines(run: Run) -> dict[str, list[Line]]:
     return {condition[0]: lines for condition, lines in conditions(run).items() if condition[1:] == ("none", 0)}
 
 
-def _change(lines: Sequence[Line], clean_by_system: Mapping[str, Sequence[Line]], name: str) -> Cell:
+def _change(lines: Sequence[Line], clean_by_system: Mapping[str, Sequence[Line]], name: str) -> TableCell:
     """Return the change of a metric in the lines of a condition against the same drives without it."""
     return _difference(lines, clean_by_system.get(lines[0]["system"], []), name)
 
 
-def _difference(lines: Sequence[Line], other_lines: Sequence[Line], name: str) -> Cell:
+def _difference(lines: Sequence[Line], other_lines: Sequence[Line], name: str) -> TableCell:
     """Return the difference of a metric from that of other lines of the same drives."""
-    cases, others = values(lines, name), values(other_lines, name)
-    shared = {drive: others[drive] for drive in cases if drive in others}
-    return Cell.of(paired_difference(cases, shared, kind="share" if name == "collision" else "mean"))
+    cases, other_cases = values(lines, name), values(other_lines, name)
+    shared_cases = {drive: other_cases[drive] for drive in cases if drive in other_cases}
+    return TableCell.of(paired_difference(cases, shared_cases, kind="share" if name == "collision" else "mean"))

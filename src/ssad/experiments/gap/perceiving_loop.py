@@ -27,7 +27,7 @@ def drive_perceiving(
     device: str,
     seed: int,
     repair: Repair | None = None,
-    every: float | None = 0.5,
+    image_interval: float | None = 0.5,
 ) -> tuple[list[Episode], list[EpisodeTrace], PerceptionRecorder | None]:
     """Episodes and traces of orders of one system under one perturbation, and what was perceived in them.
 
@@ -37,13 +37,13 @@ def drive_perceiving(
         device: Where the world and the cameras compute.
         seed: Of the perturbations.
         repair: What mends one error of the driver.
-        every: s from one picture that is kept to the next; None: none are kept.
+        image_interval: s from one picture that is kept to the next; None: none are kept.
     """
     spec = orders[0].spec
     if spec["settings"] is None:
         return *drive(orders, device=device, key=_paired)[:2], None
     system = PerceivingSystem.model_validate(spec["settings"])
-    watcher = PerceptionRecorder(system.views, len(orders), every)
+    watcher = PerceptionRecorder(system.views, len(orders), image_interval)
     driver = system.make(watcher, repair=repair, device=device)
     perturbation = perturbation_of(spec)
     if perturbation is not None and perturbation.needs_victim and driver.detector is None:
@@ -58,8 +58,10 @@ def drive_perceiving(
     )
     if perturbation is not None:
         suite = perturbation.in_loop(suite, target=spec["target"], victim=driver.detector, seed=seed)
-    driven = drive(orders, device=device, key=_paired, driver=driver, sensors=suite.build(), perturbation=suite.changes)
-    return *driven[:2], watcher
+    drive_results = drive(
+        orders, device=device, key=_paired, driver=driver, sensors=suite.build(), perturbation=suite.changes
+    )
+    return *drive_results[:2], watcher
 
 
 def perturbation_of(spec: Mapping[str, Any]) -> Perturbation | None:
@@ -91,7 +93,7 @@ def drive_repaired(
         return {}
     repair = Repair(dict(enumerate(struck_agents.values())))
     _, repaired_traces, _ = drive_perceiving(
-        [orders[index] for index in struck_agents], device=device, seed=seed, repair=repair, every=None
+        [orders[index] for index in struck_agents], device=device, seed=seed, repair=repair, image_interval=None
     )
     return {
         index: {

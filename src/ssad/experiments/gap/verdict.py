@@ -7,7 +7,7 @@ import math
 from ssad.experiments.gap import page as gap
 from ssad.report.load import Run
 from ssad.report.records import metric_of
-from ssad.report.tables import Cell
+from ssad.report.tables import TableCell
 from ssad.report.verdict import mean_of
 
 
@@ -29,24 +29,30 @@ def verdict(run: Run) -> list[str]:
                 (math.inf, f"{system} collided in {collisions} of {len(lines)} drives.{precision_text}")
             )
             continue
-        fall, rise = (gap.change(run, (system, perturbation, severity), name) for name in ("AP", "collision"))
-        if not math.isnan(fall.mean) and not math.isnan(rise.mean):
-            remark = "" if _known(fall) or _known(rise) else ", too few for intervals"
+        ap_change, collision_change = (
+            gap.change(run, (system, perturbation, severity), name) for name in ("AP", "collision")
+        )
+        if not math.isnan(ap_change.mean) and not math.isnan(collision_change.mean):
+            remark = "" if _has_interval(ap_change) or _has_interval(collision_change) else ", too few for intervals"
             change_text = (
-                f"{perturbation} {severity} changes the AP of {system} by {_sure(fall)} and its collision rate by "
+                f"{perturbation} {severity} changes the AP of {system} by {_interval_text(ap_change)} and its "
+                "collision rate by "
             )
             sentences_by_system[system].append(
-                (abs(rise.mean), f"{change_text}{_sure(rise)}, in {rise.n} drives{remark}.")
+                (
+                    abs(collision_change.mean),
+                    f"{change_text}{_interval_text(collision_change)}, in {collision_change.n} drives{remark}.",
+                )
             )
     for system in systems:
         sentences += [sentence for _, sentence in sorted(sentences_by_system[system], key=lambda ranked: -ranked[0])]
     return sentences
 
 
-def _known(change: Cell) -> bool:
+def _has_interval(change: TableCell) -> bool:
     return change.method not in ("range", "none") and bool(change.interval)
 
 
-def _sure(change: Cell) -> str:
+def _interval_text(change: TableCell) -> str:
     """Return a change with its interval, if there is one."""
-    return f"{change.mean:+.2f} {change.interval}" if _known(change) else f"{change.mean:+.2f}"
+    return f"{change.mean:+.2f} {change.interval}" if _has_interval(change) else f"{change.mean:+.2f}"

@@ -71,7 +71,7 @@ class ChanceEpisode:
         return trace
 
     def usual(self, rows: int = 200) -> tuple[float, float]:
-        """How long an episode takes on average, h, and how far the ego gets, km."""
+        """Return the mean duration of an episode, h, and the mean distance of the ego, km."""
         from ssad.world.rare.brute import draw_keys, run
 
         process = self.process(rows)
@@ -107,7 +107,7 @@ class ChanceEpisode:
         if method == "splitting":
             process = self.process(particles * repeats)
             splitting_result = splitting(process, rng, repeats=repeats)
-            found = splitting_result.estimate()
+            failure_estimate = splitting_result.estimate()
             if splitting_result.failed.any():
                 row = int(np.flatnonzero(splitting_result.failed)[0])
                 collision = {
@@ -119,7 +119,9 @@ class ChanceEpisode:
             proposal = learn(process, rng, components=components, episodes=episodes // 4)
             training = process.work()
             process = self.process(batch)
-            found, importance_samples = importance(process, proposal, rng, episodes=episodes, training=training)
+            failure_estimate, importance_samples = importance(
+                process, proposal, rng, episodes=episodes, training=training
+            )
             if importance_samples.failed.any():
                 # A large weight means that the failure is likely in the real traffic, not only in the proposal.
                 row = int(np.argmax(np.where(importance_samples.failed, importance_samples.weight, 0.0)))
@@ -128,23 +130,23 @@ class ChanceEpisode:
                 collision = {"keys": {"0": str(int(importance_samples.keys[row]))}, "means": means}
         else:
             process = self.process(batch)
-            *_, (found, keys) = monte_carlo(process, rng, episodes=episodes)
+            *_, (failure_estimate, keys) = monte_carlo(process, rng, episodes=episodes)
             if len(keys):
                 collision = {"keys": {"0": str(int(keys[0]))}, "means": []}
         duration_hours, distance_km = self.usual()
-        driven_hours = found.work * process.world.dt / 3600.0 / process.world.agents
+        driven_hours = failure_estimate.work * process.world.dt / 3600.0 / process.world.agents
         metrics = {
-            "per_million": 1e6 * found.probability,
-            "low": 1e6 * found.low,
-            "high": 1e6 * found.high,
-            "effective": found.effective,
-            "events": found.events,
-            "episodes": found.episodes,
-            "work": found.work / 1e6,
-            "training": found.training / 1e6,
+            "per_million": 1e6 * failure_estimate.probability,
+            "low": 1e6 * failure_estimate.low,
+            "high": 1e6 * failure_estimate.high,
+            "effective": failure_estimate.effective,
+            "events": failure_estimate.events,
+            "episodes": failure_estimate.episodes,
+            "work": failure_estimate.work / 1e6,
+            "training": failure_estimate.training / 1e6,
             "hours": driven_hours,
             "km": driven_hours * distance_km / duration_hours,
-            "per_hour": 1e3 * found.probability / duration_hours,
-            "per_km": 1e3 * found.probability / distance_km,
+            "per_hour": 1e3 * failure_estimate.probability / duration_hours,
+            "per_km": 1e3 * failure_estimate.probability / distance_km,
         }
         return metrics, collision

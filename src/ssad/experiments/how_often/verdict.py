@@ -33,36 +33,41 @@ def _rare(system: str, scenario: str, rows: list[Line]) -> list[str]:
 
     with_collisions = [row for row in rows if metric_of(row, "per_million") > 0]
     if not with_collisions:
-        largest = max(rows, key=lambda row: metric_of(row, "episodes"))
-        upper_limit = limits(largest)[1]
+        largest_row = max(rows, key=lambda row: metric_of(row, "episodes"))
+        upper_limit = limits(largest_row)[1]
         interval_text = (
             "" if math.isnan(upper_limit) else f": fewer than {_million(upper_limit)} in a million (95 % limit)"
         )
         return [
-            f"{system} did not collide in {metric_of(largest, 'episodes'):,.0f} episodes of {scenario}{interval_text}."
+            f"{system} did not collide in {metric_of(largest_row, 'episodes'):,.0f} episodes of "
+            f"{scenario}{interval_text}."
         ]
     # estimates with an interval first, then by their effective number of collisions
-    best = max(with_collisions, key=lambda row: (not math.isnan(limits(row)[1]), metric_of(row, "effective")))
-    low, high = limits(best)
+    best_row = max(with_collisions, key=lambda row: (not math.isnan(limits(row)[1]), metric_of(row, "effective")))
+    lower, upper = limits(best_row)
     interval_text = (
-        "too few repeats for an interval" if math.isnan(high) else f"95 %: {_million(low)} to {_million(high)}"
+        "too few repeats for an interval" if math.isnan(upper) else f"95 %: {_million(lower)} to {_million(upper)}"
     )
     sentences = [
-        f"{system} collides in about {_million(metric_of(best, 'per_million'))} of a million episodes of {scenario} "
-        f"({interval_text}; by {_method(best)}), {metric_of(best, 'per_hour'):.3g} times in 1,000 h."
+        f"{system} collides in about {_million(metric_of(best_row, 'per_million'))} of a million episodes of "
+        f"{scenario} ({interval_text}; by {_method(best_row)}), {metric_of(best_row, 'per_hour'):.3g} times in 1,000 h."
     ]
     for row in rows:
-        if row is not best and row.get("method") == "monte-carlo":
+        if row is not best_row and row.get("method") == "monte-carlo":
             collisions, episode_count = metric_of(row, "events"), metric_of(row, "episodes")
             sentences.append(
                 f"Plain Monte Carlo saw {f'{collisions:.0f}' if collisions else 'none'} in "
                 f"{episode_count:,.0f} episodes."
             )
     with_interval = [row for row in rows if not math.isnan(limits(row)[1])]
-    for other in with_interval:
-        if other is not best and best in with_interval and (limits(other)[1] < low or limits(other)[0] > high):
+    for other_row in with_interval:
+        if (
+            other_row is not best_row
+            and best_row in with_interval
+            and (limits(other_row)[1] < lower or limits(other_row)[0] > upper)
+        ):
             sentences.append(
-                f"The interval of {_method(other)} does not meet it: take more episodes before you trust either."
+                f"The interval of {_method(other_row)} does not meet it: take more episodes before you trust either."
             )
     return sentences
 

@@ -19,7 +19,7 @@ from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan
-from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow, TargetCondition
+from ssad.experiments.perception.open_loop import CellDescription, DetectorSuite, OpenLoopKind, TargetCondition
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, score_scenes, sum_applied
 from ssad.experiments.perception.scored_data import Victims, data_of, detectors_of
@@ -83,13 +83,13 @@ class Perception(OpenLoopKind):
         """Return the detectors of the suite."""
         places = conditions_by_place(suite)
         targets = [parse_target(place) for place in places if place != SCENES]
-        return detectors_of(suite.name, suite.detectors, flat=True, scenes=SCENES in places, targets=targets)
+        return detectors_of(suite.name, suite.detectors, allow_2d=True, scenes=SCENES in places, targets=targets)
 
     def data(self, suite: PerceptionSuite) -> dict[str, Any]:
         """Return what the results depend on of the recorded scenes, if a perturbation acts on them."""
         return data_of(suite) if SCENES in conditions_by_place(suite) else {}
 
-    def rows(self, suite: PerceptionSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+    def rows(self, suite: PerceptionSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield, for scenes and each target, the clean data and those under each perturbation."""
         target_inputs = f"{suite.target_town} {suite.target_images} {suite.target_size} {suite.floor}"
         for detector, (place, conditions) in product(victims.files, conditions_by_place(suite).items()):
@@ -107,7 +107,7 @@ class Perception(OpenLoopKind):
                 inputs = [safeio.dump_json(data) if place == SCENES else target_inputs]
                 inputs += [] if perturbation is None else [perturbation.version()]
                 title = f"{detector}/{place}/{name}" + (f"-{severity}" if severity else "")
-                yield TableRow(title, detector, fields, {"perturbation": entry, "severity": severity}, inputs)
+                yield CellDescription(title, detector, fields, {"perturbation": entry, "severity": severity}, inputs)
 
     def order(self, cell: Cell) -> float:
         """Return the priority of a cell: clean first."""

@@ -47,7 +47,7 @@ from ssad.experiments.perception.scored_data import (
     detectors_of,
     recording_of,
 )
-from ssad.metrics.target_attacks import Sighting, precision, sightings, target_scores
+from ssad.metrics.target_attacks import TargetSighting, precision, sightings, target_scores
 from ssad.recorders.nuscenes import record_nuscenes
 from ssad.recorders.target_images import record_all
 from ssad.recorders.target_recording import Clips
@@ -68,7 +68,7 @@ class DetectorSuite(SuiteBase, DetectorTable):
 
 
 @dataclass(frozen=True, slots=True)
-class TableRow:
+class CellDescription:
     """A system under a perturbation, or under none, as plain data.
 
     Attributes:
@@ -101,7 +101,7 @@ class TargetCondition:
     name: str
 
 
-Sightings = Sequence[Sighting]
+Sightings = Sequence[TargetSighting]
 
 
 class OpenLoopKind(Kind):
@@ -137,7 +137,7 @@ class OpenLoopKind(Kind):
         """Return what the results depend on of the recorded scenes of a suite; {}: it needs none."""
         return data_of(suite) if isinstance(suite, DetectorSuite) else {}
 
-    def rows(self, suite: Any, victims: Victims, data: Mapping[str, Any]) -> Iterable[TableRow]:
+    def rows(self, suite: Any, victims: Victims, data: Mapping[str, Any]) -> Iterable[CellDescription]:
         """Return the rows of the table of a suite, in order."""
         raise NotImplementedError
 
@@ -166,11 +166,11 @@ class OpenLoopKind(Kind):
         """Raise UnknownNameError if the unknown name of an error is registered in another family."""
         for key, family in self.families.items():
             for name in (getattr(entry, "name", entry) for entry in getattr(suite, key)):
-                other = registered_names().get(name, family)
-                if other != family and f"'{name}'" in str(error):
+                registered_family = registered_names().get(name, family)
+                if registered_family != family and f"'{name}'" in str(error):
                     raise UnknownNameError(
-                        f"suite {suite.name}: {key}: '{name}' is of the family {other}, not {family}; suites of kind "
-                        "perception take every family"
+                        f"suite {suite.name}: {key}: '{name}' is of the family {registered_family}, not {family}; "
+                        "suites of kind perception take every family"
                     ) from None
 
     def scenes(self, cell: Cell, job: Job) -> Sequence[SceneCondition]:
@@ -186,14 +186,14 @@ class OpenLoopKind(Kind):
         raise NotImplementedError
 
     def target_columns(
-        self, cell: Cell, job: Job, shown: TargetCondition, clean: Sightings, attacked: Sightings | None
+        self, cell: Cell, job: Job, condition: TargetCondition, clean: Sightings, attacked: Sightings | None
     ) -> dict[str, Any]:
         """Return further columns of the record of a cell without scenes.
 
         Args:
             cell: The cell.
             job: Data that the workers share.
-            shown: Its images and its perturbation.
+            condition: Its images and its perturbation.
             clean: Detections in the clean images.
             attacked: Detections under the perturbation; None for a clean cell.
         """
@@ -251,12 +251,16 @@ class OpenLoopKind(Kind):
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """Return the scenes whose boxes are still to be found, by name, with a cell that they belong to."""
         conditions = [*self.compared_scenes(cell, job), *self.scenes(cell, job)]
-        return {one.name: cell for one in conditions if not boxes_path(job.folder, cell.system, one).is_file()}
+        return {
+            condition.name: cell
+            for condition in conditions
+            if not boxes_path(job.folder, cell.system, condition).is_file()
+        }
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
         """Find the boxes of one scene under one perturbation."""
         conditions = [*self.compared_scenes(data, job), *self.scenes(data, job)]
-        find_boxes(_examination(job), next(one for one in conditions if one.name == name), systems)
+        find_boxes(_examination(job), next(condition for condition in conditions if condition.name == name), systems)
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Return the scores of a cell; boxes that a shared piece failed to find are found alone.
@@ -277,24 +281,24 @@ class OpenLoopKind(Kind):
         """Return the scores of a cell on images of its target."""
         settings, weights = job.settings, job.settings["detectors"].get(cell.system) or None
         detector = loaded_detector(cell.system, weights=weights, device=job.device)
-        shown = self.target(cell, job, detector)
-        images, perturbation = shown.images, shown.perturbation
+        condition = self.target(cell, job, detector)
+        images, perturbation = condition.images, condition.perturbation
         bootstrap = {"replicates": settings["replicates"], "seed": settings["seed"]}
         if perturbation is None or type(perturbation).clean_target is Perturbation.clean_target:
             clean = _clean_sightings(images, cell.system, weights)
         else:
             clean = tuple(sightings(detector, perturbation.clean_target(images)))
         if perturbation is None:
-            return target_scores(clean, **bootstrap) | self.target_columns(cell, job, shown, clean, None)
+            return target_scores(clean, **bootstrap) | self.target_columns(cell, job, condition, clean, None)
         clean_precision, floor = round(precision(clean) or 0.0, 6), settings["floor"]
         if clean_precision < floor:  # what is not found anyway cannot be hidden
             raise CellError(
-                f"{cell.system} finds the clean {shown.name} with AP50 {clean_precision:.3f}, which is less than the "
-                f"floor of {floor:g}"
+                f"{cell.system} finds the clean {condition.name} with AP50 {clean_precision:.3f}, which is less than "
+                f"the floor of {floor:g}"
             )
         attacked = tuple(sightings(detector, perturbation.on_target(images)))
         scores = target_scores(attacked, clean, **bootstrap) | {"clean_AP50": clean_precision}
-        return scores | self.target_columns(cell, job, shown, clean, attacked)
+        return scores | self.target_columns(cell, job, condition, clean, attacked)
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[SceneCondition], job: Job) -> dict[str, Any]:
         """Return the record of a cell whose boxes are there."""
@@ -404,6 +408,6 @@ def _recorded_scenes(
 
 
 @lru_cache(maxsize=8)
-def _clean_sightings(images: LightableClips, detector: str, weights: str | None) -> tuple[Sighting, ...]:
+def _clean_sightings(images: LightableClips, detector: str, weights: str | None) -> tuple[TargetSighting, ...]:
     """Return a detector's sightings in clean images, which all cells of a target are compared with."""
     return tuple(sightings(loaded_detector(detector, weights=weights, device=images.device), images.clean()))

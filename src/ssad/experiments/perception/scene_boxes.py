@@ -207,21 +207,21 @@ def find_boxes(examination: Examination, scene: SceneCondition, detectors: Seque
             samples,
             monitored_detector.reason,
             presentation.notes(),
-            flat=monitored_detector.task == "2d",
+            is_2d=monitored_detector.task == "2d",
         )
     presentation.done()
 
 
-def _write(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, Any], *, flat: bool) -> None:
+def _write(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, Any], *, is_2d: bool) -> None:
     columns: dict[str, Any] = {"failed": np.array(reason)} if reason else {}
     if not reason:
         boxes = [sample.boxes for sample in samples]
         columns["sample"] = np.array([sample.token for sample in samples])
         columns["count"] = np.array([len(sample_boxes) for sample_boxes in boxes], np.int32)
-        for name in _FLAT if flat else ():
+        for name in _FLAT if is_2d else ():
             columns[name] = np.concatenate([getattr(boxes_2d, name) for boxes_2d in boxes])
         for name, column_parts in (
-            () if flat else zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True)
+            () if is_2d else zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True)
         ):
             columns[name] = np.concatenate(column_parts)
         columns["applied"] = np.array(safeio.dump_json(dict(sorted(notes.items()))))
@@ -236,9 +236,9 @@ def _to_columns(boxes: DetectedBoxes) -> tuple[Any, ...]:
     return boxes.centre, boxes.size_wlh, boxes.rotation, boxes.velocity, boxes.score, boxes.label, attribute_names
 
 
-def _from_columns(translation: Any, size_wlh: Any, *others: Any) -> DetectedBoxes:
+def _from_columns(translation: Any, size_wlh: Any, *columns: Any) -> DetectedBoxes:
     """Return the boxes of a sample from a file's columns."""
-    rotation, velocity, score, label, attribute_names = others
+    rotation, velocity, score, label, attribute_names = columns
     size_lwh = size_wlh[:, size_columns("wlh", "lwh")]
     return DetectedBoxes(translation, size_lwh, rotation, velocity, score, label, tuple(map(str, attribute_names)))
 
@@ -367,23 +367,23 @@ def read_scenes(
 
 
 def score_found(
-    examination: Examination, detector: str, found: Sequence[Any], truth: GroundTruth, *, replicates: int
+    examination: Examination, detector: str, boxes_by_sample: Sequence[Any], truth: GroundTruth, *, replicates: int
 ) -> dict[str, Any]:
     """As `score_scenes`, of boxes that are at hand: in the world, or of a 2D detector in the images.
 
     Args:
         examination: of the run.
         detector: name.
-        found: boxes of all samples.
+        boxes_by_sample: boxes of all samples.
         truth: of the same samples; it says which scenes are copies.
         replicates: of the bootstrap over scenes.
     """
-    if isinstance(found[0], SampleImages):
+    if isinstance(boxes_by_sample[0], SampleImages):
         classes = system_of(examination, detector).classes
-        pictures = match_images(found, picture_truth_of(examination, truth), classes)
+        pictures = match_images(boxes_by_sample, picture_truth_of(examination, truth), classes)
         figures = lambda weights, summary_only: image_figures(pictures.scores(weights), is_summary=summary_only)  # noqa: E731
     else:
-        matches = match_boxes(found, truth)
+        matches = match_boxes(boxes_by_sample, truth)
         figures = lambda weights, summary_only: score_figures(matches.scores(weights), summary_only=summary_only)  # noqa: E731
     return _resampled(examination, figures, truth, replicates)
 

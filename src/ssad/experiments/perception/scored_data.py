@@ -79,14 +79,14 @@ class Victims(NamedTuple):
 
 
 def detectors_of(
-    suite: str, entries: Sequence[str], *, flat: bool = False, scenes: bool = True, targets: Iterable[Target] = ()
+    suite: str, entries: Sequence[str], *, allow_2d: bool = False, scenes: bool = True, targets: Iterable[Target] = ()
 ) -> Victims:
     """Build detectors once, and check that they fit the data.
 
     Args:
         suite: Name of the suite, for messages.
         entries: Detectors as the suite writes them.
-        flat: Whether 2D detectors are accepted too.
+        allow_2d: Whether 2D detectors are accepted too.
         scenes: Whether they are scored on scenes.
         targets: Targets that they are scored on.
 
@@ -115,7 +115,7 @@ def detectors_of(
             )
         detector = detector_of(name, path, "cpu")
         task = str(getattr(detector, "task", ""))
-        if task != "3d" and not flat:
+        if task != "3d" and not allow_2d:
             raise ConfigError(f"suite {suite}: {name} finds 2D boxes; this suite takes 3D detectors")
         if task != "3d" and scenes and not set(detector.classes) & set(MMDET3D_CLASSES):
             raise ConfigError(f"suite {suite}: {name} knows none of the ten classes of nuScenes")

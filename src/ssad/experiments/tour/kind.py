@@ -23,7 +23,7 @@ from ssad.experiments.tour import page
 from ssad.report.load import Run
 from ssad.report.tables import Table
 
-TROUBLE = "trouble.txt"
+TROUBLE_FILE = "trouble.txt"
 
 
 class Part(Schema):
@@ -93,12 +93,12 @@ class Tour(Kind):
         retried_parts = {cell.system for cell in retry}
         for name, part in plan.details.items():
             part_folder = safeio.make_folder(folder / name)
-            (part_folder / TROUBLE).unlink(missing_ok=True)
+            (part_folder / TROUBLE_FILE).unlink(missing_ok=True)
             try:
                 run(part, part_folder, resources, retry=name in retried_parts)
                 part.kind.finish(part, part_folder)
             except SSADError as error:
-                safeio.write_atomic(part_folder / TROUBLE, str(error))
+                safeio.write_atomic(part_folder / TROUBLE_FILE, str(error))
         return {}
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
@@ -120,9 +120,9 @@ def counted(folder: Path, name: str) -> dict[str, Any]:
     Raises:
         CellError: The part could not run, or some of its cells failed.
     """
-    trouble = folder / name / TROUBLE
-    if trouble.is_file():
-        raise CellError(safeio.read_text(trouble))
+    trouble_file = folder / name / TROUBLE_FILE
+    if trouble_file.is_file():
+        raise CellError(safeio.read_text(trouble_file))
     lines = read_lines(folder / name / "results.jsonl")
     failures = [line for line in lines if line["status"] != "ok"]
     if failures or not lines:

@@ -71,7 +71,7 @@ def picture_shifts(names: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ShiftedImage:
     """One picture under one shift: the unit of work of a worker.
 
     Attributes:
@@ -138,10 +138,10 @@ def shift_pictures(
         if root.exists() and not (out / RUN).is_file():
             raise StoreError(f"{root}: holds something else; choose another OUT")
     with Store.open(
-        out, {"identity": identity, "suite": {"name": "ssad shift", **identity}}, retry=True, what="ssad shift"
+        out, {"identity": identity, "suite": {"name": "ssad shift", **identity}}, retry=True, command="ssad shift"
     ) as store:
         tasks = [
-            _picture(path, source, root, how=condition, settings=settings)
+            _picture(path, source, root, condition=condition, settings=settings)
             for root, condition in conditions.items()
             for path in pictures
         ]
@@ -162,19 +162,19 @@ def shift_pictures(
                     store.append({"key": _name(picture), **record}, None)
                 progress(len(tasks) - len(missing) + finished, len(tasks))
         return [
-            _ended(root, source, files, told=identity, how=condition, done=store.results)
+            _ended(root, source, files, settings=identity, condition=condition, results=store.results)
             for root, condition in conditions.items()
         ]
 
 
 def _picture(
-    path: Path, source: Path, root: Path, *, how: tuple[str, Strength], settings: Mapping[str, Any]
-) -> Picture:
-    shift, strength = how
+    path: Path, source: Path, root: Path, *, condition: tuple[str, Strength], settings: Mapping[str, Any]
+) -> ShiftedImage:
+    shift, strength = condition
     spec = ShiftSpec(
         shift, 1 if strength == "random" else int(strength), seed=settings["seed"], calibration=settings["calibration"]
     )
-    return Picture(
+    return ShiftedImage(
         path,
         path.relative_to(source).as_posix(),
         root.absolute(),
@@ -185,20 +185,24 @@ def _picture(
     )
 
 
-def _name(one: Picture) -> str:
-    return f"{one.root.name}/{one.key}"
+def _name(image: ShiftedImage) -> str:
+    return f"{image.root.name}/{image.key}"
 
 
-def _written(one: Picture) -> dict[str, Any]:
+def _written(image_task: ShiftedImage) -> dict[str, Any]:
     """In a worker: shift one picture; what is recorded of it."""
-    spec = replace(one.spec, severity=random_severity(one.spec, one.key, one.key)) if one.random else one.spec
+    spec = (
+        replace(image_task.spec, severity=random_severity(image_task.spec, image_task.key, image_task.key))
+        if image_task.random
+        else image_task.spec
+    )
     quiet_warp()
     try:
-        image = read_image(one.path)
-        frame = Frame(camera_of(one.path, image), scene=one.key, sample=one.key)
+        image = read_image(image_task.path)
+        frame = Frame(camera_of(image_task.path, image), scene=image_task.key, sample=image_task.key)
         shifted, (application,) = shift_images(image, [frame], spec)
-        make_folder((one.root / one.key).parent)
-        write_atomic(one.root / one.key, _encoded(shifted, one))
+        make_folder((image_task.root / image_task.key).parent)
+        write_atomic(image_task.root / image_task.key, _encoded(shifted, image_task))
     except SSADError as error:
         return {"status": "failed", "severity": spec.severity, "reason": str(error)}
     details = {
@@ -209,13 +213,13 @@ def _written(one: Picture) -> dict[str, Any]:
     return {"status": "ok", "severity": spec.severity, **details}
 
 
-def _encoded(image: U8, one: Picture) -> bytes:
-    if one.path.suffix.lower() not in JPEG:
+def _encoded(image: U8, image_task: ShiftedImage) -> bytes:
+    if image_task.path.suffix.lower() not in JPEG:
         return bytes(cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1].tobytes())
-    chroma = one.subsampling
+    chroma = image_task.subsampling
     if chroma == "auto":  # 420 averages the chroma of neighbours, which would weaken noise
-        chroma = "444" if one.spec.family == "sensor" else "420"
-    return encode_jpeg(image, one.quality, chroma)
+        chroma = "444" if image_task.spec.family == "sensor" else "420"
+    return encode_jpeg(image, image_task.quality, chroma)
 
 
 def camera_of(path: Path, image: U8) -> Camera:
@@ -245,9 +249,9 @@ def _ended(
     source: Path,
     files: Sequence[Path],
     *,
-    told: Mapping[str, Any],
-    how: tuple[str, Strength],
-    done: Mapping[str, Mapping[str, Any]],
+    settings: Mapping[str, Any],
+    condition: tuple[str, Strength],
+    results: Mapping[str, Mapping[str, Any]],
 ) -> ShiftedFolder:
     """Link what is no picture, say what was done, and count."""
     link_count = 0
@@ -260,12 +264,12 @@ def _ended(
             make_folder(target.parent)
             os.symlink(path, target)
     folder_records = {
-        key.removeprefix(f"{root.name}/"): line for key, line in done.items() if key.startswith(f"{root.name}/")
+        key.removeprefix(f"{root.name}/"): line for key, line in results.items() if key.startswith(f"{root.name}/")
     }
     # The store is in the order of completion; sorting makes the manifest independent of it.
     manifest_lines = [{**folder_records[key], "key": key} for key in sorted(folder_records)]
     write_atomic(make_folder(root) / LINES, "".join(dump_json(line) + "\n" for line in manifest_lines))
-    write_atomic(root / PAGE, dump_json({"shift": how[0], "severity": how[1], **told}, indent=1) + "\n")
+    write_atomic(root / PAGE, dump_json({"shift": condition[0], "severity": condition[1], **settings}, indent=1) + "\n")
     successes = [line for line in manifest_lines if line["status"] == "ok"]
     reasons = tuple(f"{line['key']}: {line['reason']}" for line in manifest_lines if line["status"] != "ok")
     applied = sum(bool(line["applied"]) for line in successes) / max(len(successes), 1)

@@ -81,7 +81,7 @@ def digest_file(path: Path) -> str:
 
 
 @dataclass(slots=True)
-class Tally:
+class ManifestCounts:
     """Counts over the lines of a root, added scene by scene so that only one scene is in memory."""
 
     scenes: dict[str, str] = field(default_factory=dict)
@@ -115,7 +115,7 @@ class Tally:
 
 
 def page(
-    identity: Mapping[str, Any], source: Mapping[str, Any], tally: Tally, *, labels: str, transformed: str
+    identity: Mapping[str, Any], source: Mapping[str, Any], tally: ManifestCounts, *, labels: str, transformed: str
 ) -> dict[str, Any]:
     """Build manifest.json of a complete root: identity, source, counts, and hashes of lines and new boxes."""
     return {
@@ -187,7 +187,7 @@ def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) 
         )
     for box_problem in _wrong_boxes(root, manifest):
         raise StoreError(f"{box_problem}; run the same ssad shift again")
-    smallest: list[tuple[str, str, str]] = []
+    selected: list[tuple[str, str, str]] = []
     for scene in scene_names or manifest["scenes"]:
         records = read_lines(shard_path(root, scene))
         if digest_bytes(text(records.values()).encode()) != manifest["scenes"][scene]:
@@ -198,9 +198,9 @@ def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) 
                 raise StoreError(f"{root / record['file']}: {problem}; run the same ssad shift again")
         shifted = ((entry["file"], entry["hash"]) for entry in records.values() if entry["state"] == "shifted")
         # The smallest digests are a reproducible random sample, and need one scene in memory at a time.
-        smallest = heapq.nsmallest(sample, [*smallest, *((digest("manifest check", *pair), *pair) for pair in shifted)])
-    for _, name, expected in smallest:
-        if digest_file(root / name) != expected:
+        selected = heapq.nsmallest(sample, [*selected, *((digest("manifest check", *pair), *pair) for pair in shifted)])
+    for _, name, expected_hash in selected:
+        if digest_file(root / name) != expected_hash:
             raise StoreError(f"{root / name}: not the bytes in the manifest; run the same ssad shift again")
     return manifest
 
@@ -281,9 +281,9 @@ def verify(root: Path) -> tuple[int, list[str]]:
     return file_count, problems
 
 
-def _wrong_bytes(path: Path, expected: str) -> list[str]:
+def _wrong_bytes(path: Path, expected_hash: str) -> list[str]:
     """Return one line if a file has another hash or cannot be read."""
     try:
-        return [] if digest_file(path) == expected else [f"{path}: not the bytes in the manifest"]
+        return [] if digest_file(path) == expected_hash else [f"{path}: not the bytes in the manifest"]
     except FormatError as error:
         return [str(error)]

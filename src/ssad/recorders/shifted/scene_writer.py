@@ -192,9 +192,9 @@ def _make(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> dict[str, 
     kind = "camera" if frame.modality == "camera" else "lidar" if frame.channel == LIDAR else frame.modality
     record: dict[str, Any] = {"file": frame.filename, "kind": kind, "token": frame.token}
     if kind not in ("camera", "lidar"):
-        return _link(shard, record | {"reason": "no shift for this sensor"}, needed=False)
+        return _link(shard, record | {"reason": "no shift for this sensor"}, is_required=False)
     if (kind == "lidar" and not shard.options.lidar) or not (frame.key_frame or shard.options.sweeps):
-        return _link(shard, record | {"reason": "not asked for"}, needed=False)
+        return _link(shard, record | {"reason": "not asked for"}, is_required=False)
     try:
         encoded, pixels, applied = (_image if kind == "camera" else _points)(shard, shifter, frame)
     except FormatError as error:
@@ -224,9 +224,9 @@ def _idle(shifter: SceneShifter, frame: SensorFrame) -> str:
 
 def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, Applied]:
     """Return bytes of a shifted image (None: unchanged), hash of its pixels, and the application of the shift."""
-    clean = shifter.read(frame)
-    image, applied = shifter.image(frame, clean=clean)
-    if not applied.applied or np.array_equal(image, clean):
+    clean_image = shifter.read(frame)
+    image, applied = shifter.image(frame, clean=clean_image)
+    if not applied.applied or np.array_equal(image, clean_image):
         return None, "", applied
     image = np.ascontiguousarray(image)
     return _encode(image, shard, frame.filename), digest_bytes(image.data), applied
@@ -241,16 +241,16 @@ def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[by
     return encoded, digest_bytes(encoded), applied
 
 
-def _boxes(shard: Shard, shifter: SceneShifter, sample: str, done: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _boxes(shard: Shard, shifter: SceneShifter, sample: str, records: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The boxes of a sample after the shift. A sweep that cannot be read is on record, and its counts stay."""
     sweep = shifter.key_sweep(sample)
-    state = "absent" if sweep is None else done[sweep.filename]["state"]
+    state = "absent" if sweep is None else records[sweep.filename]["state"]
     try:
         labels = shifter.labels(sample, lidar=None if state in ("absent", "failed") else shard.options.lidar)
     except FormatError as error:  # it was linked without being read
         assert sweep is not None
-        identity = {name: done[sweep.filename][name] for name in ("file", "kind", "token")}
-        done[sweep.filename] = _failed(shard, identity, str(error))
+        identity = {name: records[sweep.filename][name] for name in ("file", "kind", "token")}
+        records[sweep.filename] = _failed(shard, identity, str(error))
         labels = shifter.labels(sample, lidar=None)
     sizes = labels.size_wlh
     return {
@@ -282,11 +282,11 @@ def _encode(image: U8, shard: Shard, name: str) -> bytes:
     return encode_jpeg(image, shard.options.quality, shard.subsampling)
 
 
-def _link(shard: Shard, record: dict[str, Any], *, needed: bool = True) -> dict[str, Any]:
+def _link(shard: Shard, record: dict[str, Any], *, is_required: bool = True) -> dict[str, Any]:
     """Link a file to the clean one and return its manifest line; a file that is not needed may be absent."""
     source = shard.options.source / record["file"]
     if not os.path.isfile(source):
-        if needed or os.path.lexists(source):
+        if is_required or os.path.lexists(source):
             return _failed(shard, record, f"{record['file']}: no such file")
         _remove(shard.root / record["file"])
         return record | {"state": "absent"}

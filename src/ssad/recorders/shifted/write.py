@@ -18,7 +18,16 @@ from ssad.datasets.nuscenes.tables import stream, table_path
 from ssad.engine.pool import open_pool, run_all
 from ssad.engine.store import locked
 from ssad.recorders.parts import TIME_LIMIT, claim
-from ssad.recorders.shifted.manifest import FOLDER, PAGE, TABLE, Tally, digest_file, page, read_lines, shard_path
+from ssad.recorders.shifted.manifest import (
+    FOLDER,
+    PAGE,
+    TABLE,
+    ManifestCounts,
+    digest_file,
+    page,
+    read_lines,
+    shard_path,
+)
 from ssad.recorders.shifted.options import Options, Shard, Strength
 from ssad.recorders.shifted.scene_writer import UNFINISHED, check_folders, finished, link, make_shard
 from ssad.scenarios.static.shifts.sun import NO_SUN
@@ -99,7 +108,7 @@ def materialise(
         for shift, severity in conditions:
             try:
                 written_roots.append(
-                    _finish(options, shift, severity, source=source, scenes=scene_names, known=all_scenes)
+                    _finish(options, shift, severity, source=source, scenes=scene_names, scene_names=all_scenes)
                 )
             except StoreError as error:  # finish the other roots nevertheless
                 errors.append(error)
@@ -151,38 +160,38 @@ def _finish(
     *,
     source: dict[str, Any],
     scenes: Sequence[str],
-    known: Sequence[str],
+    scene_names: Sequence[str],
 ) -> Written:
     """Labels, the manifest's page, and the check that something changed.
 
     The page covers the scenes of earlier runs as well, if they are whole: scenes may be spread over runs.
     """
     root = options.root(shift, severity)
-    tally, scene_boxes = Tally(), dict[str, msgspec.Raw]()
-    for scene in known:
+    counts, scene_boxes = ManifestCounts(), dict[str, msgspec.Raw]()
+    for scene in scene_names:
         scene_labels = finished(root, scene)
         if scene_labels is None and scene in scenes:
             raise StoreError(f"{root}: the lines of {scene} are gone; run the same ssad shift again")
         records = read_lines(shard_path(root, scene)).values() if scene_labels is not None else ()
         if scene_labels is None or (scene not in scenes and any(record["state"] == "failed" for record in records)):
             continue
-        tally.add(scene, records)
+        counts.add(scene, records)
         scene_boxes |= scene_labels.boxes
     transformed = _write_labels(options, root, scene_boxes)
-    changed = tally.changed if tally.images else tally.states["shifted"]
-    if not tally.reasons and severity != 0 and not changed and not (tally.skipped.keys() & NO_SUN):
-        explanation = "; ".join(f"{reason} ({count})" for reason, count in sorted(tally.skipped.items()))
+    changed_count = counts.changed if counts.images else counts.states["shifted"]
+    if not counts.reasons and severity != 0 and not changed_count and not (counts.skipped.keys() & NO_SUN):
+        explanation = "; ".join(f"{reason} ({count})" for reason, count in sorted(counts.skipped.items()))
         raise StoreError(
-            f"{root}: {shift} changed none of {tally.images} images: {explanation or 'no reason was given'}"
+            f"{root}: {shift} changed none of {counts.images} images: {explanation or 'no reason was given'}"
         )
     shutil.rmtree(root / UNFINISHED, ignore_errors=True)
-    if not tally.reasons:
+    if not counts.reasons:
         identity = Shard(options, shift, severity, "").identity()
-        manifest = page(identity, source, tally, labels=options.labels, transformed=transformed)
+        manifest = page(identity, source, counts, labels=options.labels, transformed=transformed)
         safeio.write_atomic(root / PAGE, safeio.dump_json(manifest, indent=1) + "\n")
-    states = tally.states
+    states = counts.states
     return Written(
-        root, states["shifted"], states["linked"], states["failed"], tally.applied, tuple(sorted(tally.reasons))
+        root, states["shifted"], states["linked"], states["failed"], counts.applied, tuple(sorted(counts.reasons))
     )
 
 

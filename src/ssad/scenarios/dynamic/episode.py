@@ -17,7 +17,7 @@ from ssad.core.types import (
     Controller,
     Episode,
     EpisodeAgent,
-    Limits,
+    EpisodeLimits,
     Pose,
     Route,
     Scenario,
@@ -138,7 +138,7 @@ def _start(route: Route, forward: float, left: float, turn: float) -> Pose:
 def _completed(scenario: Scenario, kind: ScenarioType) -> Scenario:
     """Return the scenario with the values that it leaves at the defaults taken from its type."""
     limits = scenario.limits
-    if limits.max_distance == Limits().max_distance:
+    if limits.max_distance == EpisodeLimits().max_distance:
         limits = dataclasses.replace(limits, max_distance=kind.max_distance)
     return dataclasses.replace(
         scenario,

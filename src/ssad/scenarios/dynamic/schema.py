@@ -13,14 +13,14 @@ import numpy as np
 
 from ssad.core.errors import ConfigError
 from ssad.core.safeio import Document, Location, dotted
-from ssad.core.types import Actor, Condition, Limits, Phase, Pose, Scenario, SignalPlan, TrafficPlan
+from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Scenario, SignalPlan, TrafficPlan
 from ssad.scenarios.dynamic.catalog import CUSTOM, scenario_type
 from ssad.world.models import model
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
 
-_DATA = (Scenario, Pose, Actor, Phase, Condition, SignalPlan, TrafficPlan, Limits)
+_DATA = (Scenario, Pose, Actor, Phase, PhaseTrigger, SignalPlan, TrafficPlan, EpisodeLimits)
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+\-]*(/[A-Za-z0-9][A-Za-z0-9_.:@+\-]*)*$")
 # Generous bounds: they keep a typing error from starting a run of hours.
 MAX_SPEED = 60.0
@@ -112,10 +112,10 @@ def _fields_at(location: Location) -> list[str]:
         "pose": Pose,
         "actors": Actor,
         "phases": Phase,
-        "when": Condition,
+        "when": PhaseTrigger,
         "signals": SignalPlan,
         "traffic": TrafficPlan,
-        "limits": Limits,
+        "limits": EpisodeLimits,
     }
     for part in location:
         dataclass_type = type_of_key.get(str(part), dataclass_type) if isinstance(part, str) else dataclass_type

@@ -25,7 +25,7 @@ BLOCK = 128
 
 
 class When(IntEnum):
-    """Start condition of a phase: the kinds of `ssad.core.types.Condition`."""
+    """Start condition of a phase: the kinds of `ssad.core.types.PhaseTrigger`."""
 
     ALWAYS = 0
     EGO_DISTANCE = 1
@@ -44,7 +44,7 @@ class Presence(IntEnum):
 
 
 class ContactPolicy(IntEnum):
-    """Effect of a contact of the ego: the words of `ssad.core.types.Limits.contact`."""
+    """Effect of a contact of the ego: the words of `ssad.core.types.EpisodeLimits.contact`."""
 
     END = 0
     COUNT = 1

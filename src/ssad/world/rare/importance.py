@@ -217,5 +217,5 @@ def importance(
     work = process.work() - initial_work + training
     max_weight = 1.0 / float(proposal.share[0])
     return weighted_estimate(
-        values, "importance sampling", most=max_weight, work=work, training=training
+        values, "importance sampling", max_weight=max_weight, work=work, training=training
     ), episodes_drawn

@@ -262,8 +262,8 @@ def _part(graph: LaneGraph, part: tuple[int, float, float], step: float) -> F64:
     """The rows of `_line` for one lane; those of a whole lane are kept, since most routes of a town have it."""
     lane, s0, s1 = part
     whole = math.isinf(step) and s0 == 0.0 and s1 == float(graph.length[lane])
-    if whole and lane in graph.kept:
-        cached_rows: F64 = graph.kept[lane]
+    if whole and lane in graph.cache:
+        cached_rows: F64 = graph.cache[lane]
         return cached_rows
     inner_points = graph.s[graph.points(lane)].astype(np.float64) if math.isinf(step) else np.arange(s0, s1, step)
     inner_points = inner_points[(inner_points > s0 + 0.02) & (inner_points < s1 - 0.02)]
@@ -274,7 +274,7 @@ def _part(graph: LaneGraph, part: tuple[int, float, float], step: float) -> F64:
     )
     if whole:
         rows.setflags(write=False)
-        graph.kept[lane] = rows
+        graph.cache[lane] = rows
     return rows
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import Condition, Controller, EpisodeAgent, Phase, Pose, Route, Scenario
+from ssad.core.types import Controller, EpisodeAgent, Phase, PhaseTrigger, Pose, Route, Scenario
 from ssad.scenarios.dynamic import Parameter, ScenarioType
 
 
@@ -17,7 +17,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         at = min(round(value["distance"] + number * value["gap"]), len(route.xy) - 1)  # route points are 1 m apart
         yaw, side = float(route.yaw[at]), 1.5 * float(route.width[at])
         x, y = route.xy[at].astype(float) + side * np.array([np.sin(yaw), -np.cos(yaw)])
-        start = Phase(value["speed"], Condition("ego_distance", value["trigger"], number))
+        start = Phase(value["speed"], PhaseTrigger("ego_distance", value["trigger"], number))
         walkers.append(
             EpisodeAgent(
                 f"walker {number}",

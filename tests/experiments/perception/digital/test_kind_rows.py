@@ -205,12 +205,12 @@ def test_a_target_is_reached_where_the_car_is_gone(folder: Path, root: Path) -> 
     row = target_table(load_digital_run(load_run(folder))).rows[0]
     assert row.cells[0].mean == pytest.approx(100 * found["metrics"]["success"])
     clean, attacked, truth = boxes_of(folder, root)
-    same = target_success(clean, clean, truth, ["car"], becomes={})
+    same = target_success(clean, clean, truth, ["car"], target_classes={})
     assert same == {"targets": found["metrics"]["targets"], "success": 0.0, "kept": 1.0}
-    assert target_success(clean, clean, truth, becomes={"car": "car"})["success"] == 1.0
-    fewer = target_success(attacked, clean, truth, ["car"], becomes={})
+    assert target_success(clean, clean, truth, target_classes={"car": "car"})["success"] == 1.0
+    fewer = target_success(attacked, clean, truth, ["car"], target_classes={})
     assert fewer["targets"] < same["targets"], "only what was found before can be lost"
-    assert "success" not in target_success(clean, clean, truth, ["trailer"], becomes={})
+    assert "success" not in target_success(clean, clean, truth, ["trailer"], target_classes={})
     bands = by_distance(clean, truth)
     told = one(folder, attack=None)["metrics"]
     assert bands == {key: value for key, value in told.items() if key.endswith(("0-20", "20-40", "40+"))}

@@ -441,9 +441,9 @@ def test_the_grid_is_recorded_and_a_panel_that_nobody_sees_is_refused_there_alon
 def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No attack is reported where the detector does worse than the floor without it."""
     from ssad.engine.kind import CellError
-    from ssad.metrics.target_attacks import Sighting
+    from ssad.metrics.target_attacks import TargetSighting
 
-    nothing = Sighting("a", np.zeros((0, 4)), np.zeros(0), np.array([[0.0, 0.0, 9.0, 9.0]]), np.zeros(1, bool))
+    nothing = TargetSighting("a", np.zeros((0, 4)), np.zeros(0), np.array([[0.0, 0.0, 9.0, 9.0]]), np.zeros(1, bool))
     monkeypatch.setattr("ssad.experiments.perception.open_loop._clean_sightings", lambda *given: (nothing,))
     plan = Physical().plan(suite(floor=0.9))
     job = Job(tmp_path, "cpu", SETTINGS | {"floor": 0.9})

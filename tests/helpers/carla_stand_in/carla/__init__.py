@@ -20,7 +20,7 @@ from enum import IntEnum
 import numpy as np
 
 from ssad.core.lane_graph import Marking
-from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario
+from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, EpisodeLimits, LaneType, Pose, Route, Scenario
 from ssad.simulators.carla.blueprints import MODEL_OF
 from ssad.world.models import MODELS
 from ssad.world.roads import load_town, route_along, town_signals, town_xodr
@@ -562,7 +562,7 @@ class World:
                 who, speed = Controller.AUTOPILOT, body._speed
                 way = route_along(load_town(self._town), [Pose(*body._pose), *self._ahead(body)])
             agents.append(EpisodeAgent(str(body.id), name, who, Pose(*body._pose), body._start_speed, speed, route=way))
-        limits = Limits(max_steps=10**6, max_time=1e6, contact="count")
+        limits = EpisodeLimits(max_steps=10**6, max_time=1e6, contact="count")
         scenario = Scenario("stand-in", "Custom", self._town, (Pose(0, 0), Pose(1, 0)))
         episode = Episode("stand-in", scenario, self._town, tuple(agents), limits=limits)
         self._engine = Engine([episode], {self._town: load_town(self._town)})

@@ -46,7 +46,7 @@ def attack_record(
     Raises:
         ConfigError: The attack is about an object that these scenes do not have.
     """
-    scorer = Eye(examination, system)
+    scorer = BoxScorer(examination, system)
     clean_scenes = [SceneCondition(condition.scene) for condition in scenes[: len(scenes) // max(len(specs), 1)]]
     # The clean boxes are a by-product of other cells; missing ones are found now.
     for condition in clean_scenes:
@@ -72,7 +72,9 @@ def attack_record(
     metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None
     if not specs[0].aim.attacks_all and not scorer.flat:
         places = _places(examination, specs[0], clean_scenes)
-        metrics |= target_success(clean_boxes, boxes, truth, specs[0].wanted, becomes=dict(specs[0].becomes), at=places)
+        metrics |= target_success(
+            clean_boxes, boxes, truth, specs[0].wanted, target_classes=dict(specs[0].becomes), target_positions=places
+        )
     return {
         **attacked_result,
         **sum_members(member_notes),
@@ -82,7 +84,7 @@ def attack_record(
     }
 
 
-class Eye:
+class BoxScorer:
     """Comparisons of the boxes of a system: in the world for 3D detectors, in the images for 2D detectors.
 
     Attributes:
@@ -115,7 +117,7 @@ def _places(examination: Examination, spec: AttackSpec, scenes: Sequence[SceneCo
         return None
     with NuScenes(examination.root, examination.version) as dataset:
         scene_places = [chosen_places(dataset.scene(condition.scene), spec.object, spec.wanted) for condition in scenes]
-    places = {token: place for places_of_scene in scene_places for token, place in places_of_scene.items()}
-    if not places:
+    place_by_token = {token: place for places_of_scene in scene_places for token, place in places_of_scene.items()}
+    if not place_by_token:
         raise ConfigError(f"object {spec.object}: no moment of these scenes has it; nothing was attacked")
-    return places
+    return place_by_token

@@ -18,9 +18,11 @@ from ssad.metrics.detection import CVPR_2019, Matches, filter_boxes, match
 from ssad.metrics.detection_boxes import BoxTable
 
 BANDS: Mapping[str, tuple[float, float]] = {"0-20": (0.0, 20.0), "20-40": (20.0, 40.0), "40+": (40.0, np.inf)}
-NEAR = 2.0  # metres within which a box is taken for that of an object, as for the true-positive errors of nuScenes
-SAME = 1e-3  # metres within which two places are one
-SEEN = 0.1  # least score of a box that counts as a detection of an object
+MATCH_DISTANCE = (
+    2.0  # metres within which a box is taken for that of an object, as for the true-positive errors of nuScenes
+)
+SAME_POSITION = 1e-3  # metres within which two places are one
+MIN_SCORE = 0.1  # least score of a box that counts as a detection of an object
 
 
 class Matched(Protocol):
@@ -42,11 +44,11 @@ Match = Callable[[Sequence[Any]], Matched]
 """From the boxes of all samples under an attack to what they match."""
 
 
-def by_distance(found: Sequence[SampleBoxes], truth: GroundTruth) -> dict[str, float]:
+def by_distance(boxes_by_sample: Sequence[SampleBoxes], truth: GroundTruth) -> dict[str, float]:
     """Scores of objects near and far from the ego: each band by itself, boxes and truth by their own distance.
 
     Args:
-        found: Boxes of all samples.
+        boxes_by_sample: Boxes of all samples.
         truth: Of the same samples.
 
     Returns:
@@ -54,7 +56,7 @@ def by_distance(found: Sequence[SampleBoxes], truth: GroundTruth) -> dict[str, f
         class within 2 m; a band without objects has neither.
     """
     truth_boxes = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
-    boxes = filter_boxes(box_table(found, truth), racks=truth.racks)
+    boxes = filter_boxes(box_table(boxes_by_sample, truth), racks=truth.racks)
     scores: dict[str, float] = {}
     for name, (near_limit, far_limit) in BANDS.items():
         band_matches = match(
@@ -69,49 +71,51 @@ def by_distance(found: Sequence[SampleBoxes], truth: GroundTruth) -> dict[str, f
     return scores
 
 
-def _between(boxes: BoxTable, low: float, high: float) -> BoxTable:
-    return boxes.take(np.flatnonzero((boxes.ego_distance >= low) & (boxes.ego_distance < high)))
+def _between(boxes: BoxTable, min_distance: float, max_distance: float) -> BoxTable:
+    return boxes.take(np.flatnonzero((boxes.ego_distance >= min_distance) & (boxes.ego_distance < max_distance)))
 
 
 def _hits(matches: Matches) -> int:
     """Count the objects that are found within 2 m."""
-    threshold_index = CVPR_2019.dist_ths.index(NEAR)
+    threshold_index = CVPR_2019.dist_ths.index(MATCH_DISTANCE)
     return sum(len(class_matches.hits[threshold_index]) for class_matches in matches.classes)
 
 
 def target_success(
-    clean: Sequence[SampleBoxes],
+    clean_boxes: Sequence[SampleBoxes],
     attacked: Sequence[SampleBoxes],
     truth: GroundTruth,
     classes: Sequence[str] = (),
     *,
-    becomes: Mapping[str, str],
-    at: Mapping[str, F64] | None = None,
+    target_classes: Mapping[str, str],
+    target_positions: Mapping[str, F64] | None = None,
 ) -> dict[str, float]:
-    """How often a targeted attack reaches its target, over the objects that are found in the clean pictures.
+    """Success rate of a targeted attack, over the objects that are found in the clean pictures.
 
     An object is found if the best box within 2 m of it, with a score of 0.1 at least, is of its class. The target is
     reached if, under the attack, the best such box is of the wanted class; where no class is wanted, if the object is
     not found any more.
 
     Args:
-        clean: Boxes in the clean pictures.
+        clean_boxes: Boxes in the clean pictures.
         attacked: Boxes under the attack.
         truth: Of the same samples.
-        classes: Names of the classes that are attacked; empty: all, or those that `becomes` names.
-        becomes: Class -> class that its objects should be taken for.
-        at: Where the one object of each sample is that is attacked, m, by token; None: all objects are.
+        classes: Names of the classes that are attacked; empty: all, or those that `target_classes` names.
+        target_classes: Class -> class that its objects should be taken for.
+        target_positions: Where the one object of each sample is that is attacked, m, by token; None: all objects are.
 
     Returns:
         success, absent if no such object is found; targets, the number of objects; kept, the share of the others that
         are found as what they are in both, absent if there are none.
     """
     truth_boxes = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
-    is_target = np.isin(truth_boxes.label, [CLASSES.index(name) for name in becomes or classes or CLASSES])
-    if at is not None:
-        places = np.array([at.get(token, np.full(3, np.nan)) for token in truth.samples])
-        is_target &= np.abs(truth_boxes.centre - places[truth_boxes.sample]).max(1) < SAME
-    clean_labels, attacked_labels = (_taken_for(truth_boxes, box_table(boxes, truth)) for boxes in (clean, attacked))
+    is_target = np.isin(truth_boxes.label, [CLASSES.index(name) for name in target_classes or classes or CLASSES])
+    if target_positions is not None:
+        positions = np.array([target_positions.get(token, np.full(3, np.nan)) for token in truth.samples])
+        is_target &= np.abs(truth_boxes.centre - positions[truth_boxes.sample]).max(1) < SAME_POSITION
+    clean_labels, attacked_labels = (
+        _recognised_classes(truth_boxes, box_table(boxes, truth)) for boxes in (clean_boxes, attacked)
+    )
     is_found = clean_labels == truth_boxes.label
     is_bystander = is_found & ~is_target
     kept_column = (
@@ -119,12 +123,13 @@ def target_success(
     )
     is_found &= is_target
     target_labels = {
-        CLASSES.index(source_class): CLASSES.index(target_class) for source_class, target_class in becomes.items()
+        CLASSES.index(source_class): CLASSES.index(target_class)
+        for source_class, target_class in target_classes.items()
     }
     # -2 equals no label: -1 already means that there is no box.
     is_reached = (
         attacked_labels == [target_labels.get(int(label), -2) for label in truth_boxes.label]
-        if becomes
+        if target_classes
         else attacked_labels != truth_boxes.label
     )
     count = int(is_found.sum())
@@ -135,39 +140,42 @@ def target_success(
     }
 
 
-def _taken_for(real: BoxTable, boxes: BoxTable) -> F64:
+def _recognised_classes(truth_boxes: BoxTable, boxes: BoxTable) -> F64:
     """Label of the best box near each object [N]; -1: there is none."""
-    labels = np.full(len(real.label), -1)
-    boxes = boxes.take(np.flatnonzero(boxes.score >= SEEN))
-    for sample in np.unique(real.sample):
-        rows, candidate_rows = np.flatnonzero(real.sample == sample), np.flatnonzero(boxes.sample == sample)
+    labels = np.full(len(truth_boxes.label), -1)
+    boxes = boxes.take(np.flatnonzero(boxes.score >= MIN_SCORE))
+    for sample in np.unique(truth_boxes.sample):
+        rows, candidate_rows = np.flatnonzero(truth_boxes.sample == sample), np.flatnonzero(boxes.sample == sample)
         if not len(candidate_rows):
             continue
-        distances = np.linalg.norm(real.centre[rows, None, :2] - boxes.centre[None, candidate_rows, :2], axis=-1)
-        nearby_scores = np.where(distances < NEAR, boxes.score[candidate_rows][None], -1.0)
+        distances = np.linalg.norm(truth_boxes.centre[rows, None, :2] - boxes.centre[None, candidate_rows, :2], axis=-1)
+        nearby_scores = np.where(distances < MATCH_DISTANCE, boxes.score[candidate_rows][None], -1.0)
         best_candidate = nearby_scores.argmax(1)
-        labels[rows] = np.where(nearby_scores.max(1) >= SEEN, boxes.label[candidate_rows][best_candidate], -1)
+        labels[rows] = np.where(nearby_scores.max(1) >= MIN_SCORE, boxes.label[candidate_rows][best_candidate], -1)
     return labels
 
 
-def worst_by_sample(found: Sequence[Sequence[Any]], tokens: Sequence[str], match: Match) -> list[Any]:
+def worst_by_sample(candidates: Sequence[Sequence[Any]], tokens: Sequence[str], match_boxes: Match) -> list[Any]:
     """At each moment the boxes under the attack that leaves the detector least.
 
     Args:
-        found: Boxes of all samples under each attack.
+        candidates: Boxes of all samples under each attack.
         tokens: Of all samples.
-        match: Matches them with the truth.
+        match_boxes: Matches them with the truth.
 
     Returns:
         For each sample the boxes of the attack with the least mAP over this sample alone; of equal ones those with the
         larger sum of scores, as there is more among them that is false.
     """
-    tables = [{sample_boxes.token: sample_boxes for sample_boxes in boxes} for boxes in found]
-    sample_ap = np.stack([_by_sample(match(boxes)) for boxes in found])
+    tables = [{sample_boxes.token: sample_boxes for sample_boxes in boxes} for boxes in candidates]
+    sample_ap = np.stack([_by_sample(match_boxes(boxes)) for boxes in candidates])
     noise = np.array([[float(np.sum(table[token].boxes.score)) for token in tokens] for table in tables])
     return [
         tables[
-            min(range(len(found)), key=lambda attack: (sample_ap[attack, sample_index], -noise[attack, sample_index]))
+            min(
+                range(len(candidates)),
+                key=lambda attack: (sample_ap[attack, sample_index], -noise[attack, sample_index]),
+            )
         ][sample_token]
         for sample_index, sample_token in enumerate(tokens)
     ]

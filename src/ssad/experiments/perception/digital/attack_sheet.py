@@ -38,9 +38,9 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
     rows = []
     with NuScenes(examination.root, examination.version) as dataset:
         scene, frame = richest(dataset, scenes_of(dataset, split))
-        clean = read_image(examination.root / frame.filename)
+        clean_image = read_image(examination.root / frame.filename)
         for spec in [None, *specs]:
-            monitored, image = MonitoredDetector(detector), clean
+            monitored, image = MonitoredDetector(detector), clean_image
             if spec is not None:
                 recorded = recorded_scene(examination, dataset, SceneCondition(scene.record.name))
                 (image,) = SceneAttacker(spec, recorded, monitored).look([frame])
@@ -49,30 +49,30 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
             title = "clean" if spec is None else f"{spec.attack}, loss {spec.loss}, {spec.radius:g} px {spec.norm}"
             title += f", {spec.target}" if spec and spec.target else ""
             detection_tile = tile((monitored, examination.device), scene, frame, image, title="what it finds")
-            change = magnified(image, clean)
+            change = magnified(image, clean_image)
             rows.append(
                 np.concatenate([_shrunk(image, title), _shrunk(change, "change, magnified"), detection_tile], 1)
             )
     return np.concatenate(rows)
 
 
-def magnified(picture: U8, clean: U8) -> U8:
+def magnified(image: U8, clean_image: U8) -> U8:
     """The change of a picture around middle grey, its largest value made black or white.
 
     Args:
-        picture: [H, W, 3].
-        clean: [H, W, 3].
+        image: [H, W, 3].
+        clean_image: [H, W, 3].
 
     Returns:
         [H, W, 3].
     """
-    change = picture.astype(np.float64) - clean
-    return np.asarray(np.rint(127.5 + 127.5 * change / max(float(np.abs(change).max()), 1.0)), np.uint8)
+    difference = image.astype(np.float64) - clean_image
+    return np.asarray(np.rint(127.5 + 127.5 * difference / max(float(np.abs(difference).max()), 1.0)), np.uint8)
 
 
-def _shrunk(picture: U8, title: str) -> U8:
+def _shrunk(image: U8, title: str) -> U8:
     """A picture at the width of a tile, with its name; not averaged, so that noise stays noise."""
-    size = (WIDTH, round(picture.shape[0] * WIDTH / picture.shape[1]))
-    canvas = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST))
+    size = (WIDTH, round(image.shape[0] * WIDTH / image.shape[1]))
+    canvas = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
     title_on(canvas, title)
     return canvas

@@ -29,7 +29,7 @@ from ssad.experiments.perception.digital.points import (
     transfers_of,
 )
 from ssad.experiments.perception.digital.verdict import verdict
-from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow
+from ssad.experiments.perception.open_loop import CellDescription, DetectorSuite, OpenLoopKind
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition
 from ssad.experiments.perception.scored_data import Victims, detectors_of
 from ssad.report.load import Run
@@ -86,9 +86,9 @@ class Digital(OpenLoopKind):
     def victims(self, suite: DigitalSuite) -> Victims:
         """Return all detectors of the suite."""
         names = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
-        return detectors_of(suite.name, names, flat=True)
+        return detectors_of(suite.name, names, allow_2d=True)
 
-    def rows(self, suite: DigitalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+    def rows(self, suite: DigitalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield the attacks on each detector, and the images that are made against others."""
         points = points_of(suite)
         main_detectors, hardened_detectors = (
@@ -99,7 +99,9 @@ class Digital(OpenLoopKind):
                 candidate for candidate in victims.files if candidate not in (detector, *hardened_detectors)
             ]
             transferred_points = [
-                replace(one, source=candidate) for one in transfers_of(suite) for candidate in transfer_sources
+                replace(transfer_point, source=candidate)
+                for transfer_point in transfers_of(suite)
+                for candidate in transfer_sources
             ]
             entries = [*(points if detector in main_detectors else bystander_points(suite)), *transferred_points]
             for point in hardened_points(suite) if detector in hardened_detectors else entries:
@@ -108,9 +110,13 @@ class Digital(OpenLoopKind):
                 title = f"{system}/{point.attack}{f'@{source}' if point.specs and source != system else ''}"
                 title += f"/{point.scenes}" if point.scenes else ""
                 inputs = [safeio.dump_json(data), *([victims.weights[point.source]] if point.source else [])]
-                spec = {"attacks": [one.row for one in point.specs], "source": source, "scenes": point.scenes}
+                spec = {
+                    "attacks": [transfer_point.row for transfer_point in point.specs],
+                    "source": source,
+                    "scenes": point.scenes,
+                }
                 fields = {"detector": detector, **point.fields, "task": victims.tasks[detector]}
-                yield TableRow(title, system, fields, spec, inputs)
+                yield CellDescription(title, system, fields, spec, inputs)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Prepare as `OpenLoopKind` does, and print how many gradients the suite takes."""

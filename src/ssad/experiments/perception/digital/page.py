@@ -39,12 +39,12 @@ from ssad.experiments.perception.digital.tables import (
 from ssad.experiments.perception.shifts.page import CLASSES, interval_note, replicates_of
 from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit
 from ssad.report.artefacts import pictures
-from ssad.report.figures import Panel, Point, panels
+from ssad.report.figures import CurvePoint, Panel, panels
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import DETECTORS, DIGITAL_STEPS
 from ssad.report.paper import DIGITAL as PUBLISHED
-from ssad.report.tables import Cell, Row, Table
+from ssad.report.tables import Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -68,7 +68,7 @@ def published_scores(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str]
     """Return the paper's row beside one of ours: attack and budget, and its scores by column; None: it has none."""
     attack, loss, norm, radius, _, options = setting[:6]
     published_attack = PAPER.get((attack, loss))
-    options = " ".join(word for word in options.split() if not word.startswith("precision="))
+    options = " ".join(option for option in options.split() if not option.startswith("precision="))
     if (
         published_attack is None
         or not run.suite.get("reference")
@@ -102,9 +102,9 @@ def score_columns(run: DigitalRun) -> dict[tuple[str, str], str]:
 def main_table(run: DigitalRun) -> Table:
     """Return attack x detector: mAP and NDS, the paper's rows between ours."""
 
-    def published(setting: Setting) -> list[Row]:
-        found = published_scores(run, setting)
-        return [Row.of_published(*found)] if found else []
+    def published(setting: Setting) -> list[TableRow]:
+        published_row = published_scores(run, setting)
+        return [TableRow.of_published(*published_row)] if published_row else []
 
     note = f"Percent; each camera image is attacked by itself, its stored 8-bit picture is scored; {interval_note(run)}"
     note += run.about_flat
@@ -130,12 +130,12 @@ def lost_table(run: DigitalRun) -> Table:
     """Return attack x detector: the share of the clean score that is lost, the paper's shares between ours."""
     clean = published_scores(run, Setting())
 
-    def published(setting: Setting) -> list[Row]:
+    def published(setting: Setting) -> list[TableRow]:
         attacked = published_scores(run, setting)
         if attacked is None or clean is None:
             return []
         pairs = zip(attacked[1], clean[1], strict=True)
-        return [Row.of_published(attacked[0], [100 * (1 - score / clean_score) for score, clean_score in pairs])]
+        return [TableRow.of_published(attacked[0], [100 * (1 - score / clean_score) for score, clean_score in pairs])]
 
     return Table.listing(
         "lost",
@@ -153,10 +153,12 @@ def lost_table(run: DigitalRun) -> Table:
 def effort_table(run: DigitalRun) -> Table:
     """Return the cost of each attack, and its effect on the loss that it ascends."""
 
-    def metric(row: DetectorSetting, name: str) -> Cell:
+    def metric(row: DetectorSetting, name: str) -> TableCell:
         value = run.records[row].get(name)
         scale = 100 if name in ("used", "gradient_error") else 1
-        return Cell.value(None if value is None else float(value) * scale, digits=0 if name in ("idle", "batch") else 2)
+        return TableCell.value(
+            None if value is None else float(value) * scale, digits=0 if name in ("idle", "batch") else 2
+        )
 
     def direct(row: DetectorSetting) -> bool:
         setting = row[1]
@@ -191,9 +193,9 @@ def short_of(run: DigitalRun) -> str:
 def every_table(run: DigitalRun) -> Table:
     """Return every cell."""
 
-    def metric(row: DetectorSetting, name: str) -> Cell:
+    def metric(row: DetectorSetting, name: str) -> TableCell:
         if name == "lost":
-            return lost_cell(run, *row, "mAP") if row[1].attack else Cell.value(None)
+            return lost_cell(run, *row, "mAP") if row[1].attack else TableCell.value(None)
         return metric_cell(run.record(*row), name)
 
     return Table.listing(
@@ -225,17 +227,17 @@ def attempts_of(run: DigitalRun) -> list[Attempt]:
     attempts = []
     for (detector, setting), record in run.records.items():
         attack, loss, norm, radius, steps, options = setting[:6]
-        clean = run.clean(detector, setting)
-        if not attack or record["status"] != "ok" or clean is None:
+        clean_record = run.clean(detector, setting)
+        if not attack or record["status"] != "ok" or clean_record is None:
             continue
-        unaware = bool(setting.defence) and not setting.aware
+        is_unaware = bool(setting.defence) and not setting.aware
         group = [defence_of(setting), setting.target, scenes_of(setting) if setting.subset else ""]
         attempts.append(
             Attempt(
                 detector,
                 attack,
                 float(record["metrics"]["mAP"]),
-                float(clean["metrics"]["mAP"]),
+                float(clean_record["metrics"]["mAP"]),
                 loss,
                 norm,
                 radius,
@@ -249,7 +251,7 @@ def attempts_of(run: DigitalRun) -> list[Attempt]:
                 record["coupling"],
                 record["used"],
                 record["change_px"],
-                setting.source or ("the bare detector" if unaware else ""),
+                setting.source or ("the bare detector" if is_unaware else ""),
                 ", ".join(filter(None, group)),
             )
         )
@@ -281,17 +283,17 @@ def audit_table(verdict: Verdict) -> Table:
         RULES,
         rows={"Rule": lambda rule: RULES[rule][0]},
         columns={"comparisons": "comparisons", "faults": "faults"},
-        metric=lambda rule, column: Cell(faults[rule] if column == "faults" else verdict.compared[rule], digits=0),
+        metric=lambda rule, column: TableCell(faults[rule] if column == "faults" else verdict.compared[rule], digits=0),
         note=" ".join([verdict.text, *(f"{fault.detector}: {fault.text}." for fault in verdict.faults)]),
     )
 
 
-def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP") -> str:
+def curves(run: DigitalRun, axis: Literal["radius", "steps"], metric: str = "mAP") -> str:
     """Plot a metric for each attack that ran over several radii or step counts, a line a detector; as SVG.
 
     Args:
         run: The run.
-        what: Swept parameter.
+        axis: Swept parameter.
         metric: Name.
 
     Returns:
@@ -299,9 +301,9 @@ def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP
     """
     groups: dict[Setting, set[float]] = {}
     for setting in run.settings:
-        value = setting[3] if what == "radius" else setting[4]
-        if setting.plain and setting.attack not in ("", "noise", "ensemble") and (what == "steps" or value <= FURTHEST):
-            groups.setdefault(_at(setting, what, 0), set()).add(value)
+        value = setting[3] if axis == "radius" else setting[4]
+        if setting.plain and setting.attack not in ("", "noise", "ensemble") and (axis == "steps" or value <= FURTHEST):
+            groups.setdefault(_setting_at(setting, axis, 0), set()).add(value)
     plots = []
     for group, values in groups.items():
         if len(values) < 2:
@@ -310,36 +312,36 @@ def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP
         lines = []
         for detector in run.detectors:
             records = [
-                run.record(detector, _at(group, what, axis_value)) if axis_value else run.clean(detector, group)
+                run.record(detector, _setting_at(group, axis, axis_value)) if axis_value else run.clean(detector, group)
                 for axis_value in axis_values
             ]
             lines.append(
                 [
-                    Point(value / axis_values[-1], metric_cell(record, metric), f"{detector}, {what} {value:g}")
+                    CurvePoint(value / axis_values[-1], metric_cell(record, metric), f"{detector}, {axis} {value:g}")
                     for value, record in zip(axis_values, records, strict=True)
                 ]
             )
-        ticks = [(value / axis_values[-1], f"{value:g}") for value in _apart(axis_values)]
-        plots.append(Panel(f"{title_of(group)}; {_rest(group, what)}", ticks, lines))
-    return panels(plots, label=f"{metric} over {what}", columns=3) if plots else ""
+        ticks = [(value / axis_values[-1], f"{value:g}") for value in _spread_values(axis_values)]
+        plots.append(Panel(f"{title_of(group)}; {_curve_title(group, axis)}", ticks, lines))
+    return panels(plots, label=f"{metric} over {axis}", columns=3) if plots else ""
 
 
-def _at(setting: Setting, what: Literal["radius", "steps"], value: float) -> Setting:
+def _setting_at(setting: Setting, axis: Literal["radius", "steps"], value: float) -> Setting:
     """Return a setting with another radius, or other steps."""
-    return setting._replace(radius=float(value)) if what == "radius" else setting._replace(steps=int(value))
+    return setting._replace(radius=float(value)) if axis == "radius" else setting._replace(steps=int(value))
 
 
-def _rest(setting: Setting, what: str) -> str:
+def _curve_title(setting: Setting, axis: str) -> str:
     """Return the fixed parameters of a curve: steps, or radius; and its scenes."""
     steps = setting.steps
-    fixed = f"{steps} step{'s' if steps != 1 else ''}" if what == "radius" else f"{setting.radius:g} px"
+    fixed_text = f"{steps} step{'s' if steps != 1 else ''}" if axis == "radius" else f"{setting.radius:g} px"
     scene_text = f"scenes: {scenes_of(setting)}" if setting.subset else ""
     return ", ".join(
-        part for part in [fixed, "L2" if setting.norm == "l2" else "", setting.options, scene_text] if part
+        part for part in [fixed_text, "L2" if setting.norm == "l2" else "", setting.options, scene_text] if part
     )
 
 
-def _apart(values: Sequence[float]) -> list[float]:
+def _spread_values(values: Sequence[float]) -> list[float]:
     """Return those of increasing values that can be written side by side along an axis, including the last."""
     spaced: list[float] = []
     for value in values[:-1]:
@@ -357,16 +359,20 @@ def tiles(run: DigitalRun) -> list[dict[str, Any]]:
             for setting in run.rows
             if setting.attack not in ("", "noise") and not setting.target and (record := run.record(detector, setting))
         ]
-        strongest = min(attack_scores)[1] if attack_scores else None
-        clean = run.clean(detector)
+        strongest_attack = min(attack_scores)[1] if attack_scores else None
+        clean_record = run.clean(detector)
         entries.append(
             {
                 "name": detector,
-                "mAP": metric_cell(clean, "mAP"),
-                "NDS": metric_cell(clean, "NDS"),
-                "worst": f"{title_of(strongest)}; {size_of(strongest)}" if strongest else "no attack ran",
-                "left": metric_cell(run.record(detector, strongest), "mAP") if strongest else Cell(math.nan),
-                "lost": lost_cell(run, detector, strongest, "mAP") if strongest else Cell(math.nan),
+                "mAP": metric_cell(clean_record, "mAP"),
+                "NDS": metric_cell(clean_record, "NDS"),
+                "worst": f"{title_of(strongest_attack)}; {size_of(strongest_attack)}"
+                if strongest_attack
+                else "no attack ran",
+                "left": metric_cell(run.record(detector, strongest_attack), "mAP")
+                if strongest_attack
+                else TableCell(math.nan),
+                "lost": lost_cell(run, detector, strongest_attack, "mAP") if strongest_attack else TableCell(math.nan),
             }
         )
     return entries
@@ -388,13 +394,13 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
     main_rows, losses, effort = main_table(run), lost_table(run), effort_table(run)
     all_cells, class_scores, audit_rows = every_table(run), class_table(run), audit_table(verdict)
     table_builders = (transfer_table, defence_table, hardened_table, black_box_table, target_table, halving_table)
-    others = [table for build_table in table_builders if (table := build_table(run)).rows]
+    other_tables = [table for build_table in table_builders if (table := build_table(run)).rows]
     distances = distance_table(run)
     page = render(
         TEMPLATE,
         found,
         verdict=sentences,
-        others=others,
+        others=other_tables,
         distances=distances,
         main=main_rows,
         lost=losses,
@@ -416,4 +422,4 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
             if record["status"] != "ok"
         ],
     )
-    return page, [main_rows, losses, *others, audit_rows, effort, all_cells, class_scores, distances]
+    return page, [main_rows, losses, *other_tables, audit_rows, effort, all_cells, class_scores, distances]

@@ -45,7 +45,7 @@ class Method(Schema):
     precision: Precision | None = None
 
 
-class Row(Method):
+class AttackRow(Method):
     """Attack with its settings.
 
     Attributes:
@@ -71,7 +71,7 @@ class Guard(Schema):
     options: dict[str, Any] = Field(default={})
 
 
-class Entry(Row):
+class AttackEntry(AttackRow):
     """Row of a table.
 
     Attributes:
@@ -92,7 +92,7 @@ class Entry(Row):
     classes: list[str] = Field(default=[])
     becomes: dict[str, str] = Field(default={})
     object: Annotated[str, Field(min_length=1)] | None = None
-    members: list[Row] = Field(default=[])
+    members: list[AttackRow] = Field(default=[])
 
     @field_validator("defence", "members", mode="before")
     @classmethod
@@ -137,12 +137,17 @@ class AttackTable(Schema):
     """
 
     name: str
-    attacks: list[Entry] = Field(
-        default=[Entry(name="fgsm"), Entry(name="pgd"), Entry(name="cw"), Entry(name="pgd", loss="margin")],
+    attacks: list[AttackEntry] = Field(
+        default=[
+            AttackEntry(name="fgsm"),
+            AttackEntry(name="pgd"),
+            AttackEntry(name="cw"),
+            AttackEntry(name="pgd", loss="margin"),
+        ],
         min_length=1,
     )
     sweeps: list[Sweep] = Field(default=[])
-    transfer: list[Row] = Field(default=[])
+    transfer: list[AttackRow] = Field(default=[])
     radius: Radius = Field(default=5.0, gt=0.0)
     steps: Steps = 10
     batch: int = Field(default=12, ge=1)
@@ -169,7 +174,7 @@ class Guarded:
 
 
 @dataclass(frozen=True)
-class Point:
+class AttackPoint:
     """Condition of a system: the clean data, or attacks (several: the worst of them at each moment).
 
     Attributes:
@@ -196,7 +201,7 @@ class Point:
     @property
     def fields(self) -> dict[str, Any]:
         """Columns of a record that describe the condition."""
-        common = {
+        common_fields = {
             "source": self.source,
             "defence": self.defence.text if self.defence else "",
             "aware": self.aware,
@@ -205,7 +210,7 @@ class Point:
         }
         if not self.specs:
             no_attack = dict.fromkeys(("attack", "loss", "norm"))
-            return {**no_attack, "radius": 0.0, "steps": 0, "options": "", "target": "", **common}
+            return {**no_attack, "radius": 0.0, "steps": 0, "options": "", "target": "", **common_fields}
         spec = self.specs[0]
         columns = {
             "attack": spec.attack,
@@ -215,7 +220,7 @@ class Point:
             "steps": spec.steps,
             "options": _options(spec),
             "target": spec.target,
-            **common,
+            **common_fields,
         }
         if len(self.specs) > 1:
             members = ", ".join(
@@ -227,11 +232,11 @@ class Point:
 
 
 def system_name(detector: str, guard: Guarded | None) -> str:
-    """What a detector behind a defence is called."""
+    """Return the name of a detector behind a defence."""
     return detector if guard is None else f"{detector}+{guard.text.replace(' ', '-')}"
 
 
-def guard_of(suite: AttackTable, entry: Entry) -> Guarded | None:
+def guard_of(suite: AttackTable, entry: AttackEntry) -> Guarded | None:
     """Return the defence of a row; it is built to check its options.
 
     Raises:
@@ -248,7 +253,7 @@ def guard_of(suite: AttackTable, entry: Entry) -> Guarded | None:
     return defence
 
 
-def rows_of(suite: AttackTable) -> list[Point]:
+def rows_of(suite: AttackTable) -> list[AttackPoint]:
     """Return the rows of the tables.
 
     Raises:
@@ -288,7 +293,7 @@ def rows_of(suite: AttackTable) -> list[Point]:
                 )
             specs = [spec]
         points.append(
-            Point(
+            AttackPoint(
                 tuple(specs),
                 defence,
                 bool(entry.aware),
@@ -302,7 +307,7 @@ def rows_of(suite: AttackTable) -> list[Point]:
     return points
 
 
-def points_of(suite: AttackTable) -> list[Point]:
+def points_of(suite: AttackTable) -> list[AttackPoint]:
     """Return all conditions of every detector, each once, without the transfer of attacks to other detectors.
 
     The clean data come first, then noise, rows and curves. Clean data on fewer scenes, or behind a defence, are
@@ -321,29 +326,29 @@ def points_of(suite: AttackTable) -> list[Point]:
     return _with_controls([*rows, *sweep_points, *undefended_points, *transfer_points])
 
 
-def _with_controls(points: Sequence[Point]) -> list[Point]:
+def _with_controls(points: Sequence[AttackPoint]) -> list[AttackPoint]:
     """Return the clean data and noise that points are compared with, and then the points, each once."""
     noise_points = [
         replace(point, specs=(AttackSpec("noise", default_loss("noise"), point.specs[0].norm, point.specs[0].radius),))
         for point in points
         if point.defence is None
     ]
-    clean_points = [Point(scenes=point.scenes, defence=point.defence) for point in points]
+    clean_points = [AttackPoint(scenes=point.scenes, defence=point.defence) for point in points]
     # A dict keeps the first of equal points in order; a set would not.
-    return list(dict.fromkeys([Point(row=True), *clean_points, *noise_points, *points]))
+    return list(dict.fromkeys([AttackPoint(row=True), *clean_points, *noise_points, *points]))
 
 
-def bystander_points(suite: AttackTable) -> list[Point]:
+def bystander_points(suite: AttackTable) -> list[AttackPoint]:
     """The conditions of a detector that takes part in the transfer alone: clean data, and the attacks made against it.
 
     Raises:
         ConfigError: An attack does not exist or refuses a setting.
     """
     transfer_points = transfers_of(suite)
-    return list(dict.fromkeys([*(Point(scenes=point.scenes) for point in transfer_points), *transfer_points]))
+    return list(dict.fromkeys([*(AttackPoint(scenes=point.scenes) for point in transfer_points), *transfer_points]))
 
 
-def hardened_points(suite: AttackTable) -> list[Point]:
+def hardened_points(suite: AttackTable) -> list[AttackPoint]:
     """The conditions of adversarially trained weights: clean data, noise, the main table, and the curves over radii.
 
     Raises:
@@ -353,13 +358,13 @@ def hardened_points(suite: AttackTable) -> list[Point]:
     return _with_controls([*(selected for selected in rows_of(suite) if selected.row), *_swept(suite, over_radii)])
 
 
-def transfers_of(suite: AttackTable) -> list[Point]:
+def transfers_of(suite: AttackTable) -> list[AttackPoint]:
     """Return the attacks whose images are shown to other detectors.
 
     Raises:
         ConfigError: An attack does not exist or refuses a setting.
     """
-    return [Point((_spec(suite, row, row.radius, row.steps),), scenes=row.scenes or 0) for row in suite.transfer]
+    return [AttackPoint((_spec(suite, row, row.radius, row.steps),), scenes=row.scenes or 0) for row in suite.transfer]
 
 
 def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int | None) -> AttackSpec:
@@ -392,7 +397,7 @@ def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int |
     return replace(spec, precision=method.precision or suite.precision) if uses_gradient else spec
 
 
-def _swept(suite: AttackTable, sweeps: Sequence[Sweep]) -> list[Point]:
+def _swept(suite: AttackTable, sweeps: Sequence[Sweep]) -> list[AttackPoint]:
     """Return the points of the curves; a radius of 0 is the clean data.
 
     Raises:
@@ -404,12 +409,12 @@ def _swept(suite: AttackTable, sweeps: Sequence[Sweep]) -> list[Point]:
             raise ConfigError(f"suite {suite.name}: sweeps: {sweep.name} has neither radii nor steps")
         specs = [_spec(suite, sweep, radius, None) for radius in sweep.radii if radius > 0]
         specs += [_spec(suite, sweep, None, steps) for steps in sweep.steps]
-        points += [Point((spec,), scenes=sweep.scenes or 0) for spec in specs]
+        points += [AttackPoint((spec,), scenes=sweep.scenes or 0) for spec in specs]
     return points
 
 
 def _options(spec: AttackSpec) -> str:
-    others = [(key, value) for key, value in spec.options if key != "steps"]
-    others += [("draws", spec.draws)] if spec.draws else []
-    others += [("precision", spec.precision)] if spec.precision != "float32" else []
-    return " ".join(f"{key}={value}" for key, value in others)
+    other_options = [(key, value) for key, value in spec.options if key != "steps"]
+    other_options += [("draws", spec.draws)] if spec.draws else []
+    other_options += [("precision", spec.precision)] if spec.precision != "float32" else []
+    return " ".join(f"{key}={value}" for key, value in other_options)

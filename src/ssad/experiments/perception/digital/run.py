@@ -11,7 +11,7 @@ from ssad.core.registry import label_of, split_weights
 from ssad.experiments.perception.shifts.page import cell_of, replicates_of
 from ssad.metrics import replicate_difference
 from ssad.report.load import Run
-from ssad.report.tables import Cell
+from ssad.report.tables import TableCell
 
 TITLES = {
     "fgsm": "FGSM",
@@ -99,7 +99,7 @@ class DigitalRun:
         return [(_called(name), _called(counterpart)) for name, counterpart in zip(names, counterparts, strict=True)]
 
     @property
-    def everyone(self) -> list[str]:
+    def all_detectors(self) -> list[str]:
         """Detectors of the table, and those that take part in the transfer alone."""
         transfer_detectors = [_called(text) for text in self.suite.get("transfer_detectors", [])]
         return [*self.detectors, *transfer_detectors]
@@ -115,7 +115,7 @@ class DigitalRun:
     @property
     def about_flat(self) -> str:
         """Remark on 2D detectors for notes; "" where there is none."""
-        names = [name for name in self.everyone if self.flat(name)]
+        names = [name for name in self.all_detectors if self.flat(name)]
         if not names:
             return ""
         return f" mAP of {' and '.join(names)}: AP50 of 2D boxes in the images, mean over the classes that are there."
@@ -135,9 +135,9 @@ class DigitalRun:
         candidate = self.records.get((detector, setting))
         return candidate if candidate is not None and candidate["status"] == "ok" else None
 
-    def clean(self, detector: str, like: Setting | None = None) -> Mapping[str, Any] | None:
+    def clean(self, detector: str, setting: Setting | None = None) -> Mapping[str, Any] | None:
         """Return the record of the clean data, of the scenes and behind the defence of a setting."""
-        defence, subset = like.system if like else ("", 0)
+        defence, subset = setting.system if setting else ("", 0)
         return self.record(detector, Setting(defence=defence, subset=subset))
 
 
@@ -217,39 +217,53 @@ def circumstances(setting: Setting) -> str:
     return ", ".join(part for part in [*parts, awareness if setting.defence else ""] if part)
 
 
-def metric_cell(record: Mapping[str, Any] | None, metric: str) -> Cell:
+def metric_cell(record: Mapping[str, Any] | None, metric: str) -> TableCell:
     """Return a metric in percent with its interval over the record's own scenes; n/a where there is none."""
-    return Cell(math.nan) if record is None else cell_of(Resampling(int(record.get("scenes", 0))), record, metric)
+    return TableCell(math.nan) if record is None else cell_of(Resampling(int(record.get("scenes", 0))), record, metric)
 
 
-def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> Cell:
+def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> TableCell:
     """Return the share of the clean score that an attack removed, percent; the interval from paired replicates.
 
     A score that more than doubled has no interval.
     """
-    clean, attacked = run.clean(detector, setting), run.record(detector, setting)
-    if clean is None or attacked is None or not clean["metrics"].get(metric) or attacked["metrics"].get(metric) is None:
-        return Cell(math.nan)
-    pairs = zip(replicates_of(clean, metric), replicates_of(attacked, metric), strict=True)
-    value = 1.0 - attacked["metrics"][metric] / clean["metrics"][metric]
+    clean_record, attacked = run.clean(detector, setting), run.record(detector, setting)
+    if (
+        clean_record is None
+        or attacked is None
+        or not clean_record["metrics"].get(metric)
+        or attacked["metrics"].get(metric) is None
+    ):
+        return TableCell(math.nan)
+    pairs = zip(replicates_of(clean_record, metric), replicates_of(attacked, metric), strict=True)
+    value = 1.0 - attacked["metrics"][metric] / clean_record["metrics"][metric]
     if value < -1.0:  # else it lies in [-1, 1], as a difference of two scores does
-        return Cell(100.0 * value)
-    return _difference(value, [1.0 - after / before for before, after in pairs if before > 0], attacked)
-
-
-def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> Cell:
-    """Return how much higher the first of two detectors scores, in points; the interval from paired replicates."""
-    first, second = (run.record(name, setting) for name in detectors)
-    if first is None or second is None or first["metrics"].get(metric) is None or second["metrics"].get(metric) is None:
-        return Cell(math.nan)
-    pairs = zip(replicates_of(first, metric), replicates_of(second, metric), strict=True)
+        return TableCell(100.0 * value)
     return _difference(
-        first["metrics"][metric] - second["metrics"][metric],
-        [first_score - second_score for first_score, second_score in pairs],
-        first,
+        value,
+        [1.0 - attacked_score / clean_score for clean_score, attacked_score in pairs if clean_score > 0],
+        attacked,
     )
 
 
-def _difference(value: float, replicates: Sequence[float], record: Mapping[str, Any]) -> Cell:
+def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> TableCell:
+    """Return how much higher the first of two detectors scores, in points; the interval from paired replicates."""
+    first_record, second_record = (run.record(name, setting) for name in detectors)
+    if (
+        first_record is None
+        or second_record is None
+        or first_record["metrics"].get(metric) is None
+        or second_record["metrics"].get(metric) is None
+    ):
+        return TableCell(math.nan)
+    pairs = zip(replicates_of(first_record, metric), replicates_of(second_record, metric), strict=True)
+    return _difference(
+        first_record["metrics"][metric] - second_record["metrics"][metric],
+        [first_score - second_score for first_score, second_score in pairs],
+        first_record,
+    )
+
+
+def _difference(value: float, replicates: Sequence[float], record: Mapping[str, Any]) -> TableCell:
     interval = replicate_difference(value, replicates, n=record["n"], clusters=int(record.get("scenes", 0)))
-    return Cell.of(interval.scaled(100.0))
+    return TableCell.of(interval.scaled(100.0))

@@ -18,7 +18,7 @@ from ssad.experiments.perception.digital.run import (
     size_of,
     title_of,
 )
-from ssad.report.tables import Cell, Table
+from ssad.report.tables import Table, TableCell
 
 FURTHEST = 32.0  # radius up to which curves are shown: what lies beyond is for the audit
 BANDS = {"0-20": "0 to 20 m", "20-40": "20 to 40 m", "40+": "beyond 40 m"}
@@ -44,7 +44,7 @@ def transfer_table(run: DigitalRun) -> Table:
     """For each attack a matrix: mAP of the detector in the column under pictures made against that in the row."""
     white_boxes = dict.fromkeys(setting._replace(source="") for setting in run.settings if setting.source)
 
-    def metric(row: tuple[str, Setting], detector: str) -> Cell:
+    def metric(row: tuple[str, Setting], detector: str) -> TableCell:
         source, white_box = row
         if not source:
             return metric_cell(run.clean(detector, white_box), "mAP")
@@ -54,12 +54,12 @@ def transfer_table(run: DigitalRun) -> Table:
     return Table.listing(
         "transfer",
         "Transfer between detectors",
-        [(source, white_box) for white_box in white_boxes for source in ("", *run.everyone)],
+        [(source, white_box) for white_box in white_boxes for source in ("", *run.all_detectors)],
         rows={
             **{head: partial(_of_setting, factor) for head, factor in (ATTACK | SCENES).items()},
             "Made against": lambda row: row[0] or "nothing: clean",
         },
-        columns={detector: detector for detector in run.everyone},
+        columns={detector: detector for detector in run.all_detectors},
         metric=metric,
         note="mAP in percent. Where row and column are of one detector the attack is white-box; elsewhere nothing was "
         f"asked of the detector that is shown the pictures.{run.about_flat}",
@@ -71,16 +71,16 @@ def defence_table(run: DigitalRun) -> Table:
     defended_settings: dict[tuple[str, Setting], dict[bool, Setting]] = {}
     for setting in run.settings:
         if setting.defence and setting.attack:
-            bare = setting._replace(defence="", aware=False, options=_without_draws(setting.options))
-            defended_settings.setdefault((setting.defence, bare), {})[setting.aware] = setting
+            bare_setting = setting._replace(defence="", aware=False, options=_without_draws(setting.options))
+            defended_settings.setdefault((setting.defence, bare_setting), {})[setting.aware] = setting
 
-    def metric(row: tuple[str, tuple[str, Setting]], column: str) -> Cell:
+    def metric(row: tuple[str, tuple[str, Setting]], column: str) -> TableCell:
         detector, defence = row
-        bare, by_awareness = defence[1], defended_settings[defence]
+        bare_setting, by_awareness = defence[1], defended_settings[defence]
         if column in ("clean", "defended"):
-            like = bare if column == "clean" else next(iter(by_awareness.values()))
-            return metric_cell(run.clean(detector, like), "mAP")
-        attacked = bare if column == "attacked" else by_awareness.get(column == "aware")
+            sample_setting = bare_setting if column == "clean" else next(iter(by_awareness.values()))
+            return metric_cell(run.clean(detector, sample_setting), "mAP")
+        attacked = bare_setting if column == "attacked" else by_awareness.get(column == "aware")
         return metric_cell(run.record(detector, attacked) if attacked else None, "mAP")
 
     return Table.listing(
@@ -118,7 +118,7 @@ def hardened_table(run: DigitalRun) -> Table:
     """Return adversarially trained weights beside ordinary ones, on the same images: their cost and their gain."""
     ordinary = dict(run.hardened)
 
-    def metric(row: DetectorSetting, column: str) -> Cell:
+    def metric(row: DetectorSetting, column: str) -> TableCell:
         name, setting = row
         if column == "difference":
             return gained_cell(run, (name, ordinary[name]), setting, "mAP")
@@ -148,10 +148,10 @@ def black_box_table(run: DigitalRun) -> Table:
         attacked = setting.plain and setting.attack not in ("", "noise")
         return attacked and record["status"] == "ok" and record["access"] != "white-box"
 
-    def metric(row: DetectorSetting, column: str) -> Cell:
+    def metric(row: DetectorSetting, column: str) -> TableCell:
         detector, setting = row
         if column == "queries":
-            return Cell(float(run.records[row]["queries"] or 0), digits=0)
+            return TableCell(float(run.records[row]["queries"] or 0), digits=0)
         if column == "clean":
             return metric_cell(run.clean(detector, setting), "mAP")
         noise = Setting("noise", norm=setting.norm, radius=setting.radius, subset=setting.subset)
@@ -172,13 +172,13 @@ def black_box_table(run: DigitalRun) -> Table:
 def target_table(run: DigitalRun) -> Table:
     """Return how often targeted attacks reach their target."""
 
-    def metric(row: DetectorSetting, name: str) -> Cell:
+    def metric(row: DetectorSetting, name: str) -> TableCell:
         if name == "mAP":
             return metric_cell(run.records[row], name)
         value = run.records[row]["metrics"].get(name)
         if name == "targets":
-            return Cell.value(value, digits=0)
-        return Cell.value(None if value is None else 100 * value)
+            return TableCell.value(value, digits=0)
+        return TableCell.value(None if value is None else 100 * value)
 
     return Table.listing(
         "targets",
@@ -207,7 +207,7 @@ def halving_table(run: DigitalRun) -> Table:
         if setting.plain and setting.attack not in ("", "noise", "ensemble"):
             radii.setdefault(setting._replace(radius=0.0), set()).add(setting.radius)
 
-    def metric(group: Setting, column: tuple[str, str]) -> Cell:
+    def metric(group: Setting, column: tuple[str, str]) -> TableCell:
         detector, quantity = column
         records = {0.0: run.clean(detector, group)}
         records |= {radius: run.record(detector, group._replace(radius=radius)) for radius in sorted(radii[group])}
@@ -215,7 +215,7 @@ def halving_table(run: DigitalRun) -> Table:
             return metric_cell(records.get(1.0), "mAP")
         curve = [(radius, record["metrics"]["mAP"]) for radius, record in records.items() if record]
         # interpolation over a radius that has not run would mislead
-        return Cell(halving(curve if len(curve) == len(records) else []))
+        return TableCell(halving(curve if len(curve) == len(records) else []))
 
     return Table.listing(
         "halving",
@@ -245,10 +245,10 @@ def halving(curve: Sequence[tuple[float, float]]) -> float:
     Returns:
         On straight lines between the points; NaN if it never falls so far, or the first score is 0.
     """
-    half = curve[0][1] / 2 if curve else 0.0
-    for (low, before), (high, after) in pairwise(curve):
-        if after <= half < before:
-            return low + (before - half) / (before - after) * (high - low)
+    half_score = curve[0][1] / 2 if curve else 0.0
+    for (lower, score_before), (upper, score_after) in pairwise(curve):
+        if score_after <= half_score < score_before:
+            return lower + (score_before - half_score) / (score_before - score_after) * (upper - lower)
     return math.nan
 
 

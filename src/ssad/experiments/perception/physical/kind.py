@@ -14,7 +14,7 @@ from ssad.core.protocols import Detector
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources, SuiteBase, find_cell
 from ssad.engine.progress import Live
-from ssad.experiments.perception.open_loop import OpenLoopKind, Sightings, TableRow, TargetCondition
+from ssad.experiments.perception.open_loop import CellDescription, OpenLoopKind, Sightings, TargetCondition
 from ssad.experiments.perception.physical import page
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_attacks import SearchedLight, TargetAttacks, TrainedTexture, see_all
@@ -82,7 +82,7 @@ class Physical(OpenLoopKind):
     def victims(self, suite: PhysicalSuite) -> Victims:
         """Return the detectors and judges of the suite."""
         entries, target = [*suite.detectors, *suite.judges], target_of(suite)
-        victims = detectors_of(suite.name, entries, flat=True, scenes=False, targets=[target])
+        victims = detectors_of(suite.name, entries, allow_2d=True, scenes=False, targets=[target])
         for name, file in victims.files.items():
             if file:
                 raise ConfigError(f"suite {suite.name}: {name}={file}: this suite takes shipped weights only")
@@ -92,7 +92,7 @@ class Physical(OpenLoopKind):
                 )
         return victims
 
-    def rows(self, suite: PhysicalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+    def rows(self, suite: PhysicalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield the rows of the table; check the recordings."""
         for row in rows_of(suite):
             source = row.spec.get("light", row.spec).get("source", "")

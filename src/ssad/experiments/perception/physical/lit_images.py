@@ -128,7 +128,7 @@ def lit_clips(
         folder,
         split=split,
         device=device,
-        only=file_names,
+        selected_keys=file_names,
         hour=lambda weather, heading: at_hour(weather, hour, heading),
         stages=stages,
     ):

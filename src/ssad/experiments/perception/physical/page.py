@@ -17,7 +17,7 @@ from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import PHYSICAL as PUBLISHED
 from ssad.report.records import Line, field
-from ssad.report.tables import Cell, Row, Table
+from ssad.report.tables import Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -122,7 +122,7 @@ def _attack(name: str) -> str:
     return f"{TITLES.get(prefix, prefix)}{separator}{remainder}"
 
 
-def score(lines: Sequence[Line], metric: str) -> Cell:
+def score(lines: Sequence[Line], metric: str) -> TableCell:
     """Return a metric in percent, the mean over draws of a control, with its interval.
 
     The interval is over drives; of several draws it goes from the lowest to the highest end of theirs, so that it
@@ -130,16 +130,16 @@ def score(lines: Sequence[Line], metric: str) -> Cell:
     """
     measured = [line for line in lines if line["metrics"].get(metric) is not None]
     if not measured:
-        return Cell(math.nan)
+        return TableCell(math.nan)
     percentages = [100.0 * float(line["metrics"][metric]) for line in measured]
     mean, count = math.fsum(percentages) / len(percentages), int(measured[0]["n"])
     limits = [interval for line in measured if (interval := (line.get("intervals") or {}).get(metric))]
     # A draw without an interval has too few drives: only the spread of the draws is known.
     if len(limits) < len(measured) > 1:
-        return Cell(mean, min(percentages), max(percentages), count, clusters=len(percentages), method="range")
+        return TableCell(mean, min(percentages), max(percentages), count, clusters=len(percentages), method="range")
     low = 100.0 * min((float(interval[0]) for interval in limits), default=math.nan)
     high = 100.0 * max((float(interval[1]) for interval in limits), default=math.nan)
-    return Cell(mean, low, high, count, clusters=int(measured[0]["drives"]), method="given")
+    return TableCell(mean, low, high, count, clusters=int(measured[0]["drives"]), method="given")
 
 
 def main_table(run: PhysicalRun, number: int) -> Table:
@@ -156,7 +156,7 @@ def main_table(run: PhysicalRun, number: int) -> Table:
     scores = {metric: title for metric, title in SCORES.items() if metric in measured or metric != "ASR_any_25"}
     columns = {(d, metric): f"{d} {title}" for d in run.detectors for metric, title in scores.items()}
 
-    def published(attack: tuple[str, str]) -> list[Row]:
+    def published(attack: tuple[str, str]) -> list[TableRow]:
         if not published_town or attack not in PAPER or not any(names.values()):
             return []
         cells = PUBLISHED[published_town][PAPER[attack]]
@@ -165,7 +165,7 @@ def main_table(run: PhysicalRun, number: int) -> Table:
             for detector, name in names.items()
             for metric, number in zip(("AP50", "ASR_25"), cells.get(name, (None, None)), strict=True)
         }
-        return [Row.of_published((f"{PAPER[attack]}, {published_town}",), map(published_scores.get, columns))]
+        return [TableRow.of_published((f"{PAPER[attack]}, {published_town}",), map(published_scores.get, columns))]
 
     note = (
         f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
@@ -205,7 +205,7 @@ def _place(suite: Mapping[str, Any]) -> str:
 
 def margin_table(run: PhysicalRun) -> Table:
     """Return each trained texture against the draw of a control of its carrier that comes nearest to it."""
-    nearest: dict[tuple[str, str, tuple[str, str]], tuple[Cell, tuple[str, str]]] = {}
+    nearest: dict[tuple[str, str, tuple[str, str]], tuple[TableCell, tuple[str, str]]] = {}
     for (_, test), detector, attack in product(run.pairs, run.detectors, run.attacks):
         name, carrier = attack
         attack_lines = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
@@ -218,7 +218,7 @@ def margin_table(run: PhysicalRun) -> Table:
         if differences:
             nearest[test, detector, attack] = min(differences, key=lambda candidate: lower(candidate[0]))
 
-    def metric(row: tuple[str, str, tuple[str, str]], column: str) -> Cell:
+    def metric(row: tuple[str, str, tuple[str, str]], column: str) -> TableCell:
         test, detector, attack = row
         difference, control = nearest[row]
         if column == "difference":
@@ -252,7 +252,7 @@ def learns_nothing(control: str, attack: str) -> bool:
     return prefix in CONTROLS and (prefix != "random" or remainder in ("", attack.partition(", ")[0]))
 
 
-def lower(cell: Cell) -> float:
+def lower(cell: TableCell) -> float:
     """Return the lower end of a cell's interval, or its number."""
     return cell.mean if math.isnan(cell.low) else cell.low
 
@@ -287,7 +287,7 @@ def transfer_table(run: PhysicalRun) -> Table:
 def others_table(run: PhysicalRun) -> Table:
     """Return the other scores: at a higher confidence, and of the whole class."""
 
-    def metric(row: tuple[str, str, tuple[str, str]], name: str) -> Cell:
+    def metric(row: tuple[str, str, tuple[str, str]], name: str) -> TableCell:
         test, detector, attack = row
         lines = run.lines(test, "drive", detector, attack)
         return _difference(lines) if name == "delta_e" else score(lines, name)
@@ -309,10 +309,10 @@ def others_table(run: PhysicalRun) -> Table:
     )
 
 
-def _difference(lines: Sequence[Line]) -> Cell:
+def _difference(lines: Sequence[Line]) -> TableCell:
     """Return the colour difference of a texture to the paint that it covers, the mean over draws of a control."""
     differences = [float(line["delta_e"]) for line in lines if line.get("delta_e") is not None]
-    return Cell(math.fsum(differences) / len(differences)) if differences else Cell(math.nan)
+    return TableCell(math.fsum(differences) / len(differences)) if differences else TableCell(math.nan)
 
 
 def grid_table(run: PhysicalRun) -> Table:
@@ -327,11 +327,11 @@ def grid_table(run: PhysicalRun) -> Table:
         worst_cells = [line["worst"] for line in lines_by_row[row] if line["worst"]]
         return max(worst_cells, key=lambda candidate: candidate[2], default=None)
 
-    def metric(row: tuple[str, str, str, Shown], name: str) -> Cell:
+    def metric(row: tuple[str, str, str, Shown], name: str) -> TableCell:
         if name != "worst":
             return score(lines_by_row[row], name)
         worst = worst_cell(row)
-        return Cell.value(100 * worst[2] if worst else None)
+        return TableCell.value(100 * worst[2] if worst else None)
 
     return Table.listing(
         "grid",
@@ -364,7 +364,7 @@ def comparison_table(run: PhysicalRun) -> Table:
         strongest = min(attack_lines, key=lambda line: line["metrics"]["AP50"], default={})
         pairs += [(strongest, line) for line in attack_lines if line is not strongest]
 
-    def metric(pair: tuple[Line, Line], column: str) -> Cell:
+    def metric(pair: tuple[Line, Line], column: str) -> TableCell:
         strongest, other = pair
         if column == "difference":
             return paired_gap(other, strongest)
@@ -389,13 +389,13 @@ def comparison_table(run: PhysicalRun) -> Table:
     )
 
 
-def paired_gap(more: Line, less: Line) -> Cell:
+def paired_gap(more: Line, less: Line) -> TableCell:
     """Return the difference of the AP50 of two records in percent; its interval where both are of the same images."""
     difference, count, drives = more["metrics"]["AP50"] - less["metrics"]["AP50"], int(more["n"]), int(more["drives"])
     if (count, drives) != (less["n"], less["drives"]) or not (more.get("replicates") and less.get("replicates")):
-        return Cell(100.0 * difference)
+        return TableCell(100.0 * difference)
     pairs = zip(*(line["replicates"]["AP50"] for line in (more, less)), strict=False)
-    return Cell.of(
+    return TableCell.of(
         replicate_difference(difference, [first - second for first, second in pairs], n=count, clusters=drives).scaled(
             100.0
         )
@@ -418,7 +418,7 @@ def effort_table(run: PhysicalRun) -> Table:
             "Attack": lambda line: title_of((line["attack"], line["carrier"])),
         },
         columns={"epochs": "epochs", "loss_before": "loss in the first epoch", "loss_after": "in the last"},
-        metric=lambda lines, name: Cell(float(lines[-1][name])),
+        metric=lambda lines, name: TableCell(float(lines[-1][name])),
         note="The loss is ascended; means over the first and the last epoch, each picture with its own print and "
         "noise.",
     )
@@ -501,7 +501,7 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
                 for (name, clean_carrier), cell in scores.items()
                 if name == "clean" and f"{carrier}, ".startswith(f"{clean_carrier}, ")
             ),
-            next((cell for (name, _), cell in scores.items() if name == "clean"), Cell(math.nan)),
+            next((cell for (name, _), cell in scores.items() if name == "clean"), TableCell(math.nan)),
         )
         entries.append(
             {
@@ -509,7 +509,7 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
                 "town": test,
                 "clean": clean,
                 "worst": title_of(strongest) if strongest else "none has run",
-                "left": trained[strongest] if strongest else Cell(math.nan),
+                "left": trained[strongest] if strongest else TableCell(math.nan),
             }
         )
     return entries

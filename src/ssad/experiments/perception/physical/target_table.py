@@ -13,7 +13,7 @@ from pydantic import Field, field_validator, model_validator
 from ssad.core.errors import ConfigError
 from ssad.core.schema import Names, Schema
 from ssad.experiments.perception.digital.points import named
-from ssad.experiments.perception.open_loop import TableRow
+from ssad.experiments.perception.open_loop import CellDescription
 from ssad.recorders.nuscenes import WEATHERS
 from ssad.recorders.target_recording import AZIMUTHS, ELEVATIONS, Clips
 from ssad.rendering.camera.render import SceneWeather
@@ -226,7 +226,7 @@ class TargetTable(Schema):
         return found
 
 
-def rows_of(table: TargetTable) -> Iterator[TableRow]:
+def rows_of(table: TargetTable) -> Iterator[CellDescription]:
     """Yield all rows of a table: textures, each beside the clean images, then lights.
 
     Raises:
@@ -251,7 +251,7 @@ def rows_of(table: TargetTable) -> Iterator[TableRow]:
 
 def _texture_rows(  # noqa: PLR0917
     table: TargetTable, pair: Pair, view: str, detector: str, row: Mapping[str, Any], called: str
-) -> Iterator[TableRow]:
+) -> Iterator[CellDescription]:
     """A texture before a detector, from each detector that it is trained against, and with each seed."""
     attack = row["attack"]
     is_trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
@@ -273,10 +273,10 @@ def _texture_rows(  # noqa: PLR0917
         }
         title_parts = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
         title = "/".join(map(str, title_parts)) + (f"/{GRID}" if view == GRID else "")
-        yield TableRow(title, detector, fields, spec)
+        yield CellDescription(title, detector, fields, spec)
 
 
-def _light_rows(table: TargetTable) -> Iterator[TableRow]:
+def _light_rows(table: TargetTable) -> Iterator[CellDescription]:
     """Yield, for each hour, the clean images, then each light and its controls."""
     check_lights(table)
     for pair, detector in product(table.pairs, table.detectors):
@@ -306,7 +306,7 @@ def _light_rows(table: TargetTable) -> Iterator[TableRow]:
             }
             title_parts = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
             title = "/".join(map(str, title_parts))
-            yield TableRow(title, detector, fields, {"attack": None, "light": light})
+            yield CellDescription(title, detector, fields, {"attack": None, "light": light})
 
 
 def _title(table: TargetTable, row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:

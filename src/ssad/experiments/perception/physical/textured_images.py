@@ -261,7 +261,7 @@ def textured_clips(
     cache_folder = _kept_in(folder, layers, split)
     rows = clip_rows(folder, split)
     missing_files = {row["file_name"] for row, _ in rows if not (cache_folder / f"{row['file_name']}.npz").is_file()}
-    missing_views = clip_views(folder, split=split, device=device, only=missing_files)
+    missing_views = clip_views(folder, split=split, device=device, selected_keys=missing_files)
     for row, objects in rows:
         file = row["file_name"]
         if file in missing_files:
@@ -310,7 +310,7 @@ def see_clips(
     for cache_folder in cache_folders:
         safeio.make_folder(cache_folder)
     file_names = {row["file_name"] for row, _ in clip_rows(folder) if row["part"] == part}
-    for recorded in clip_views(folder, device=device, only=file_names):
+    for recorded in clip_views(folder, device=device, selected_keys=file_names):
         # All sets of layers in one pass: building the scene of a view costs more than rendering it.
         for cache_folder, layers in zip(cache_folders, variants, strict=True):
             if not (cache_folder / f"{recorded.file}.npz").is_file():

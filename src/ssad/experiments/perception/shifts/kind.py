@@ -12,7 +12,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.types import U8
 from ssad.engine.kind import Cell, Job, Names
-from ssad.experiments.perception.open_loop import DetectorSuite, OpenLoopKind, TableRow
+from ssad.experiments.perception.open_loop import CellDescription, DetectorSuite, OpenLoopKind
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition
 from ssad.experiments.perception.scored_data import Victims
 from ssad.experiments.perception.sheets import STRONG, detection_sheet
@@ -59,7 +59,7 @@ class Detection(OpenLoopKind):
         for name in suite.shifts:
             ShiftSpec(name, calibration=suite.calibration)
 
-    def rows(self, suite: DetectionSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[TableRow]:
+    def rows(self, suite: DetectionSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield the clean data, then each shift at each severity."""
         shifted = list(product(suite.shifts, suite.severities))
         for detector, (shift, severity) in product(victims.files, [(None, 0), *shifted]):
@@ -67,7 +67,7 @@ class Detection(OpenLoopKind):
             fields = {"detector": detector, "shift": shift, "family": family, "severity": severity}
             spec = {"calibration": suite.calibration, "labels": "original"}
             title = f"{detector}/{shift or 'clean'}/{severity}"
-            yield TableRow(title, detector, fields, spec, [safeio.dump_json(data)])
+            yield CellDescription(title, detector, fields, spec, [safeio.dump_json(data)])
 
     def versions(self, suite: DetectionSuite) -> dict[str, str]:
         """Return the version of the shifts."""

@@ -17,12 +17,12 @@ from ssad.metrics.intervals import MIN_CLUSTERS
 from ssad.metrics.rank import family_correlation
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
 from ssad.report.artefacts import pictures
-from ssad.report.figures import Panel, Point, panels
+from ssad.report.figures import CurvePoint, Panel, panels
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import DETECTORS
 from ssad.report.paper import SHIFTS as PUBLISHED
-from ssad.report.tables import Cell, Row, Table
+from ssad.report.tables import Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -107,19 +107,19 @@ def load_detection_run(run: Run) -> DetectionRun:
     return DetectionRun(run, records)
 
 
-def score_cell(run: Resampled, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> Cell:
+def score_cell(run: Resampled, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> TableCell:
     """Return a score in percent with its interval; all intervals of this page are made here."""
-    return Cell.of(replicate_estimate(value, replicates, n=n, clusters=run.scenes, bounded=bounded).scaled(100.0))
+    return TableCell.of(replicate_estimate(value, replicates, n=n, clusters=run.scenes, bounded=bounded).scaled(100.0))
 
 
-def cell_of(run: Resampled, record: Mapping[str, Any] | None, metric: str) -> Cell:
+def cell_of(run: Resampled, record: Mapping[str, Any] | None, metric: str) -> TableCell:
     """Return a metric in percent with its interval; n/a where there is none."""
     value = None if record is None else record["metrics"].get(metric)
     if record is None or value is None:
-        return Cell(math.nan)
+        return TableCell(math.nan)
     replicates, interval = replicates_of(record, metric), (record.get("intervals") or {}).get(metric)
     if not replicates and interval:
-        return Cell(100 * value, 100 * interval[0], 100 * interval[1], record["n"], method="given")
+        return TableCell(100 * value, 100 * interval[0], 100 * interval[1], record["n"], method="given")
     return score_cell(run, value, replicates, record["n"])
 
 
@@ -128,7 +128,7 @@ def replicates_of(record: Mapping[str, Any], metric: str) -> list[float]:
     return (record.get("replicates") or {}).get(metric) or []
 
 
-def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
+def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> TableCell:
     """Return a shift's number: at the random severity if that ran, else the mean over severities."""
     if not shift or run.record(detector, shift, "random") is not None:
         return cell_of(run, run.record(detector, shift, "random"), metric)
@@ -138,27 +138,29 @@ def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> C
         or len(records) < len(run.numbers)
         or any(record["metrics"].get(metric) is None for record in records)
     ):
-        return Cell(math.nan)
+        return TableCell(math.nan)
     mean = math.fsum(record["metrics"][metric] for record in records) / len(records)
     replicates = [replicates_of(record, metric) for record in records]
     means = [math.fsum(draw) / len(draw) for draw in zip(*replicates, strict=True)] if all(replicates) else []
     return score_cell(run, mean, means, records[0]["n"])
 
 
-def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
+def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> TableCell:
     """Share of the clean score that is left under a shift, percent; the interval from paired replicates."""
-    clean, shifted = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
-    if clean is None or math.isnan(shifted.mean) or not clean["metrics"].get(metric):
-        return Cell(math.nan)
+    clean_record, shifted_cell = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
+    if clean_record is None or math.isnan(shifted_cell.mean) or not clean_record["metrics"].get(metric):
+        return TableCell(math.nan)
     random_record = run.record(detector, shift, "random")
     records = (
         [random_record]
         if random_record
         else [record for severity in run.numbers if (record := run.record(detector, shift, severity)) is not None]
     )
-    draws = zip(*(replicates_of(record, metric) for record in (clean, *records)), strict=True)
-    shares = [math.fsum(draw[1:]) / len(records) / draw[0] for draw in draws if draw[0] > 0]
-    return score_cell(run, shifted.mean / 100.0 / clean["metrics"][metric], shares, shifted.n, bounded=False)
+    draws = zip(*(replicates_of(record, metric) for record in (clean_record, *records)), strict=True)
+    kept_shares = [math.fsum(draw[1:]) / len(records) / draw[0] for draw in draws if draw[0] > 0]
+    return score_cell(
+        run, shifted_cell.mean / 100.0 / clean_record["metrics"][metric], kept_shares, shifted_cell.n, bounded=False
+    )
 
 
 def interval_note(run: Resampled) -> str:
@@ -189,11 +191,11 @@ def main_table(run: DetectionRun) -> Table:
     """Return shift x detector: mAP and NDS, the paper's rows between ours."""
     names = published_names(run)
 
-    def published(shift: str) -> list[Row]:
+    def published(shift: str) -> list[TableRow]:
         if shift not in PUBLISHED or not any(names):
             return []
         scores = [PUBLISHED[shift].get(name, (None, None)) for name in names]
-        return [Row.of_published((run.family(shift), title_of(shift)), chain.from_iterable(scores))]
+        return [TableRow.of_published((run.family(shift), title_of(shift)), chain.from_iterable(scores))]
 
     if "random" not in run.suite["severities"]:
         strength = f"mean over severities {', '.join(run.numbers)}"
@@ -230,15 +232,15 @@ def left_table(run: DetectionRun) -> Table:
     names = published_names(run)
     has_published = any(names) and any(shift in PUBLISHED for shift in run.shifts)
 
-    def published(shift: str) -> list[Row]:
+    def published(shift: str) -> list[TableRow]:
         if shift not in PUBLISHED or not any(names):
             return []
-        shares = [
+        kept_shares = [
             100 * PUBLISHED[shift][name][number] / PUBLISHED[""][name][number] if name else None
             for name in names
             for number in (0, 1)
         ]
-        return [Row.of_published((run.family(shift), title_of(shift)), shares)]
+        return [TableRow.of_published((run.family(shift), title_of(shift)), kept_shares)]
 
     return Table.listing(
         "left",
@@ -265,10 +267,10 @@ def order_table(run: DetectionRun) -> Table | None:
     if len(shifts) < 3 or not published_by_detector:
         return None
 
-    def metric(detector: str, score: str) -> Cell:
+    def metric(detector: str, score: str) -> TableCell:
         scores = [summary_cell(run, detector, shift, score).mean for shift in shifts]
         published = [PUBLISHED[shift][published_by_detector[detector]][SCORES.index(score)] for shift in shifts]
-        return Cell.of(family_correlation(scores, published, shifts))
+        return TableCell.of(family_correlation(scores, published, shifts))
 
     return Table.listing(
         "order",
@@ -316,10 +318,10 @@ def car_table(run: DetectionRun) -> Table:
 def class_table(run: DetectionRun) -> Table:
     """Return the AP of each class and the errors of true positives on the clean data."""
 
-    def metric(detector: str, column: str) -> Cell:
+    def metric(detector: str, column: str) -> TableCell:
         record = run.record(detector, "", "0")
         if column in ERRORS:
-            return Cell.value(record["metrics"].get(column) if record else None)
+            return TableCell.value(record["metrics"].get(column) if record else None)
         return cell_of(run, record, column)
 
     return Table.listing(
@@ -355,7 +357,7 @@ def robustness_table(run: DetectionRun) -> Table | None:
     def scores(detector: str, number: Callable[[Mapping[str, Any]], float]) -> dict[str, list[float]]:
         return {shift: [number(record) for record in records[detector, shift]] for shift in ["", *run.shifts]}
 
-    def metric(detector: str, column: tuple[str, str]) -> Cell:
+    def metric(detector: str, column: tuple[str, str]) -> TableCell:
         name, score = column
 
         def value(number: Callable[[Mapping[str, Any]], float]) -> float:
@@ -385,13 +387,15 @@ def _draw(record: Mapping[str, Any], score: str, draw: int) -> float:
     return replicates_of(record, score)[draw]
 
 
-def _robustness(own: Mapping[str, Sequence[float]], base: Mapping[str, Sequence[float]]) -> tuple[float, float]:
+def _robustness(
+    scores: Mapping[str, Sequence[float]], baseline_scores: Mapping[str, Sequence[float]]
+) -> tuple[float, float]:
     """Return mRR and mCE of scores by shift, with the clean ones at ""; NaN where they are not defined."""
-    shifted = {shift: values for shift, values in own.items() if shift}
-    reference = {shift: values for shift, values in base.items() if shift}
+    shifted_scores = {shift: values for shift, values in scores.items() if shift}
+    reference = {shift: values for shift, values in baseline_scores.items() if shift}
     try:
-        rate = mean_resilience_rate(shifted, own[""][0])
-        errors = corruption_error(shifted, reference)
+        rate = mean_resilience_rate(shifted_scores, scores[""][0])
+        errors = corruption_error(shifted_scores, reference)
     except ConfigError:
         return math.nan, math.nan
     return rate, math.fsum(errors.values()) / len(errors)
@@ -407,7 +411,7 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
     for shift in run.shifts:
         lines = [
             [
-                Point(
+                CurvePoint(
                     int(severity) / 5,
                     cell_of(run, run.record(detector, shift if severity != "0" else "", severity), metric),
                     f"{detector}, {title_of(shift)} {severity}",
@@ -420,39 +424,41 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
     return panels(plots, label=f"{metric} over severity")
 
 
-def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
+def tiles(run: DetectionRun, robustness: Table | None) -> list[dict[str, Any]]:
     """Return the headline numbers of each detector."""
     entries = []
     for number, detector in enumerate(run.detectors):
-        clean = run.record(detector, "", "0")
+        clean_record = run.record(detector, "", "0")
         scores = {shift: [summary_cell(run, detector, shift, "NDS").mean / 100] for shift in run.shifts}
-        measured = {shift: score for shift, score in scores.items() if not math.isnan(score[0])}
-        clean_score = cell_of(run, clean, "NDS").mean / 100
-        rates = resilience_rate(measured, clean_score) if measured and clean_score > 0 else {}
-        worst = min(rates, key=lambda shift: rates[shift], default="")
+        measured_scores = {shift: score for shift, score in scores.items() if not math.isnan(score[0])}
+        clean_score = cell_of(run, clean_record, "NDS").mean / 100
+        rates = resilience_rate(measured_scores, clean_score) if measured_scores and clean_score > 0 else {}
+        worst_shift = min(rates, key=lambda shift: rates[shift], default="")
         entries.append(
             {
                 "name": detector,
-                "mAP": cell_of(run, clean, "mAP"),
-                "NDS": cell_of(run, clean, "NDS"),
-                "mRR": robust.rows[number].cells[1] if robust else Cell(math.nan),
-                "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else "",
+                "mAP": cell_of(run, clean_record, "mAP"),
+                "NDS": cell_of(run, clean_record, "NDS"),
+                "mRR": robustness.rows[number].cells[1] if robustness else TableCell(math.nan),
+                "worst": f"{title_of(worst_shift)}: {100 * rates[worst_shift]:.0f} % of NDS is left"
+                if worst_shift
+                else "",
             }
         )
     return entries
 
 
-def summary(found: Run) -> Table:
+def summary(run: Run) -> Table:
     """Return the table for the terminal: percent."""
-    is_random = "random" in found.suite["severities"]
+    is_random = "random" in run.suite["severities"]
     note = f"percent; {'severities from 1 to 5' if is_random else 'means over the severities that ran'}"
-    return replace(main_table(load_detection_run(found)), note=note)
+    return replace(main_table(load_detection_run(run)), note=note)
 
 
 def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a detection run and its tables."""
     run = load_detection_run(found)
-    robust, order = robustness_table(run), order_table(run)
+    robustness, order = robustness_table(run), order_table(run)
     main_rows, left_rows, severities = main_table(run), left_table(run), severity_table(run)
     car_rows, class_rows = car_table(run), class_table(run)
     page = render(
@@ -465,8 +471,8 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
         severities=severities,
         cars=car_rows,
         classes=class_rows,
-        robust=robust,
-        tiles=tiles(run, robust),
+        robust=robustness,
+        tiles=tiles(run, robustness),
         plot=curves(run),
         plot_map=curves(run, "mAP"),
         pictures=pictures(found.folder),
@@ -479,7 +485,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
             if record["status"] != "ok"
         ],
     )
-    tables = main_rows, left_rows, order, robust, severities, car_rows, class_rows
+    tables = main_rows, left_rows, order, robustness, severities, car_rows, class_rows
     return page, [table for table in tables if table is not None]
 
 
@@ -489,7 +495,9 @@ def _skipped(run: DetectionRun) -> list[str]:
     for (detector, shift, severity), record in run.records.items():
         if detector != run.detectors[0] or record["status"] != "ok":
             continue
-        parts = [f"{reason} {count}" for reason, count in record.get("applied", {}).items() if reason != "applied"]
-        if parts:
-            remarks.append(f"{title_of(shift)}, severity {severity}: {'; '.join(parts)}")
+        reason_texts = [
+            f"{reason} {count}" for reason, count in record.get("applied", {}).items() if reason != "applied"
+        ]
+        if reason_texts:
+            remarks.append(f"{title_of(shift)}, severity {severity}: {'; '.join(reason_texts)}")
     return remarks

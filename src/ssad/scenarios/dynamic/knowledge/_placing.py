@@ -11,7 +11,7 @@ import numpy as np
 
 from ssad.core.errors import RouteError
 from ssad.core.rotations import wrap
-from ssad.core.types import F64, Condition, Controller, EpisodeAgent, LaneType, Phase, Pose, Route, Scenario
+from ssad.core.types import F64, Controller, EpisodeAgent, LaneType, Phase, PhaseTrigger, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._remember import remembered
 
 if TYPE_CHECKING:
@@ -282,14 +282,14 @@ def to_outermost(graph: LaneGraph, place: LanePosition, *, kinds: Sequence[LaneT
 
 def go(speed: float, trigger_distance: float) -> Phase:
     """Return the phase that drives at `speed` once the ego is within `trigger_distance` m of actor 0."""
-    return Phase(speed, Condition("ego_distance", trigger_distance, 0))
+    return Phase(speed, PhaseTrigger("ego_distance", trigger_distance, 0))
 
 
 def go_when_ego_moves(speed: float, trigger_distance: float) -> tuple[Phase, ...]:
     """As `go`, but wait until the ego drives faster than 0.5 m/s."""
     return (
-        Phase(0.0, Condition("ego_distance", trigger_distance, 0)),
-        Phase(speed, Condition("ego_speed", 0.5)),
+        Phase(0.0, PhaseTrigger("ego_distance", trigger_distance, 0)),
+        Phase(speed, PhaseTrigger("ego_speed", 0.5)),
     )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.core.types import Condition, EpisodeAgent, Phase, Route, Scenario
+from ssad.core.types import EpisodeAgent, Phase, PhaseTrigger, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import ahead_and_left, bending_route, go, pose_at, scripted
 
@@ -28,7 +28,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         graph, scenario, route, distance=values["distance"], gap=values["gap"]
     )
     drive_phase = go(values["leader_speed"], values["trigger_distance"])
-    brake_phase = Phase(values["brake_speed"], Condition("travelled", values["brake_after"]))
+    brake_phase = Phase(values["brake_speed"], PhaseTrigger("travelled", values["brake_after"]))
     return [
         scripted(
             "leader",

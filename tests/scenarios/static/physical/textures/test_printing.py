@@ -126,7 +126,7 @@ def test_the_mean_over_draws_comes_nearer_with_more_of_them() -> None:
 )
 def test_ranges_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match=f"expectation: {next(iter(wrong))}"):
-        checked(Expectation, wrong, what="expectation")
+        checked(Expectation, wrong, subject="expectation")
 
 
 def test_controls() -> None:

@@ -42,7 +42,7 @@ def make_light(name: str, options: Mapping[str, Any]) -> Any:
         ConfigError: An option is unknown or has an invalid value.
     """
     if name in LIGHTS:
-        return checked(LIGHTS[name], options, what=f"attack {name}")
+        return checked(LIGHTS[name], options, subject=f"attack {name}")
     if ":" not in name and name not in names("light", {}):
         raise unknown_name("light attack", name, LIGHTS)
     return make("light", name, resolve("light", {}, name), options, ("ranges", "edit"))

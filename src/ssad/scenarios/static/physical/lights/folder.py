@@ -208,7 +208,7 @@ def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[SearchBudget, A
     method = options.pop("search", None)
     if method not in (None, "swarm", "greedy", "gradient"):
         raise ConfigError(f"attack {attack}: search={method!r}: choose swarm, greedy or gradient")
-    return checked(SearchBudget, options, what=f"attack {attack}"), method
+    return checked(SearchBudget, options, subject=f"attack {attack}"), method
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:

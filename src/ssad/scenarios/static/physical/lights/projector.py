@@ -116,7 +116,7 @@ class Projector:
         if isinstance(options["expectation"], Mapping):
             options["expectation"] = {**asdict(AIMED), **options["expectation"]}
         label = f"attack {self.name}"
-        attack = checked(partial(TextureAttack, self.name), options, what=label, kind=TextureAttack)
+        attack = checked(partial(TextureAttack, self.name), options, subject=label, kind=TextureAttack)
         if attack.stealth:
             raise ConfigError(f"{label}: stealth={attack.stealth:g}: it is for what is printed on something")
         return attack

@@ -38,7 +38,7 @@ def make_physical(name: str, /, **settings: Any) -> TextureAttack:
     definition = resolve("physical-attack", ATTACKS, name)
     factory = definition if callable(definition) else partial(replace, definition)
     try:
-        attack = checked(factory, settings, what=f"attack {name}", kind=TextureAttack)
+        attack = checked(factory, settings, subject=f"attack {name}", kind=TextureAttack)
     except TypeError as error:
         raise ConfigError(f"attack {name}: {error}") from None
     if not isinstance(attack, TextureAttack):

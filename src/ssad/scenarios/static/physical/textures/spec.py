@@ -88,4 +88,4 @@ def make_carrier(name: str, options: Mapping[str, Any]) -> Carrier:
     """
     if name not in CARRIERS:
         raise unknown_name("carrier", name, CARRIERS)
-    return checked(CARRIERS[name], options, what=name)
+    return checked(CARRIERS[name], options, subject=name)
