@@ -73,7 +73,7 @@ def weather_of(description: str) -> str:
     )
 
 
-class Clips:
+class TargetRecording:
     """The test pictures of some folders and what is in them, one row an object."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
@@ -141,7 +141,7 @@ class Clips:
         return Boxes2D(self.image, self.label, self.box, ignore=self.crowd | ~counts)
 
 
-def found_in(name: str, clips: Clips, device: str, **options: Any) -> Boxes2D:
+def found_in(name: str, clips: TargetRecording, device: str, **options: Any) -> Boxes2D:
     """All detections of a detector with these options, with the labels of the clips."""
     detector = make_detector(name, device=device, **options)
     starts = range(0, len(clips.files), 16)
@@ -155,7 +155,13 @@ def found_in(name: str, clips: Clips, device: str, **options: Any) -> Boxes2D:
 
 
 def recall(
-    clips: Clips, found: Boxes2D, counts: np.ndarray[Any, Any], labels: int, *, least: float = CLEAR, iou: float = 0.5
+    clips: TargetRecording,
+    found: Boxes2D,
+    counts: np.ndarray[Any, Any],
+    labels: int,
+    *,
+    least: float = CLEAR,
+    iou: float = 0.5,
 ) -> float:
     """Share of the objects that count which a detection with this score and IoU finds."""
     assert found.score is not None
@@ -165,7 +171,7 @@ def recall(
     return float((matched.hit & ~matched.ignored).sum() / matched.truth.sum())
 
 
-def of_target(clips: Clips, found: Boxes2D, labels: int) -> dict[str, float]:
+def of_target(clips: TargetRecording, found: Boxes2D, labels: int) -> dict[str, float]:
     """AP50 of what each recording is about, a car or a sign."""
     folder, scores = np.array(clips.folders)[clips.image], {}
     for recording in dict.fromkeys(clips.folders):
@@ -175,7 +181,7 @@ def of_target(clips: Clips, found: Boxes2D, labels: int) -> dict[str, float]:
     return scores
 
 
-def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
+def small_cars(clips: TargetRecording, found: Boxes2D, labels: int) -> dict[str, Any]:
     """Cars below 24 px: how many are found from each score on, and how often a score of so much is right."""
     car, weather, small = clips.classes.index("car"), np.array(clips.weather)[clips.image], clips.small("car")
     matched = match_2d(clips.truth(~clips.crowd), found, labels=labels)
@@ -203,7 +209,7 @@ def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
     return {"by score": by_score, "by light": by_light, "by contrast": by_contrast(clips, found, labels)}
 
 
-def by_contrast(clips: Clips, found: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
+def by_contrast(clips: TargetRecording, found: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
     """How many small cars are found of those with a low contrast-to-noise ratio, and of the others."""
     small, faint = clips.small("car"), clips.contrast < FAINT
     return {
@@ -212,7 +218,7 @@ def by_contrast(clips: Clips, found: Boxes2D, labels: int) -> dict[str, dict[str
     }
 
 
-def flat_tables(name: str, clips: Clips, device: str) -> dict[str, Any]:
+def flat_tables(name: str, clips: TargetRecording, device: str) -> dict[str, Any]:
     """One 2D detector: AP50 by class and light, recall by size and distance."""
     found, labels = found_in(name, clips, device), len(clips.classes)
     every = ~clips.crowd
@@ -592,7 +598,7 @@ def main() -> None:
         return
     result = json.loads(given.out.read_text()) if given.out.is_file() else {}
     if given.clips:
-        clips = Clips(given.clips)
+        clips = TargetRecording(given.clips)
         result["clips"] = [describe_data(folder) for folder in given.clips]
         result["flat"] = {name: flat_tables(name, clips, given.device) for name in FLAT}
     if given.drives is not None:

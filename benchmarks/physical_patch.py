@@ -30,7 +30,7 @@ from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.metrics.target_attacks import sightings, target_scores
 from ssad.recorders.target_images import record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.texture import to_linear
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Hide
@@ -106,7 +106,7 @@ ORDER = {name: number for number, name in enumerate(VARIANTS)}
 def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: str) -> TargetClips:
     """Pictures of a town, recorded if they are not there."""
     if not (home / town / "annotations").is_dir():
-        record_clips(Clips(home / town, ((town, count),), (), target=TargetCar(), device=device), workers=0)
+        record_clips(TargetRecording(home / town, ((town, count),), (), target=TargetCar(), device=device), workers=0)
     return TargetClips(home / town, count, classes, device)
 
 

@@ -21,7 +21,7 @@ from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_sheet import target_sheet
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.recorders.target_images import record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.physical import albedo_of, control, make_carrier
 from ssad.scenarios.static.physical.textures.card import load_texture
@@ -44,7 +44,7 @@ def main() -> None:
     quiet_warp()
     detector, target = make_detector(DETECTOR), TargetCar()
     with tempfile.TemporaryDirectory() as folder:
-        record_clips(Clips(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
+        record_clips(TargetRecording(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
         clips = TargetClips(Path(folder), 1, tuple(detector.classes))
         ((_, clean, truth),) = clips.clean()
         shown = []

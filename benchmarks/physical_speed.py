@@ -27,7 +27,7 @@ from ssad.core.machine import quiet_warp
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.recorders.target_images import record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
@@ -85,7 +85,7 @@ def measure(count: int, device: str) -> dict[str, Any]:
     target = TargetCar()
     surface = Camouflage().on(target.mesh())
     with tempfile.TemporaryDirectory() as folder:
-        record_clips(Clips(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0)
+        record_clips(TargetRecording(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0)
         detector = make_detector("yolov5n", device=device)
         clips = TargetClips(Path(folder), count, tuple(detector.classes), device)
         views = [view for _, view in clips.wearing(surface)]

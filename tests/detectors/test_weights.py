@@ -19,7 +19,7 @@ from ssad.detectors import SHIPPED, make_detector
 from ssad.detectors.on_scenes import score_2d, score_3d
 from ssad.recorders.nuscenes import Recording, record_nuscenes
 from ssad.recorders.target_images import record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.training.batches import PictureSet, fill
 from ssad.training.detector import coco_items, coco_truth
 
@@ -35,7 +35,7 @@ def clips(shared: Shared) -> tuple[CocoSet, PictureSet]:
 
     def make(out: Path) -> None:
         with two_phases():
-            record_clips(Clips(out, images=(("Larkhill", 4),), held_out=("Larkhill",), seed=77), workers=0)
+            record_clips(TargetRecording(out, images=(("Larkhill", 4),), held_out=("Larkhill",), seed=77), workers=0)
 
     out = shared("shipped-clips", make)
     data = read_coco(out / "annotations" / "test.json")

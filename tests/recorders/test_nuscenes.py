@@ -33,7 +33,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.recorders.drives import MIX, drive_street, make_drive, thin_shares
 from ssad.recorders.nuscenes import AHEAD, Recording, drive, record_nuscenes
 from ssad.recorders.target_images import record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.bodies import make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
 from ssad.rendering.meshes.mesh import Mesh
@@ -294,7 +294,7 @@ def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
         record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=0)
     assert "\n" not in str(error.value)
     with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
-        record_clips(Clips(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
+        record_clips(TargetRecording(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
     assert "\n" not in str(error.value)
     with np.load(town) as stored:
         arrays = dict(stored)

@@ -12,7 +12,7 @@ from helpers.killing import kill_9, wait_until_stopped
 from ssad.core.errors import FormatError, StoreError
 from ssad.recorders.nuscenes import Recording
 from ssad.recorders.parts import FOLDER, PAGE, REQUEST, PartsFolder
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
 
 REQUESTED = {"towns": ["Twinford"], "seed": 0}
@@ -99,11 +99,11 @@ def test_the_same_settings_are_the_same_request(tmp_path: Path) -> None:
     """A file holds lists where settings hold tuples, as that of a target's size."""
     recordings = [
         Recording(tmp_path / "a", ("Twinford",)),
-        Clips(tmp_path / "b", (("Twinford", 1),), target=TargetCar("van", size=(5.0, 2.0, 2.0))),
+        TargetRecording(tmp_path / "b", (("Twinford", 1),), target=TargetCar("van", size=(5.0, 2.0, 2.0))),
     ]
     for recording in recordings:
         recording.parts.claim()
         recording.parts.claim()
-    other = Clips(tmp_path / "b", (("Twinford", 1),), target=TargetCar("van", size=(5.0, 2.0, 2.1)))
+    other = TargetRecording(tmp_path / "b", (("Twinford", 1),), target=TargetCar("van", size=(5.0, 2.0, 2.1)))
     with pytest.raises(StoreError, match="another recording"):
         other.parts.claim()

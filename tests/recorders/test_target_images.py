@@ -41,7 +41,7 @@ from ssad.recorders.target_images import (
     clip_views,
     record_clips,
 )
-from ssad.recorders.target_recording import FOCAL, SMALL, Clips, pair_images
+from ssad.recorders.target_recording import FOCAL, SMALL, TargetRecording, pair_images
 from ssad.recorders.viewpoints import AIM, CAR_EYE, MIN_CAMERA_HEIGHT, follow, look_at, polar, turn_of, weather_name
 from ssad.rendering.camera.labels import label_picture
 from ssad.rendering.camera.render import SceneWeather, render
@@ -55,12 +55,12 @@ BOTH = pytest.mark.parametrize("mode", ["drives", pytest.param("orbits", marks=p
 DISTANCES, AZIMUTHS, ELEVATIONS = (5.0, 10.0, 20.0), (0.0, 90.0, 180.0, 270.0), (0.0, 15.0, 30.0)
 
 
-def todo(out: Path, mode: str, **changes: Any) -> Clips:
+def todo(out: Path, mode: str, **changes: Any) -> TargetRecording:
     """A small recording."""
     given: dict[str, Any] = {"images": PAIRS, "mode": mode, "size": 160, "held_out": ("Oldmarket",)}
     if mode == "orbit":
         given |= {"distances": DISTANCES, "azimuths": AZIMUTHS, "elevations": ELEVATIONS}
-    return Clips(out, **(given | changes))
+    return TargetRecording(out, **(given | changes))
 
 
 def contents(root: Path) -> dict[str, str]:
@@ -485,7 +485,7 @@ def test_another_recording_in_the_folder_is_refused(drives: Path, tmp_path: Path
 )
 def test_what_cannot_be_recorded_is_refused_in_one_line(tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said) as error:
-        Clips(tmp_path, **wrong)
+        TargetRecording(tmp_path, **wrong)
     assert "\n" not in str(error.value)
 
 

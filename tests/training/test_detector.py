@@ -18,7 +18,7 @@ from ssad.core.checkpoints import read_card
 from ssad.core.errors import ConfigError, FormatError
 from ssad.detectors import SHIPPED, make_detector
 from ssad.recorders.target_images import record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import parse_target
 from ssad.training import detector as training
 from ssad.training.detector import DetectorPlan, command_of, describe_data, run_training
@@ -33,14 +33,14 @@ def clips(shared: Shared) -> Path:
 
     def make(out: Path) -> None:
         with plain_bodies():
-            record_clips(Clips(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
+            record_clips(TargetRecording(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
 
     return shared("clips", make)
 
 
 @pytest.mark.parametrize("target", ["van:white:3", "stop_sign:worn:2"])
 def test_the_target_of_clips_is_part_of_their_command(target: str, tmp_path: Path) -> None:
-    about = Clips(tmp_path, (("Twinford", 2),), mode="orbit", target=parse_target(target)).identity()
+    about = TargetRecording(tmp_path, (("Twinford", 2),), mode="orbit", target=parse_target(target)).identity()
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "all.json").write_text(json.dumps({"info": {"recording": about}}))
     assert f"--clips orbit --towns Twinford --images 2 --target {target} " in describe_data(tmp_path)

@@ -200,11 +200,11 @@ def record(
     with Live("record", 1, 0, console=Console(stderr=True), unit=unit) as progress:
         if clips is not None:
             from ssad.recorders.target_images import record_clips
-            from ssad.recorders.target_recording import Clips, pair_images
+            from ssad.recorders.target_recording import TargetRecording, pair_images
             from ssad.rendering.target import parse_target
 
             images_per_town = pair_images(names(towns), names(images))
-            target_recording = Clips(
+            target_recording = TargetRecording(
                 out,
                 images_per_town,
                 names(held_out),

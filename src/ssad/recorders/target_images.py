@@ -35,7 +35,7 @@ from ssad.engine.pool import open_pool, run_all
 from ssad.recorders.drives import drive_street, make_drive
 from ssad.recorders.nuscenes import draw_weather, drive
 from ssad.recorders.parts import TIME_LIMIT, same_request
-from ssad.recorders.target_recording import BEHIND, FOCAL, SMALL, Clips
+from ssad.recorders.target_recording import BEHIND, FOCAL, SMALL, TargetRecording
 from ssad.recorders.viewpoints import (
     AIM,
     Place,
@@ -95,7 +95,7 @@ class _StageSet:
         places: Possible places of a standing target.
     """
 
-    clips: Clips
+    clips: TargetRecording
     key: tuple[object, ...]
     trace: EpisodeTrace
     cast: SceneObjects
@@ -104,7 +104,7 @@ class _StageSet:
     places: tuple[Place, ...] = ()
 
 
-def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _StageSet:
+def _prepare(clips: TargetRecording, town: str, key: tuple[object, ...]) -> _StageSet:
     graph = load_town(town)
     street = drive_street(graph, clips.streets, key=("clips", *key))
     trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
@@ -213,7 +213,7 @@ def _rounds(
         yield sorted(first_free.items())
 
 
-def _part(task: tuple[Clips, str, int, int, str]) -> str:
+def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
     """Record `count` images, of one drive if possible, and return the name of the part.
 
     A finished part is left alone.
@@ -400,7 +400,7 @@ def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
 
 
 def record_clips(
-    clips: Clips,
+    clips: TargetRecording,
     *,
     workers: int | None = None,
     ray: str | None = None,
@@ -415,7 +415,7 @@ def record_clips(
 
 
 def record_all(
-    recordings: Sequence[Clips],
+    recordings: Sequence[TargetRecording],
     *,
     workers: int | None = None,
     ray: str | None = None,
@@ -430,7 +430,7 @@ def record_all(
         StoreError: See `record_clips`.
         ConfigError: See `record_clips`.
     """
-    tasks: list[list[tuple[Clips, str, int, int, str]]] = []
+    tasks: list[list[tuple[TargetRecording, str, int, int, str]]] = []
     for recording in recordings:
         _check_other(recording)
         tasks.append(
@@ -452,7 +452,7 @@ def record_all(
     return [recording.out for recording in recordings]
 
 
-def _check_other(clips: Clips) -> None:
+def _check_other(clips: TargetRecording) -> None:
     """StoreError: the folder holds another recording."""
     annotations_file = clips.out / "annotations" / "all.json"
     if annotations_file.is_file() and not clips.parts.claimed:
@@ -462,7 +462,7 @@ def _check_other(clips: Clips) -> None:
             raise StoreError(f"{clips.out}: holds another recording; choose another folder")
 
 
-def _write_pages(clips: Clips, tasks: Sequence[tuple[Clips, str, int, int, str]]) -> None:
+def _write_pages(clips: TargetRecording, tasks: Sequence[tuple[TargetRecording, str, int, int, str]]) -> None:
     """annotations/{train,test,all}.json of parts that are all there."""
     splits = {
         "train": [entry_task for entry_task in tasks if entry_task[1] not in clips.held_out],
@@ -545,7 +545,7 @@ def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ..
 
 
 def recording_of(folder: Path, split: str = "all") -> dict[str, Any]:
-    """Return the description of a recording (see `Clips.identity`).
+    """Return the description of a recording (see `TargetRecording.identity`).
 
     Raises:
         FormatError: No recording.
@@ -614,8 +614,8 @@ def _unknown(path: Path, error: Exception) -> FormatError:
     return FormatError(f"{path}: not the clips of this version {error_text}; record them again")
 
 
-def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:
-    """The recording that `Clips.identity` describes."""
+def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> TargetRecording:
+    """The recording that `TargetRecording.identity` describes."""
     settings: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in about.items() if name != "clips"
     }
@@ -625,4 +625,4 @@ def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:
         target_settings = {name: value for name, value in about["target"].items() if name != "kind"}
         target_class: Any = STANDING[about["target"]["kind"]] if "kind" in about["target"] else TargetCar
         settings["target"] = target_class(**target_settings | {"size": None if size is None else tuple(size)})
-    return Clips(folder, **settings | {"mode": about["clips"], "device": device})
+    return TargetRecording(folder, **settings | {"mode": about["clips"], "device": device})

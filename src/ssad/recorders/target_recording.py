@@ -27,7 +27,7 @@ SMALL: Final = 8.0  # px of a side of a target
 
 
 @dataclass(frozen=True, slots=True)
-class Clips:
+class TargetRecording:
     """Settings of a recording of target images.
 
     Attributes:

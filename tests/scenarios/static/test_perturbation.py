@@ -21,7 +21,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.recorders.target_images import record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering import onboard
 from ssad.rendering.episode_scene import EpisodeScene
 from ssad.rendering.sensor_suite import SensorSuite
@@ -159,7 +159,9 @@ def targets(shared: Shared) -> dict[str, Path]:
             mode = "drive" if isinstance(parsed, TargetCar) else "orbit"
             folder = out / target.replace(":", "-")
             record_clips(
-                Clips(folder, (("Twinford", 1),), (), size=320, behind=8.0, target=parsed, mode=mode, distances=(6.0,)),
+                TargetRecording(
+                    folder, (("Twinford", 1),), (), size=320, behind=8.0, target=parsed, mode=mode, distances=(6.0,)
+                ),
                 workers=0,
             )
 

@@ -24,7 +24,7 @@ from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, score_scenes, sum_applied
 from ssad.experiments.perception.scored_data import Victims, data_of, detectors_of
 from ssad.experiments.perception.sheets import detection_sheet
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import Target, TargetCar, parse_target
 from ssad.scenarios.static.catalogue import NONE, PerturbationTable, parse_perturbation
 from ssad.scenarios.static.digital.perturbation import DigitalAttack
@@ -113,7 +113,7 @@ class Perception(OpenLoopKind):
         """Return the priority of a cell: clean first."""
         return float(cell.spec["perturbation"] is not None)
 
-    def recordings(self, plan: Plan, folder: Path) -> list[Clips]:
+    def recordings(self, plan: Plan, folder: Path) -> list[TargetRecording]:
         """Return the recordings of the targets."""
         targets = {cell.fields["data"] for cell in plan.cells} - {SCENES}
         return [recording_of_target(plan.suite, target, folder, plan.device) for target in sorted(targets)]
@@ -184,10 +184,10 @@ def target_folder(target: str) -> str:
     return f"target-{target.replace(':', '-')}"
 
 
-def recording_of_target(suite: PerceptionSuite, target: str, folder: Path, device: str) -> Clips:
+def recording_of_target(suite: PerceptionSuite, target: str, folder: Path, device: str) -> TargetRecording:
     """Return the recording of a target: a car that drives ahead, a walker or a sign from all sides."""
     parsed = parse_target(target)
-    return Clips(
+    return TargetRecording(
         folder / "data" / target_folder(target),
         ((suite.target_town, suite.target_images),),
         held_out=(),

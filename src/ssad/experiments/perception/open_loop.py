@@ -50,7 +50,7 @@ from ssad.experiments.perception.scored_data import (
 from ssad.metrics.target_attacks import TargetSighting, precision, sightings, target_scores
 from ssad.recorders.nuscenes import record_nuscenes
 from ssad.recorders.target_images import record_all
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.scenarios.static.catalogue import registered_names
 from ssad.scenarios.static.digital.defences import make_defence
 from ssad.scenarios.static.perturbation import Perturbation
@@ -203,7 +203,7 @@ class OpenLoopKind(Kind):
         """Return further settings of the workers."""
         return {}
 
-    def recordings(self, plan: Plan, folder: Path) -> list[Clips]:
+    def recordings(self, plan: Plan, folder: Path) -> list[TargetRecording]:
         """Return the recordings of targets that a plan needs, below a results folder."""
         return []
 

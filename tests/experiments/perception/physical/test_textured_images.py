@@ -20,7 +20,7 @@ from ssad.core.images import read_image
 from ssad.experiments.perception.physical.textured_images import KEPT, Wearing, textured_clips
 from ssad.recorders.nuscenes import SENSOR
 from ssad.recorders.target_images import TARGET, clip_views, record_clips
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.recorders.viewpoints import look_at
 from ssad.rendering.camera.render import Rendering, render
 from ssad.rendering.camera.scene import TextureLayer
@@ -45,7 +45,7 @@ def others_are_boxes() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("textured") / "clips"
-    record_clips(Clips(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+    record_clips(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
     return out
 
 
@@ -78,7 +78,9 @@ def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
 def same_metal(tmp_path_factory: pytest.TempPathFactory) -> list[Rendering]:
     """A named car in each of two towns, from the same places: behind its right, and before its left from above."""
     out = tmp_path_factory.mktemp("towns") / "clips"
-    record_clips(Clips(out, (("Twinford", 1), ("Oldmarket", 1)), (), size=160, behind=8.0, target=CAR), workers=0)
+    record_clips(
+        TargetRecording(out, (("Twinford", 1), ("Oldmarket", 1)), (), size=160, behind=8.0, target=CAR), workers=0
+    )
     eyes = (np.array([-6.0, -2.5, 1.8]), np.array([5.0, 3.5, 3.0]))
     found = []
     for seen in clip_views(out):

@@ -24,7 +24,7 @@ from ssad.experiments.perception.physical.verdict import verdict
 from ssad.experiments.perception.scored_data import Victims, detectors_of
 from ssad.experiments.runs import read_plan
 from ssad.metrics.target_grid import grid_scores
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import class_of_target, parse_target
 from ssad.report.load import Run
 from ssad.report.tables import Table
@@ -106,7 +106,7 @@ class Physical(OpenLoopKind):
         stage = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
         return stage + (3 if cell.fields["view"] == GRID else 0)
 
-    def recordings(self, plan: Plan, folder: Path) -> list[Clips]:
+    def recordings(self, plan: Plan, folder: Path) -> list[TargetRecording]:
         """Return the recordings of the suite."""
         suite: PhysicalSuite = plan.suite
         return suite.recordings(folder, plan.device)

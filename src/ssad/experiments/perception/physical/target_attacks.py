@@ -23,7 +23,7 @@ from ssad.engine.pool import open_pool, run_all
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
 from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
-from ssad.recorders.target_recording import Clips
+from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.target import TargetCar, parse_target
@@ -272,7 +272,7 @@ def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
 
 
 def see_all(
-    recordings: Sequence[Clips],
+    recordings: Sequence[TargetRecording],
     target: str,
     surfaces: Sequence[str],
     *,

@@ -15,7 +15,7 @@ from ssad.core.schema import Names, Schema
 from ssad.experiments.perception.digital.points import named
 from ssad.experiments.perception.open_loop import CellDescription
 from ssad.recorders.nuscenes import WEATHERS
-from ssad.recorders.target_recording import AZIMUTHS, ELEVATIONS, Clips
+from ssad.recorders.target_recording import AZIMUTHS, ELEVATIONS, TargetRecording
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.hours import at_hour
 from ssad.rendering.target import Target, TargetCar, parse_target
@@ -101,7 +101,7 @@ class Entry(Schema):
     texture: str | None = None
 
 
-class LightEntry(Schema):
+class TargetLightEntry(Schema):
     """Rows of the table for one light: searched, and with settings drawn at random.
 
     Attributes:
@@ -131,7 +131,7 @@ class TargetTable(Schema):
             around.
         pairs: pairs of towns.
         attacks: names, or mappings with the keys of a texture entry.
-        lights: names of light attacks, or mappings with the keys of `LightEntry`.
+        lights: names of light attacks, or mappings with the keys of `TargetLightEntry`.
         epochs: epochs of all trained textures, in place of their own; None: their own.
         window: side of the part around the target that trainings show to a 2D detector, px, a multiple of 32; None:
             whole images, as for 3D detectors always. A window of 192 takes a sixth of the time.
@@ -150,7 +150,7 @@ class TargetTable(Schema):
     target: str = "sedan:silver:0"
     pairs: list[Pair] = Field(default=[Pair(train="Twinford", test="Oldmarket")], min_length=1)
     attacks: list[Entry] = Field(default=[])
-    lights: list[LightEntry] = Field(default=[])
+    lights: list[TargetLightEntry] = Field(default=[])
     epochs: int | None = Field(default=None, ge=1)
     window: int | None = None
     seeds: int = Field(default=3, ge=1)
@@ -181,7 +181,7 @@ class TargetTable(Schema):
         """Return True if the test of a pair includes the grid."""
         return self.grid is not None and (self.grid.towns is None or pair.test in self.grid.towns)
 
-    def recordings(self, folder: Path, device: str) -> list[Clips]:
+    def recordings(self, folder: Path, device: str) -> list[TargetRecording]:
         """What is recorded below a folder: drives of each town, the grid, and views from all around for trainings.
 
         Raises:
@@ -194,7 +194,9 @@ class TargetTable(Schema):
                 # A town may train one pair and test another; one recording serves both.
                 images[town] = max(images.get(town, 0), count)
         target = target_of(self)
-        make_recording = partial(Clips, held_out=(), target=target, size=self.size, seed=self.seed, device=device)
+        make_recording = partial(
+            TargetRecording, held_out=(), target=target, size=self.size, seed=self.seed, device=device
+        )
         mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
         found = [
             make_recording(
