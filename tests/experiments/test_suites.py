@@ -84,7 +84,7 @@ def test_unknown_suite() -> None:
 def plan_of(scenarios: list[Scenario], monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Plan:
     """A plan without a world behind it."""
     monkeypatch.setattr(scenario_kind, "suite_scenarios", lambda suite: tuple(scenarios))
-    monkeypatch.setattr(scenario_kind, "town", lambda name: None)
+    monkeypatch.setattr(scenario_kind, "cached_town", lambda name: None)
     monkeypatch.setattr(scenario_kind, "town_version", lambda graph: "0")
     values = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"], "repetitions": 2}
     return Driving().plan(DrivingSuite(**(values | changes)), check=False)

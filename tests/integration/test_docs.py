@@ -54,6 +54,7 @@ GROUPS = {
     "ssad.kinds",
     "ssad.attacks",
     "ssad.generators",
+    "ssad.generator_files",
     "ssad.shifts",
     "ssad.lights",
     "ssad.faults",

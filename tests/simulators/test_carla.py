@@ -181,7 +181,7 @@ def test_the_lane_sensor_counts_what_the_body_crosses(carla: ModuleType) -> None
         assert invasions == 1
         assert crossed == sorted(crossed)
         simulator.reset()
-    simulator._events.crossed.append((simulator._frame, ("Solid",)))  # told late, of the drop onto the road
+    simulator._events.lane_crossings.append((simulator._frame, ("Solid",)))  # told late, of the drop onto the road
     assert simulator.measured == nothing
     simulator.close()
     assert not carla_world()._actors

@@ -63,15 +63,15 @@ def test_rows_of_scenes_without_an_adversary_are_empty(monkeypatch) -> None:
     assert not observation.any()  # nobody is chosen at the very start
     released = 0
     for _ in range(120):
-        before = env._who.copy()
+        before = env._adversaries.copy()
         env.step_async(np.zeros((6, 2), np.float32))
         observation, reward, done, infos = env.step_wait()
         assert done[before < 0].all()
         assert not reward[before < 0].any()
-        assert not observation[env._who < 0].any()
-        assert (observation[env._who >= 0, 2] > 1.0).all()  # its own length
+        assert not observation[env._adversaries < 0].any()
+        assert (observation[env._adversaries >= 0, 2] > 1.0).all()  # its own length
         external = env.world.state().controller == Controller.EXTERNAL
-        assert external.sum() == (env._who >= 0).sum()
+        assert external.sum() == (env._adversaries >= 0).sum()
         for b in np.flatnonzero(done & (before >= 0)):
             released += 1
             assert infos[b]["terminal_observation"][2] > 1.0

@@ -45,7 +45,9 @@ def scenario(name: str, **changes: Any) -> Scenario:
 @pytest.fixture(autouse=True)
 def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Towns of that name, and scenarios that the suite seems to name."""
-    replace_name(monkeypatch, "town", lambda name: SimpleNamespace(name=name, xy=np.zeros(3), sign_kind=np.zeros(0)))
+    replace_name(
+        monkeypatch, "cached_town", lambda name: SimpleNamespace(name=name, xy=np.zeros(3), sign_kind=np.zeros(0))
+    )
 
 
 def plan_of(monkeypatch: pytest.MonkeyPatch, *scenarios: Scenario, check: bool = False, **changes: Any) -> Plan:

@@ -154,7 +154,7 @@ def test_a_route_does_not_depend_on_those_drawn_before() -> None:
         for pair in ends:
             with contextlib.suppress(RouteError):
                 route_along(used, pair)
-    assert len(used.kept) > 10
+    assert len(used.cache) > 10
     compared = 0
     for pair in ends[::5]:
         with contextlib.suppress(RouteError):

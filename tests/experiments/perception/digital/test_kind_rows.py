@@ -260,7 +260,9 @@ def test_the_chosen_object_is_the_nearest_that_a_camera_sees_or_one_instance(
         frame = next(f for f in cameras if len(camera_truth(f, found.take(np.array([row]))).label))
         assert chosen_first(scene, frame, NEAREST, classes).token[0] == found.token[row]
     first = chosen_object(scene, sample, NEAREST)
-    monkeypatch.setattr("ssad.scenarios.static.digital.chosen_object._seen", lambda frame, found, row: row != first)
+    monkeypatch.setattr(
+        "ssad.scenarios.static.digital.chosen_object._is_visible", lambda frame, found, row: row != first
+    )
     assert chosen_object(scene, sample, NEAREST) == np.argsort(gap, kind="stable")[1], "the nearest is hidden"
     assert chosen_object(scene, sample, "nobody") is None
     assert chosen_object(scene, sample, NEAREST, ("trailer",)) is None, "the tiny set has none"

@@ -139,8 +139,8 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
     kept = sorted((folder / KEPT).rglob("*.npz"))
     assert len(kept) == 1
 
-    def rendered(*given: object, only: set[str], **other: object) -> Iterator[None]:
-        assert not only, "rendered again"
+    def rendered(*given: object, selected_keys: set[str], **other: object) -> Iterator[None]:
+        assert not selected_keys, "rendered again"
         yield from ()
 
     monkeypatch.setattr(module, "clip_views", rendered)

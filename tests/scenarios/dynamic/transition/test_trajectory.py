@@ -38,7 +38,7 @@ def untouched(base: Base) -> Cat:
 def cat(untouched: Cat) -> Cat:
     """One that a test may ask: nothing is taken from those of the other tests."""
     made = copy(untouched)
-    made._left, made._egos = [[*left] for left in untouched._left], [copy(egos) for egos in untouched._egos]
+    made._untried, made._egos = [[*left] for left in untouched._untried], [copy(egos) for egos in untouched._egos]
     return made
 
 
@@ -51,7 +51,7 @@ def test_recorded_motions_start_at_the_origin_and_can_be_driven(cat: Cat) -> Non
 
 
 def test_candidates_stay_on_the_road_and_their_priors_add_up(cat: Cat, base: Base) -> None:
-    (found,) = cat._left
+    (found,) = cat._untried
     assert len(found) > 50
     query = LaneQuery(base.graph)
     assert all(not query.off_road(c.pose[::2, :2]).any() for c in found[::10])
@@ -62,7 +62,7 @@ def test_candidates_stay_on_the_road_and_their_priors_add_up(cat: Cat, base: Bas
 
 
 def test_the_score_sums_over_the_egos_rollouts_and_falls_with_the_time(cat: Cat) -> None:
-    candidate = cat._left[0][0]
+    candidate = cat._untried[0][0]
     motion = cat._motion[0]
 
     def ego(meets: int | None) -> np.ndarray:
@@ -88,13 +88,13 @@ def test_the_score_sums_over_the_egos_rollouts_and_falls_with_the_time(cat: Cat)
 
 
 def test_the_best_are_proposed_first_and_none_twice(cat: Cat) -> None:
-    scores = [cat._score(0, c) for c in cat._left[0]]
-    count = len(cat._left[0])
+    scores = [cat._score(0, c) for c in cat._untried[0]]
+    count = len(cat._untried[0])
     (first,) = cat.ask(4)
     (second,) = cat.ask(4)
     assert len(first) == len(second) == 4
-    assert len(cat._left[0]) == count - 8
-    left = [cat._score(0, c) for c in cat._left[0]]
+    assert len(cat._untried[0]) == count - 8
+    left = [cat._score(0, c) for c in cat._untried[0]]
     assert sorted(scores)[:-8] == sorted(left)
     assert len({p.scenario.actors for p in [*first, *second]}) == 8
     assert all(p.scenario.type == "Custom" for p in first)

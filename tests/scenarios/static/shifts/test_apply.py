@@ -377,7 +377,9 @@ def test_cameras_of_a_moment_agree_whether_the_sun_is_hidden(street: NuScenes, m
     scene = street.scene(street.scenes()[0].name)
     frames = [f for f in scene.frames if f.key_frame and f.modality == "camera"][:6]
     for share in (0.0, 0.4, 1.0):
-        monkeypatch.setattr("ssad.scenarios.static.shifts.scene_shifter.free_sun", lambda *_, share=share: share)
+        monkeypatch.setattr(
+            "ssad.scenarios.static.shifts.scene_shifter.visible_sun_share", lambda *_, share=share: share
+        )
         shifter = SceneShifter(street.root, scene, ShiftSpec("sunlight", 5))
         found = [shifter.image(frame)[1] for frame in frames]
         front = [one for one in found if "the sun is not in front of this camera" not in one.skipped]

@@ -80,13 +80,14 @@ class Digital(OpenLoopKind):
     def check(self, suite: DigitalSuite) -> None:
         """Build attacks and defences, so that errors show up here."""
         points_of(suite)
-        if suite.transfer_detectors and not suite.transfer:
-            raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
 
     def victims(self, suite: DigitalSuite) -> Victims:
         """Return all detectors of the suite."""
         names = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
-        return detectors_of(suite.name, names, allow_2d=True)
+        victims = detectors_of(suite.name, names, allow_2d=True)
+        if suite.transfer_detectors and not suite.transfer:
+            raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
+        return victims
 
     def rows(self, suite: DigitalSuite, victims: Victims, data: Mapping[str, Any]) -> Iterator[CellDescription]:
         """Yield the attacks on each detector, and the images that are made against others."""

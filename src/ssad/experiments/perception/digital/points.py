@@ -14,7 +14,7 @@ from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.schema import Schema
 from ssad.scenarios.static.digital import default_loss, make_objective
 from ssad.scenarios.static.digital.budget import Norm
-from ssad.scenarios.static.digital.defences import make_defence
+from ssad.scenarios.static.digital.defences import RandomResize, make_defence
 from ssad.scenarios.static.digital.objectives import UNDIVIDED
 from ssad.scenarios.static.digital.spec import AttackSpec, has_option
 from ssad.scenarios.static.digital.universal import UniversalFit
@@ -270,7 +270,7 @@ def rows_of(suite: AttackTable) -> list[AttackPoint]:
         if not specs:
             draws = (
                 (entry.draws or DRAWS)
-                if defence and entry.aware and hasattr(make_defence(defence.name), "drawn")
+                if defence and entry.aware and isinstance(make_defence(defence.name), RandomResize)
                 else 0
             )
             classes, becomes = tuple(entry.classes), tuple(sorted(entry.becomes.items()))
