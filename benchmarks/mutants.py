@@ -46,7 +46,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
-COPIED = ("src", "tests", "suites", "docs", "benchmarks", "pyproject.toml", "README.md")
 MEMORY = 8 << 30  # bytes that a test run may allocate: a mutant may fill a list for ever
 
 INTEGRATION = Path("tests") / "integration"
@@ -244,6 +243,16 @@ def seconds_by_file(report: Path, folder: Path) -> Counter[str]:
     return seconds
 
 
+def _top_level_names(root: Path) -> list[str]:
+    """Files and folders of the checkout that git knows or would add; outside a checkout, all that are not hidden."""
+    command = ["git", "-C", str(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    with contextlib.suppress(OSError):
+        listing = subprocess.run(command, capture_output=True, text=True, check=False)
+        if listing.returncode == 0 and listing.stdout:
+            return sorted({path.split("/")[0] for path in listing.stdout.split("\0") if path})
+    return sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
+
+
 @dataclass(frozen=True)
 class Copy:
     """A copy of the source in `folder`, in which one mutant at a time is tested."""
@@ -253,7 +262,7 @@ class Copy:
 
     def make(self) -> None:
         """Copy what the tests read."""
-        for name in COPIED:
+        for name in _top_level_names(self.root):
             if (self.root / name).is_dir():
                 shutil.copytree(self.root / name, self.folder / name, ignore=shutil.ignore_patterns("__pycache__"))
             elif (self.root / name).is_file():

@@ -76,3 +76,6 @@ class Mirror(Perturbation):
         return PerturbedScene(
             lambda frames: [np.ascontiguousarray(read_image(scene.root / f.filename)[:, ::-1]) for f in frames]
         )
+
+
+MIRROR = Mirror()

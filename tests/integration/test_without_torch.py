@@ -19,6 +19,7 @@ NEEDS = (
     "core.checkpoints",
     "core.eval_mode",
     "core.pickled",
+    "core.tensor_boxes",
     "detectors.",
     "drivers.learned",
     "drivers.perceiving",

@@ -190,3 +190,21 @@ def test_the_papers_own_row_is_flagged_and_its_others_are_not() -> None:
     (fault,) = audit(published_attempts()).faults
     assert (fault.rule, fault.detector) == ("iterated", "PGD (paper)")
     assert "PGD with 10 steps at 5 px leaves 19.61 mAP, FGSM with 1 step at 5 px 8.77 mAP" in fault.text
+
+
+@pytest.mark.parametrize(
+    ("changed", "pairs"),
+    [
+        ({}, 1),
+        ({"options": "draws=2"}, 1),
+        ({"options": "restarts=2"}, 0),
+        ({"attack": "mifgsm"}, 0),
+        ({"loss": "margin"}, 0),
+        ({"norm": "l2", "change": 1.0}, 0),
+        ({"radius": 3.0, "change": 3.0}, 0),
+        ({"steps": 20}, 0),
+    ],
+)
+def test_transferred_attacks_are_compared_with_the_same_attack_alone(changed: dict[str, Any], pairs: int) -> None:
+    transferred = replace(BASE, source="other", score=0.25, gradient_error=None)
+    assert audit([replace(BASE, **changed), transferred]).compared["transfer"] == pairs

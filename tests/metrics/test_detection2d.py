@@ -151,3 +151,10 @@ def test_the_best_so_many_of_an_image_count() -> None:
     found = one([0, 0, 0, 1], [FAR, FAR, A, A], [0.9, 0.8, 0.7, 0.6])
     for most, hits in ((1, [False, True]), (2, [False, False, True]), (3, [False, False, True, True])):
         assert match_2d(truth, found, labels=1, max_detections=most).hit.tolist() == hits
+
+
+def test_boxes_without_an_area_overlap_nothing() -> None:
+    point = [5.0, 5.0, 5.0, 5.0]
+    matched = match_2d(one([0], [point]), one([0], [point], [0.5]), labels=1)
+    assert matched.hit.tolist() == [False]
+    assert average_precision(one([0], [point]), one([0], [point], [0.5]), labels=1)[0] == 0.0

@@ -235,12 +235,13 @@ def test_in_route_failure_without_a_route():
         (11, 20.0, (0, 0), 1),  # agent 0 is an agent like any other
     ],
 )
-def test_where_an_event_ends(steps, x, agents, events):
+@pytest.mark.parametrize("start", [0.0, -80.0])
+def test_where_an_event_ends(steps, x, agents, events, start):
     contact = np.zeros(steps)
     contact[[0, -1]] = 1
     agent = np.full(steps, -1)
     agent[[0, -1]] = agents
-    ego = np.linspace(0.0, x, steps)
+    ego = start + np.linspace(0.0, x, steps)
     assert collision_events(make_trace(steps, [(ego, 0, 0, 0)], contact=contact, contact_agent=agent)).sum() == events
 
 

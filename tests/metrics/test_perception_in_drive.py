@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from ssad.core.perception import Objects, Perceived, Tracks, no_objects
 from ssad.core.types import AgentKind, Contact, EpisodeTrace
 from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
 from ssad.metrics.perception_in_drive import (
+    BANDS,
+    REACH,
     cause_of_collision,
     component_metrics,
     hard_braking,
@@ -232,3 +235,29 @@ def test_how_a_detector_fails_is_what_a_perfect_one_takes_to_fail_alike() -> Non
     )
     assert all_["missed_burst"] is None
     assert all_["distance_share"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_who_is_touched_matters_more_than_who_is_near() -> None:
+    bodies = ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0), (5.0, 0.0, 0.0, 0.0))
+    touched = np.full(STEPS, -1)
+    touched[-3:] = 1
+    assert object_that_matters(make_trace(STEPS, bodies, contact_agent=touched)) == 1
+    assert object_that_matters(make_trace(STEPS, bodies)) == 2
+
+
+def test_the_nearest_agent_is_that_whose_end_is_nearest() -> None:
+    """A lorry of 12 m whose middle is 11 m away ends 5 m away; a car of 4.5 m, 8 m away, ends at 5.75 m."""
+    bodies = ((0.0, 0.0, 0.0, 0.0), (11.0, 0.0, 0.0, 0.0), (8.0, 0.0, 0.0, 0.0), (14.0, 0.0, 0.0, 0.0))
+    trace = make_trace(STEPS, bodies)
+    trace.length[:] = [4.5, 12.0, 4.5, 15.0]
+    assert object_that_matters(trace) == 1
+    trace.active[:, 1] = False
+    assert object_that_matters(trace) == 2
+    trace.active[:, 1:] = False
+    assert object_that_matters(trace) is None
+
+
+def test_bands_of_distance_join_and_reach_as_far_as_objects_count() -> None:
+    assert BANDS[0][0] == 0.0
+    assert BANDS[-1][1] == REACH
+    assert all(near[1] == far[0] for near, far in itertools.pairwise(BANDS))

@@ -40,3 +40,13 @@ def test_few_families_have_no_interval_and_what_does_not_vary_no_correlation() -
     assert few.method == "none"
     assert math.isnan(family_correlation([1, 2, 3], [0, 0, 0], ["a", "b", "c"]).mean)
     assert family_correlation([1, 2, math.nan, 4], [1, 2, 9, 4], list("abcd")).n == 3
+
+
+def test_every_family_is_drawn() -> None:
+    """Without the family that breaks the order the correlation is 1 in each draw."""
+    for outlier in (0, 5):
+        first = np.arange(6.0)
+        second = first.copy()
+        second[outlier] = 10.0 if outlier == 0 else -10.0
+        estimate = family_correlation(first, second, list("abcdef"))
+        assert estimate.low < 0.5 < estimate.high == pytest.approx(1.0)

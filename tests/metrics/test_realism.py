@@ -69,3 +69,19 @@ def test_the_score_is_the_weighted_likelihood() -> None:
     assert wasserstein(values(20.0), reference)["speed"] == pytest.approx(14.0)
     assert wasserstein(values(20.0), reference)["acceleration"] == 0.0
     assert math.isnan(wasserstein(pooled([]), reference)["speed"])
+
+
+def test_the_histograms_are_the_challenges() -> None:
+    """WOSAC's configuration of 2024: limits and bins of the kinematic, interactive and map-based features."""
+    challenge = {
+        "speed": (0.0, 25.0, 10),
+        "acceleration": (-12.0, 12.0, 11),
+        "yaw_rate": (-0.628, 0.628, 11),
+        "yaw_acceleration": (-3.14, 3.14, 11),
+        "nearest": (-5.0, 40.0, 10),
+        "ttc": (0.0, 5.0, 10),
+        "road_edge": (-20.0, 40.0, 10),
+        "collision": (0.0, 1.0, 2),
+        "off_road": (0.0, 1.0, 2),
+    }
+    assert {name: (feature.low, feature.high, feature.bins) for name, feature in FEATURES.items()} == challenge

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ssad.core.detections import Detections, Truth
+from ssad.metrics.intervals import replicate_limits
 from ssad.metrics.target_attacks import TargetSighting, _precisions, precision, sighting, target_scores
 
 TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
@@ -149,3 +150,49 @@ def test_precision_of_drawn_drives_is_that_of_their_pictures() -> None:
             naive.append(precision(picked, target_only=target_only, min_score=least))
         assert _precisions(pictures, of, drawn, target_only=target_only, min_score=least) == naive
         assert len(set(naive)) > 10
+
+
+def test_a_box_on_the_neighbour_does_not_find_the_target() -> None:
+    """It covers half of the target, but all of the only other object."""
+    neighbour = [30.0, 10.0, 70.0, 40.0]
+    truth = Truth(torch.tensor([1, 0]), torch.tensor([TARGET, neighbour]))
+    found = Detections(torch.tensor([0.9]), torch.tensor([2]), torch.tensor([neighbour]))
+    assert sighting("a", found, truth).any_class == 0.0
+    alone = Truth(torch.tensor([1]), torch.tensor([TARGET]))
+    assert sighting("a", found, alone).any_class == pytest.approx(0.9)
+
+
+def test_the_interval_of_ap_is_that_of_its_replicates() -> None:
+    pictures = [
+        seen(
+            (TARGET, 0.5 + 0.05 * k),
+            (OTHER, 0.3 + 0.07 * k),
+            drive=str(k),
+            real=(TARGET,) if k % 3 else (TARGET, OTHER),
+        )
+        for k in range(7)
+    ]
+    scores = target_scores(pictures)
+    for name in ("AP50", "AP50_all"):
+        variance = np.var(scores["replicates"][name], ddof=1)
+        limits = replicate_limits(np.asarray(scores["metrics"][name]), np.asarray(variance), 7, bounded=True)
+        assert scores["intervals"][name] == pytest.approx([float(limit) for limit in limits], abs=1e-4)
+
+
+def test_a_target_found_at_the_threshold_could_not_be_lost() -> None:
+    clean = [seen((TARGET, 0.25)), seen((TARGET, 0.26))]
+    metrics = target_scores([seen(), seen((TARGET, 0.9))], clean)["metrics"]
+    assert [metrics[name] for name in ("ASR_25", "ASR_any_25", "ASR_all_25")] == [0.0, 0.0, 0.0]
+
+
+def test_drives_with_nothing_to_count_are_drawn_too() -> None:
+    """The true boxes of the last drives are of crowds: they add false boxes to a draw, and nothing to find."""
+    crowd = np.ones(1, np.bool_)
+    pictures = [seen((TARGET, 0.9 - 0.1 * k), (OTHER, 0.95), drive=str(k)) for k in range(3)]
+    pictures += [
+        TargetSighting(str(k), np.array([OTHER]), np.array([0.99]), np.array([TARGET]), crowd) for k in range(3, 6)
+    ]
+    drive_draws = [np.array([5, 0, 1, 2, 3, 4]), np.array([0, 0, 5, 5, 4, 1])]
+    drawn_scores = [precision([pictures[k] for k in draw], target_only=False, min_score=0.0) for draw in drive_draws]
+    drives = np.arange(6, dtype=np.int32)
+    assert _precisions(pictures, drives, drive_draws, target_only=False, min_score=0.0) == drawn_scores

@@ -300,3 +300,23 @@ def test_pairs_of_cells():
     assert (e.mean, e.n, e.failed, e.clusters) == (4.0, 1, 2, 1)
     nothing = paired_difference({"a": first["a"]}, {"c": second["c"]})
     assert (nothing.n, nothing.failed) == (0, 2)
+
+
+def test_the_margins_of_a_difference_of_shares_are_correlated():
+    """Donner and Zou's limits, worked out from the two shares: 12 and 5 of 40 cells differ in one way and the other."""
+    first = {str(k): CaseValue(float(k < 12), str(k), f"a{k}") for k in range(40)}
+    second = {str(k): CaseValue(float(12 <= k < 17), str(k), f"b{k}") for k in range(40)}
+    gained, lost = (estimate(list(cases.values()), "share") for cases in (first, second))
+    phi = -math.sqrt(0.3 * 0.125 / (0.7 * 0.875))
+    margins = [
+        math.sqrt(one * one + other * other - 2.0 * phi * one * other)
+        for one, other in ((0.3 - gained.low, lost.high - 0.125), (gained.high - 0.3, 0.125 - lost.low))
+    ]
+    difference = paired_difference(first, second, kind="share")
+    assert difference.low == pytest.approx(0.175 - margins[0])
+    assert difference.high == pytest.approx(0.175 + margins[1])
+
+
+def test_drawn_signs_leave_room_for_the_observed_ones():
+    """18 clusters that all have one sign: none of nine draws has it, and the p-value is 1 in 10, not 0."""
+    assert sign_flip_test(shares(30, 40, "a"), shares(12, 40, "b"), draws=9) == pytest.approx(1 / 10)

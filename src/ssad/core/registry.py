@@ -6,9 +6,11 @@ cannot be taken by a package. Where a system or a detector is named, arguments a
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import inspect
+import json
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -39,7 +41,8 @@ class Reference:
         """Parse a reference.
 
         Args:
-            text: Such as "mine:Mine?checkpoint=a.pt&reach=20@a": values are numbers, true, false or texts.
+            text: Such as "mine:Mine?checkpoint=a.pt&reach=20@a": values are numbers, true, false, lists and objects
+                of JSON such as [1,2], or texts.
 
         Raises:
             ConfigError: An argument is not KEY=VALUE, or the label is empty.
@@ -62,9 +65,12 @@ class Reference:
 
 
 def _value(text: str) -> Any:
-    """Return an argument's value: true, false, a number, or the text."""
+    """Return an argument's value: true, false, a number, a list or object of JSON, or the text."""
     if text in ("true", "false"):
         return text == "true"
+    if text.startswith(("[", "{")):
+        with contextlib.suppress(ValueError):
+            return json.loads(text)
     for number_type in (int, float):
         try:
             return number_type(text)

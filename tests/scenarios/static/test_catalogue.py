@@ -57,6 +57,25 @@ def test_a_form_means_a_perturbation(form: Any, family: str, title: str, severit
     assert again.model_dump(mode="json") == written
 
 
+@pytest.mark.parametrize(
+    ("options", "settings"),
+    [
+        ({"flip": True, "at": [1, 2]}, "at=[1,2]&flip=true"),
+        ({"flip": False, "share": 0.5}, "flip=false&share=0.5"),
+        ({"of": {"a": 1}, "kind": "near"}, 'kind=near&of={"a":1}'),
+    ],
+)
+def test_a_title_names_the_settings_and_is_read_again(options: dict[str, Any], settings: str) -> None:
+    entry = parse_perturbation({f"{OWN}:Mirror": options})
+    assert entry.title == f"{OWN}:Mirror?{settings}"
+    again = parse_perturbation(entry.title)
+    assert (again.name, again.options) == (entry.name, options)
+
+
+def test_an_object_that_is_made_already_has_no_severities() -> None:
+    assert [one.severity for one in parse_perturbation(f"{OWN}:MIRROR").at([1, 5])] == [1]
+
+
 def test_every_registered_name_is_made_and_written_as_itself() -> None:
     names = registered_names()
     assert set(names.values()) >= set(FAMILIES)
