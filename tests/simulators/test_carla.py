@@ -477,7 +477,7 @@ def test_a_batch_and_a_bad_address_are_refused(carla: ModuleType) -> None:
 )
 def test_a_run_goes_on(fault: str, code: int, more: str, tmp_path: Path) -> None:
     """Through the command: a server that dies fails episodes, and one that never answers is a line."""
-    path = f"{STAND_IN}:{Path(adapter.__file__).parent.parent.parent}"
+    path = f"{STAND_IN}:{Path(adapter.__file__).parents[3]}"
     done = ssad_process(
         "run",
         "precrash",
