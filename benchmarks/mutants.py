@@ -244,13 +244,13 @@ def seconds_by_file(report: Path, folder: Path) -> Counter[str]:
 
 
 def _top_level_names(root: Path) -> list[str]:
-    """Files and folders of the checkout that git knows or would add; outside a checkout, all that are not hidden."""
+    """Files and folders of the checkout that git knows or would add; without git, all but environments and caches."""
     command = ["git", "-C", str(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     with contextlib.suppress(OSError):
         listing = subprocess.run(command, capture_output=True, text=True, check=False)
         if listing.returncode == 0 and listing.stdout:
             return sorted({path.split("/")[0] for path in listing.stdout.split("\0") if path})
-    return sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
+    return sorted(path.name for path in root.iterdir() if path.name != ".venv" and not path.name.endswith("_cache"))
 
 
 @dataclass(frozen=True)
