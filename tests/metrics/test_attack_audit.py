@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -208,3 +209,24 @@ def test_the_papers_own_row_is_flagged_and_its_others_are_not() -> None:
 def test_transferred_attacks_are_compared_with_the_same_attack_alone(changed: dict[str, Any], pairs: int) -> None:
     transferred = replace(BASE, source="other", score=0.25, gradient_error=None)
     assert audit([replace(BASE, **changed), transferred]).compared["transfer"] == pairs
+
+
+def test_two_standard_errors_are_of_the_differences_around_their_mean() -> None:
+    first, second = replace(BASE, draws=(0.11, 0.12, 0.08, 0.09)), replace(BASE, draws=(0.05, 0.06, 0.06, 0.07))
+    differences = (0.06, 0.06, 0.02, 0.02)  # of mean 0.04
+    margin = 2.0 * math.sqrt(sum((difference - 0.04) ** 2 for difference in differences) / 3)
+    assert margin > 0.02 * CLEAN
+    assert weaker(replace(first, score=0.1), replace(second, score=0.1 - 1.01 * margin))
+    assert not weaker(replace(first, score=0.1), replace(second, score=0.1 - 0.99 * margin))
+
+
+@pytest.mark.parametrize(("score", "named"), [(3.0, False), (3.01, True)])
+def test_restarts_may_gain_a_twentieth_of_the_clean_score(score: float, named: bool) -> None:
+    few = replace(BASE, clean=20.0, score=score, change=None, used=None)
+    verdict = audit([few, replace(few, options="restarts=3", score=2.0)])
+    assert ("restarts" in rules(verdict)) == named
+
+
+def test_a_picture_may_be_as_far_from_the_clean_one_as_the_budget() -> None:
+    assert "budget" not in rules(audit([replace(BASE, change=BASE.radius)]))
+    assert "budget" in rules(audit([replace(BASE, change=BASE.radius * 1.001)]))

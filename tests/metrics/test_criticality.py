@@ -209,3 +209,10 @@ def test_the_last_step_and_the_cap_count():
     assert post_encroachment_time(late(101)) == pytest.approx(10.0)
     assert post_encroachment_time(late(31), cap=2.9) == 2.9
     assert min_ttc(make_trace(1, [(0, 0, 0, 10), (44, 0, 0, 0)]), cap=3.0) == 3.0
+
+
+def test_bodies_side_by_side_that_drive_alike_never_touch():
+    """Their distance across the road does not change: no speed along it brings them together."""
+    first, second = np.array([0.0, 0.0, 0.0, 4.0, 2.0]), np.array([20.0, 3.0, 0.0, 4.0, 2.0])
+    assert time_to_collision(first, second, np.array([5.0, 0.0])) == math.inf
+    assert time_to_collision(first, second - [0, 2.5, 0, 0, 0], np.array([5.0, 0.0])) == pytest.approx(16.0 / 5.0)

@@ -261,3 +261,51 @@ def test_bands_of_distance_join_and_reach_as_far_as_objects_count() -> None:
     assert BANDS[0][0] == 0.0
     assert BANDS[-1][1] == REACH
     assert all(near[1] == far[0] for near, far in itertools.pairwise(BANDS))
+
+
+@pytest.mark.parametrize(("off", "found"), [(1.99, 1.0), (2.0, 0.0)])
+def test_an_object_is_found_within_2_m(off: float, found: float) -> None:
+    trace = make_trace(STEPS, ((0.0, 0.0, 0.0, 0.0), (20.0, 0.0, 0.0, 0.0)))
+    metrics = component_metrics(trace, perceived(trace, lambda k: [(20.0, off)], lambda k: []), phantom_score=0.3)
+    assert (metrics["recall"], metrics["target_recall"]) == (found, found)
+
+
+@pytest.mark.parametrize(("off", "phantoms"), [(5.0, 0.0), (5.01, 1.0)])
+def test_a_phantom_is_more_than_5_m_from_everybody(off: float, phantoms: float) -> None:
+    trace = make_trace(STEPS, ((0.0, 0.0, 0.0, 0.0), (20.0, 0.0, 0.0, 0.0)))
+    metrics = component_metrics(trace, perceived(trace, lambda k: [(20.0, off)], lambda k: []), phantom_score=0.3)
+    assert metrics["phantoms"] == phantoms
+
+
+@pytest.mark.parametrize(("place", "stood"), [((0.0, 0.0), False), ((0.1, 0.0), True), ((-0.1, 0.0), False)])
+def test_a_phantom_before_the_ego_is_ahead_of_its_middle(place: tuple[float, float], stood: bool) -> None:
+    trace = make_trace(STEPS, ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0)))
+    seconds = phantom_stop(trace, perceived(trace, lambda k: [], lambda k: [place]))
+    assert (seconds > 0.0) == stood
+
+
+def test_tracks_on_the_ego_itself_are_false() -> None:
+    """The ego is nobody that is out of view: what is believed where it is counts against the tracks."""
+    trace = make_trace(STEPS, ((0.0, 0.0, 0.0, 0.0), (20.0, 0.0, 0.0, 0.0)))
+    found = track_metrics(trace, perceived(trace, lambda k: [], lambda k: [(20.0, 0.0), (0.0, 0.0)]))
+    assert found["MOTA"] == 0.0
+
+
+def test_a_sign_far_to_the_side_is_not_one_before_the_ego() -> None:
+    trace = make_trace(STEPS, ((0.0, 0.0, 0.0, 0.0),))
+    read = [(0.0, np.array([[10.0, 4.9]]))]
+    assert sign_metrics(trace, Perceived([], [], CAMERAS, read), np.array([[10.0, 4.9]]))["sign_recall"] == 1.0
+    assert sign_metrics(trace, Perceived([], [], CAMERAS, read), np.array([[10.0, 5.1]]))["sign_recall"] is None
+
+
+def test_a_look_at_the_step_itself_counts_for_the_cause() -> None:
+    """It finds the object from the first look on at which something is found, not from the look after it."""
+    struck = np.full(STEPS, -1)
+    struck[-1] = 1
+    trace = make_trace(STEPS, (straight(0.0, 0.0, 0.0, 5.0, STEPS), (25.0, 0.0, 0.0, 0.0)), contact_agent=struck)
+    looks = [(k * trace.dt, objects((25.0, 0.0)) if k >= 20 else objects()) for k in range(STEPS)]
+    told = cause_of_collision(trace, Perceived(looks, [], CAMERAS))
+    assert told is not None
+    # from 3 s before the contact to 0.5 s before it: steps 10 to 34, of which 15 have found it and no track has
+    assert told["shares"]["late"] == pytest.approx(15 / 25)
+    assert told["shares"]["missed"] == pytest.approx(10 / 25)

@@ -196,3 +196,31 @@ def test_drives_with_nothing_to_count_are_drawn_too() -> None:
     drawn_scores = [precision([pictures[k] for k in draw], target_only=False, min_score=0.0) for draw in drive_draws]
     drives = np.arange(6, dtype=np.int32)
     assert _precisions(pictures, drives, drive_draws, target_only=False, min_score=0.0) == drawn_scores
+
+
+@pytest.mark.parametrize(("score", "found"), [(0.25, 0.0), (0.2501, 1.0)])
+def test_a_target_is_found_above_the_threshold(score: float, found: float) -> None:
+    assert target_scores([seen((TARGET, score))])["metrics"]["found_25"] == found
+
+
+def test_a_score_at_the_threshold_is_lost() -> None:
+    clean, attacked = [seen((TARGET, 0.9), (OTHER, 0.9), real=(TARGET, OTHER))], [seen((TARGET, 0.25), (OTHER, 0.26))]
+    attacked = [seen((TARGET, 0.25), (OTHER, 0.26), real=(TARGET, OTHER))]
+    assert target_scores(attacked, clean)["metrics"]["ASR_all_25"] == 1 / 2
+
+
+def test_boxes_that_share_no_area_do_not_overlap() -> None:
+    """A true box of a thousandth of a pixel: a box elsewhere covers nothing of it."""
+    dot = [10.0, 10.0, 10.03, 10.03]
+    found = Detections(torch.tensor([0.9]), torch.tensor([2]), torch.tensor([OTHER]))
+    assert sighting("a", found, Truth(torch.tensor([1]), torch.tensor([dot]))).any_class == 0.0
+
+
+def test_five_drives_are_enough_for_an_interval() -> None:
+    pictures = [seen((TARGET, 0.4 + 0.1 * k), drive=str(k)) for k in range(5)]
+    assert set(target_scores(pictures)["intervals"]) >= {"AP50", "found_50"}
+    assert target_scores(pictures)["intervals"]["AP50"]
+    assert target_scores(pictures)["intervals"]["found_50"]
+    few = target_scores(pictures[:4])["intervals"]
+    assert few.get("AP50") is None
+    assert few.get("found_50") is None

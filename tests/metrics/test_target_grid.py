@@ -38,3 +38,10 @@ def test_without_an_attack_the_worst_cell_is_the_detectors() -> None:
     found = grid_scores(rows, [seen(0.9), seen(0.0)], None, floor=0.9)
     assert found["worst"] == [20.0, 180.0, 0.0]
     assert [view[5] for view in found["views"]] == [None, None]
+
+
+def test_scores_are_rounded() -> None:
+    """Confidences to four places, AP50 to six."""
+    found = grid_scores([row(5.0, 0.0)] * 2, [seen(0.91234567)] * 2, [seen(0.12345678), seen(0.0)], floor=0.9)
+    assert found["views"][0][4:] == [0.9123, 0.1235]
+    assert found["cells"][0][4] == round(51 / 101, 6)

@@ -144,3 +144,9 @@ def test_in_continuous_integration_nothing_is_compared_with_less(
     monkeypatch.setenv("SSAD_CI", variable)
     with pytest.raises(outcome, match="no module trackeval_of_nobody: install it"):
         import_or_skip("trackeval_of_nobody", "install it")
+
+
+def test_one_object_in_one_frame_is_enough() -> None:
+    scores = track_scores([frame((0, 0), (-1, 4), (-1, 5))])
+    assert scores is not None
+    assert scores.mota == 1.0 - 2.0
