@@ -153,3 +153,14 @@ def test_grades_and_other_systems_have_tables_of_their_own(found: Run) -> None:
     assert moved is not None
     assert moved.rows[0].head == ("king", "autopilot", "ppo")
     assert [c.mean for c in moved.rows[0].cells] == pytest.approx([0.75, 0.0, 0.75])
+
+
+def test_the_front_of_a_body_is_marked() -> None:
+    """The ego drives east: its right edge has a thick dark line, its left one a thin one."""
+    graph = load_town("Twinford")
+    x, y = graph.xy[graph.points(0)][0].tolist()
+    picture = found_view(make_trace(31, [(x, y, 0.0, 0.0)], size=(8.0, 6.0)), graph, [], size=400)
+    dark = (picture.astype(int).sum(-1) < 3 * 60)[195:205]  # rows through its middle
+    columns = np.flatnonzero(dark.all(0))
+    front, rear = columns[columns > 200], columns[columns < 200]
+    assert 0 < len(rear) < len(front)

@@ -9,6 +9,7 @@ import io
 import json
 import re
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.browser import ask
+from helpers.metric_traces import make_trace
 from helpers.run_folder import driving_lines, write_run
 
 from ssad.core import safeio
@@ -25,8 +27,9 @@ from ssad.core.safeio import plain
 from ssad.core.traces import load_trace, save_trace
 from ssad.drivers import make_system
 from ssad.experiments.driving.driving_tables import precrash_table
-from ssad.experiments.driving.embed import SCALE, episode_data, origin, pack
+from ssad.experiments.driving.embed import SCALE, episode_data, origin, pack, town_data
 from ssad.experiments.driving.episodes import load_episodes
+from ssad.experiments.driving.page import _tile
 from ssad.experiments.runs import write_report
 from ssad.metrics import episode_metrics
 from ssad.report import write_video
@@ -394,3 +397,19 @@ def test_a_video_plays_and_seeks_in_a_browser(run_folder: Path, tmp_path: Path) 
     assert found["duration"] == pytest.approx(len(trace.accel) * trace.dt, abs=0.2)
     assert found["seen"][0] == found["seen"][2] != found["seen"][1]
     assert found["at"] == pytest.approx(found["duration"], abs=0.2)
+
+
+def test_a_tile_says_where_it_averages_several_groups(run_folder: Path) -> None:
+    names = [part["name"] for part in _tile(load_episodes(load_run(run_folder)), "blind")["parts"]]
+    assert names == ["pre-crash, mean of the groups", "natural traffic"]
+
+
+def test_the_roads_beside_a_route_are_kept() -> None:
+    """Lanes of the cell of the grid that a route of one point lies in are kept, those far away are not."""
+    graph = load_town("Twinford")
+    lane = max(range(graph.lanes), key=lambda n: float(graph.length[n]))
+    middle = graph.xy[graph.points(lane)][len(graph.xy[graph.points(lane)]) // 2].astype(np.float64)
+    trace = make_trace(2, [(*middle, 0.0, 0.0)])
+    near = town_data(graph, [replace(trace, route=np.array([middle], np.float32))])
+    far = town_data(graph, [replace(trace, route=np.array([middle + 1e5], np.float32))])
+    assert len(near["strips"]) > len(far["strips"]) == 0

@@ -18,7 +18,7 @@ from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.recorder import PerceptionRecorder
 from ssad.experiments.gap.drive_sheet import RecordedDrive
-from ssad.experiments.gap.mcap import need_mcap, write_mcap
+from ssad.experiments.gap.mcap import COLOURS, need_mcap, write_mcap
 from ssad.world.rollout import rollout
 
 
@@ -68,6 +68,7 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
         assert abs(time - step * trace.dt) < 1e-6
         np.testing.assert_allclose([message.translation.x, message.translation.y], [trace.x[step, 0], trace.y[step, 0]])
         np.testing.assert_allclose(message.rotation.z, yaw_to_quaternion(trace.yaw[step, 0])[3])
+        assert message.translation.z == 0.0
     (first, *_) = told["/truth"]
     assert len(first[1].entities[0].cubes) == int(trace.active[0].sum())
     found = {round(time, 3): message.entities[0].cubes for time, message in told["/detections"]}
@@ -101,3 +102,7 @@ def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(ConfigError, match=r"--mcap needs .*\[view\]"):
         need_mcap()
+
+
+def test_colours_are_shares() -> None:
+    assert all(0.0 <= share <= 1.0 for colour in COLOURS.values() for share in colour)

@@ -24,9 +24,16 @@ from ssad.detectors.on_scenes import SampleBoxes, match_boxes
 from ssad.engine.kind import Job, Resources
 from ssad.engine.run import run
 from ssad.experiments.perception.digital import attack_scores
-from ssad.experiments.perception.digital.attack_scores import by_distance, target_success, worst_by_sample, worst_of
+from ssad.experiments.perception.digital.attack_scores import (
+    _recognised_classes,
+    by_distance,
+    target_success,
+    worst_by_sample,
+    worst_of,
+)
 from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
 from ssad.experiments.perception.digital.page import attempts_of, load_digital_run, main_table
+from ssad.experiments.perception.digital.points import points_of
 from ssad.experiments.perception.digital.run import Resampling, setting_of
 from ssad.experiments.perception.digital.tables import (
     defence_table,
@@ -38,6 +45,7 @@ from ssad.experiments.perception.digital.tables import (
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, boxes_path, read_scenes, truth_of
 from ssad.experiments.perception.shifts.page import interval_note
 from ssad.experiments.runs import write_report
+from ssad.metrics.detection_boxes import BoxTable
 from ssad.report.load import load_run
 from ssad.scenarios.static.digital import scene_attacker
 from ssad.scenarios.static.digital.chosen_object import NEAREST, chosen_first, chosen_object, chosen_places
@@ -419,3 +427,18 @@ def test_bad_rows_end_in_one_line(root: Path, case: tuple[dict[str, Any], str]) 
     with pytest.raises(SSADError, match=words) as caught:
         Digital().plan(suite_of(root, **changes))
     assert "\n" not in str(caught.value)
+
+
+def test_an_attack_behind_a_defence_is_compared_with_the_bare_detector(root: Path) -> None:
+    points = points_of(suite_of(root))
+    assert any(point.defence and point.aware for point in points)
+    assert all(not point.aware for point in points if not point.defence)
+
+
+def test_objects_near_no_box_have_no_class() -> None:
+    truth, found = BoxTable.empty(3), BoxTable.empty(2)
+    truth.centre[:, 0] = (0.0, 50.0, 0.0)
+    truth.sample[:] = (0, 0, 1)
+    found.label[:], found.score[:] = (4, 7), (0.9, 0.8)
+    found.centre[:, 0] = (0.5, 30.0)
+    assert _recognised_classes(truth, found).tolist() == [4, -1, -1]
