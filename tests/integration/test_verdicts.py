@@ -227,15 +227,20 @@ def test_of_rows_of_one_attack_the_strongest_counts_beside_noise_of_its_size(tmp
     assert harmless == "d: mAP 50% clean; no attack takes any of it."
 
 
-def test_what_failed_counts_as_in_the_tables(tmp_path: Path) -> None:
+def test_what_failed_is_named_and_in_no_share(tmp_path: Path) -> None:
     failed = {"status": "failed", "reason": "hung", "metrics": {}}
     drives = [{"system": "s", "metrics": {"collision": True, "route_completion": 0.5}}, {"system": "s"} | failed]
     said = told(tmp_path / "drives", "driving", drives)
-    assert said == "s collided in 1 of 2 drives and completed 50% of its routes."
-    assert told(tmp_path / "none", "driving", drives[1:]) == "s collided in 0 of 1 drives."
+    assert said == (
+        "s collided in 1 of 1 drives; 1 more failed, so its collision rate lies in 0.00–1.00 whatever they were, "
+        "and completed 50% of its routes."
+    )
+    assert told(tmp_path / "none", "driving", drives[1:]) == "s has no collision rate: all of its 1 drives failed."
     alive = {"system": "s", "generator": "king", "metrics": {"survived": True, "CR": False}}
     said = told(tmp_path / "searches", "adversarial", [alive, alive, {"system": "s", "generator": "king"} | failed])
-    assert said == "No generator makes s collide in scenarios that it survives unchanged: king in 0 of 3 (1 failed)."
+    assert (
+        said == "No generator makes s collide in scenarios that it survives unchanged: king in 0 of 2 (1 more failed)."
+    )
     assert told(tmp_path / "dead", "adversarial", [{"system": "s", "generator": "king"} | failed]) == "See the table."
 
 

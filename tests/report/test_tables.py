@@ -103,5 +103,8 @@ def test_a_failed_cell_has_no_metric_and_counts_as_failed() -> None:
     assert (case.cluster, case.case, case.failed) == ("route", "motion", True)
     assert case_of(LINES[0], 0.5).cluster == LINES[0]["key"]
     cell = metric_cell([*LINES[:3], failed], "collision", "share")
-    assert (cell.n, cell.failed) == (4, 1)
-    assert cell.mean == pytest.approx(1 / 4)
+    assert (cell.n, cell.failed) == (3, 1)
+    assert cell.mean == pytest.approx(1 / 3)
+    assert cell.count == "n = 3, 1 failed"
+    never = metric_cell([failed], "collision", "share")
+    assert (never.text, never.interval, never.count) == ("n/a", "", "n = 0, 1 failed")

@@ -1,8 +1,8 @@
 """Aggregation of episodes to the numbers of a table, with explicit denominators.
 
-A failed episode is never dropped silently: it counts in the denominator of every proportion as unknown (no event for
-the mean, an event for the upper limit of the interval), its route completion and driving score are 0, and every
-other mean is over the episodes that ran, whose number is `Estimate.n`. Unmeasured values are left out.
+Every mean is over the episodes that ran, whose number is `Estimate.n`. A failed episode is never dropped silently:
+`Estimate.failed` counts it, and the limits of every share and of every bounded value hold whatever it was. A system
+all of whose episodes failed has no numbers. Unmeasured values are left out.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ class Metric:
 
     Attributes:
         kind: "share" of episodes where the field is not 0, "bounded" by 0 and `scale`, or "mean".
-        failed: Value of a failed episode; NaN: not counted, or unknown in a share.
     """
 
     symbol: str
@@ -47,7 +46,6 @@ class Metric:
     kind: Kind
     title: str
     scale: float = 1.0
-    failed: float = math.nan
 
 
 METRICS: dict[str, Metric] = {
@@ -56,7 +54,7 @@ METRICS: dict[str, Metric] = {
         Metric("CR", "collision", "", "lower", "share", "collision rate"),
         Metric("OR", "off_road", "m", "lower", "mean", "distance driven off the road"),
         Metric("DR", "distance_to_route", "m", "lower", "mean", "distance to the route"),
-        Metric("RC", "route_completion", "", "higher", "bounded", "route completion", failed=0.0),
+        Metric("RC", "route_completion", "", "higher", "bounded", "route completion"),
         Metric("TS", "time", "s", "lower", "mean", "time spent"),
         Metric("RR", "red_lights", "", "lower", "mean", "red lights run"),
         Metric("SS", "stop_signs", "", "lower", "mean", "stop signs run"),
@@ -77,7 +75,7 @@ METRICS: dict[str, Metric] = {
         Metric("CR_cyclist", "collisions_cyclist", "", "lower", "share", "episodes that hit a cyclist"),
         Metric("CR_static", "collisions_static", "", "lower", "share", "episodes that hit something else"),
         Metric("IF", "in_route_failure", "", "lower", "share", "episodes that left the route"),
-        Metric("DS", "driving_score", "", "higher", "bounded", "CARLA driving score", scale=100.0, failed=0.0),
+        Metric("DS", "driving_score", "", "higher", "bounded", "CARLA driving score", scale=100.0),
         Metric("TTC", "min_ttc", "s", "higher", "bounded", "least time to collision", scale=10.0),
         Metric("PET", "pet", "s", "higher", "bounded", "least post-encroachment time", scale=10.0),
         Metric("MD", "min_distance", "m", "higher", "mean", "least distance to another agent"),
@@ -179,8 +177,6 @@ def aggregate_groups(outcomes: Iterable[tuple[str, EpisodeOutcome]]) -> list[Gro
 def _value(outcome: EpisodeOutcome, metric: Metric) -> CaseValue:
     """Return the value that an episode contributes to a metric."""
     number = None if outcome.metrics is None else getattr(outcome.metrics, metric.field)
-    if outcome.metrics is None:
-        number = metric.failed
     value = math.nan if number is None else float(number)
     if metric.kind == "share" and not math.isnan(value):
         value = float(value > 0.0)
@@ -191,7 +187,8 @@ def _overall(outcomes: Sequence[EpisodeOutcome]) -> Estimate:
     """Return SafeBench's score of the means, averaged over the groups, with the interval of the unrounded score.
 
     The score is a weighted sum of means, so an episode has one too: from its collision, distances, incomplete
-    route and time. For a failed episode, distances and time are the group's means, and the collision is unknown.
+    route and time. For a failed episode, distances and time are the group's means; whether it collided and how far it
+    came is unknown.
     """
     groups: dict[str, list[EpisodeOutcome]] = {}
     for outcome in outcomes:
@@ -207,17 +204,25 @@ def _overall(outcomes: Sequence[EpisodeOutcome]) -> Estimate:
         if any(math.isnan(value) for value in means.values()):
             continue
         scores.append(overall_score(means))
-        # Whether a failed episode collided is unknown: the lower limit assumes none, the upper one all.
+        # The lower limit assumes that failed episodes completed their routes, the upper one that they collided at once.
         for case_values, unknown in ((optimistic, 0.0), (pessimistic, 1.0)):
             for outcome in members:
-                terms = dict(means) | {"CR": unknown, "RC": 0.0}
+                terms = dict(means) | {"CR": unknown, "RC": 1.0 - unknown}
                 if outcome.metrics is not None:
                     terms = {name: float(getattr(outcome.metrics, METRICS[name].field)) for name in means}
                 terms["IR"] = 1.0 - terms["RC"]
                 score = math.fsum(WEIGHTS[name] * terms[name] / DIVISORS[name] for name in WEIGHTS)
                 case_values.append(CaseValue(score, outcome.cluster, outcome.case, group, outcome.metrics is None))
+    failed = estimate([_value(outcome, METRICS["CR"]) for outcome in outcomes], "share").failed
     if not scores:
-        return replace(NOTHING, failed=sum(outcome.metrics is None for outcome in outcomes))
+        return replace(NOTHING, failed=failed)
     mean = math.fsum(scores) / len(scores)
     lower_estimate, upper_estimate = estimate(optimistic, "mean", min_value=0.0), estimate(pessimistic, "mean")
-    return replace(lower_estimate, mean=mean, low=min(lower_estimate.low, mean), high=max(upper_estimate.high, mean))
+    return replace(
+        lower_estimate,
+        mean=mean,
+        low=min(lower_estimate.low, mean),
+        high=max(upper_estimate.high, mean),
+        n=lower_estimate.n - lower_estimate.failed,
+        failed=failed,
+    )

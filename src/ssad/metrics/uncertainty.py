@@ -56,10 +56,11 @@ class Estimate:
         mean: The mean over the distinct cases, or over the strata's means.
         low: Lower limit, or the smallest cluster mean where method is "range".
         high: Upper limit, or the largest cluster mean where method is "range".
-        n: Distinct cases behind the mean (copies count once).
-        failed: Cases without a value because they failed.
+        n: Distinct cases behind the mean (copies count once), all of which have a value.
+        failed: Cases that failed; they widen the limits of a share or of a bounded value.
         method: Meaning of low and high: "beta", "t" (95 % intervals), "range" (over the clusters, which are too
-            few or too similar for an interval), "none".
+            few or too similar for an interval), "bounds" (one cluster, its failed cases once all 0 and once all at the
+            upper bound), "none".
         clusters: Distinct clusters behind the mean.
     """
 
@@ -87,50 +88,58 @@ NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, min_value: float = -math.inf) -> Estimate:
     """Mean of case values with its 95 % interval; with several strata, the unweighted mean of their means.
 
+    The mean is over the cases that have a value. Failed cases, whose outcome is unknown, widen the limits of a share
+    or of a bounded value: all of them count once as 0 and once as the upper bound, so the interval holds whatever
+    they were. Where no case has a value there is no mean and no interval.
+
     Args:
-        values: what the cases gave. Copies (same case, same stratum) count once; NaN is left out.
-        kind: "share": values are 0 or 1, and a failed case without a value counts in n after all, as 0 in the mean and
-            the lower limit and as 1 in the upper one, so the interval holds whatever it was. "bounded": values lie in
-            [0, `scale`]. "mean": any values.
-        scale: upper bound of a bounded value.
-        min_value: lower bound of a mean; the interval does not go below it.
+        values: Values of the cases. Copies (same case, same stratum) count once; a value that was not measured is
+            left out.
+        kind: "share": values are 0 or 1. "bounded": values lie in [0, `scale`]. "mean": any values, whose failed cases
+            have no bounds and are only counted.
+        scale: Upper bound of a bounded value.
+        min_value: Lower bound of a mean; the interval does not go below it.
 
     Returns:
         The estimate. Fewer than five clusters, or clusters too alike for an interval: low and high are the range.
     """
     distinct_values = _distinct(values)
     failed = sum(case_value.failed for case_value in distinct_values)
-    counted_values = [
-        case_value
-        for case_value in distinct_values
-        if not math.isnan(case_value.value) or (case_value.failed and kind == "share")
-    ]
-    if not counted_values:
+    measured_values = [case_value for case_value in distinct_values if not math.isnan(case_value.value)]
+    if not measured_values:
         return replace(NOTHING, failed=failed)
-    clusters, cluster_index = _clusters(counted_values)
-    limits = []
-    has_unknown = any(math.isnan(case_value.value) for case_value in counted_values)
-    # Unknown outcomes: once all 0 for the mean and lower limit, once all 1 for the upper one.
-    for assumed_value in (0.0, 1.0) if has_unknown else (0.0,):
-        value_array = (
-            np.array(
-                [assumed_value if math.isnan(case_value.value) else case_value.value for case_value in counted_values]
-            )
-            / scale
-        )
-        cluster_sums = np.bincount(cluster_index, value_array, len(clusters.size)).astype(np.float64)
-        limits.append(_ends(cluster_sums, clusters, kind, min_value / scale))
-    mean, low, method = float(limits[0].mean), float(limits[0].low), limits[0].method
-    high = float(limits[-1].high)
+    measured_limits, cluster_count = _limits_of(measured_values, kind, scale, min_value, assumed_value=math.nan)
+    mean, low, high = (float(limit) for limit in (measured_limits.mean, measured_limits.low, measured_limits.high))
+    method = measured_limits.method
+    counted_values = [
+        case_value for case_value in distinct_values if case_value.failed or not math.isnan(case_value.value)
+    ]
+    if kind != "mean" and len(counted_values) > len(measured_values):
+        lowest, _ = _limits_of(counted_values, kind, scale, min_value, assumed_value=0.0)
+        highest, _ = _limits_of(counted_values, kind, scale, min_value, assumed_value=1.0)
+        low, high, method = float(lowest.low), float(highest.high), lowest.method
+        if math.isnan(low) or math.isnan(high):  # one cluster has no interval, but its failed cases have bounds
+            low, high, method = float(lowest.mean), float(highest.mean), "bounds"
     return Estimate(
         scale * mean,
         scale * min(low, mean),
         scale * max(high, mean),
-        len(counted_values),
+        len(measured_values),
         failed,
         method,
-        len(clusters.size),
+        cluster_count,
     )
+
+
+def _limits_of(
+    values: Sequence[CaseValue], kind: Kind, scale: float, min_value: float, *, assumed_value: float
+) -> tuple[ConfidenceLimits, int]:
+    """Return limits of values over `scale`, with an assumed value for those that are NaN; number of clusters."""
+    clusters, cluster_index = _clusters(values)
+    scaled_values = np.array([case_value.value for case_value in values]) / scale
+    scaled_values[np.isnan(scaled_values)] = assumed_value
+    cluster_sums = np.bincount(cluster_index, scaled_values, len(clusters.size)).astype(np.float64)
+    return _ends(cluster_sums, clusters, kind, min_value / scale), len(clusters.size)
 
 
 def replicate_estimate(
@@ -176,7 +185,8 @@ def paired_difference(
 
     A mean has Student limits of the differences. A share has limits even where hardly any cell differs: the
     difference is that of two shares, the cells where only the first is 1 and those where only the second is,
-    whose limits are combined (MOVER, with the correlation that two shares of one multinomial have).
+    whose limits are combined (MOVER, with the correlation that two shares of one multinomial have). Cells that failed
+    on either side are in neither share's mean, and widen the limits of both.
 
     Args:
         first: Values of one system by cell (scenario and repetition); clusters count, strata do not.
@@ -192,14 +202,28 @@ def paired_difference(
         paired data" (1998).
     """
     pairs, missing = _pairs(first, second)
-    if kind == "mean":
+    if kind == "mean" or not pairs:
         return replace(estimate(pairs, "mean"), failed=missing)
+    unknown_pairs = [
+        CaseValue(math.nan, first[key].cluster, f"{key}\nfailed", failed=True)
+        for key in set(first) & set(second)
+        if first[key].failed or second[key].failed
+    ]
     only_first, only_second = (
-        estimate([replace(pair, value=float(sign * pair.value > 0.0)) for pair in pairs], "share") for sign in (1, -1)
+        estimate([*(replace(pair, value=float(sign * pair.value > 0.0)) for pair in pairs), *unknown_pairs], "share")
+        for sign in (1, -1)
     )
     first_share, second_share = only_first.mean, only_second.mean
-    if not pairs or "beta" not in (only_first.method, only_second.method):
-        return replace(estimate(pairs, "mean"), failed=missing)
+    if "beta" not in (only_first.method, only_second.method):
+        lowest, highest = (
+            estimate([*pairs, *(replace(pair, value=bound) for pair in unknown_pairs)], "mean") for bound in (-1.0, 1.0)
+        )
+        return replace(
+            estimate(pairs, "mean"),
+            low=np.fmin(lowest.low, lowest.mean) if unknown_pairs else lowest.low,
+            high=np.fmax(highest.high, highest.mean) if unknown_pairs else highest.high,
+            failed=missing,
+        )
     correlation = (
         0.0
         if first_share * second_share == 0.0

@@ -60,11 +60,16 @@ def render(template: str | Path, run: Run, *, verdict: Sequence[str] = (), **val
 
 
 def heat(cell: TableCell, symbol: str) -> str:
-    """Background of a table cell, from good (0) to bad (1), as a CSS colour mix; none but for driving metrics."""
+    """Background of a table cell, from good (0) to bad (1), as a CSS colour mix; none but for driving metrics.
+
+    Where cases failed, the limit that is worse decides: what never ran is not coloured as good.
+    """
     metric = METRICS.get(symbol)
     if metric is None or math.isnan(cell.mean) or metric.unit not in ("", "m") or not metric.better:
         return ""
     scale = {"OR": 10.0, "DR": 5.0}.get(symbol, metric.scale)
-    fraction = min(max(cell.mean / scale, 0.0), 1.0)
+    worse_limit = cell.high if metric.better == "lower" else cell.low
+    value = worse_limit if cell.failed and not math.isnan(worse_limit) else cell.mean
+    fraction = min(max(value / scale, 0.0), 1.0)
     redness = fraction if metric.better == "lower" else 1.0 - fraction
     return f"--bad:{100 * redness:.0f}%"

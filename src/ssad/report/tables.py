@@ -21,7 +21,8 @@ Result = TypeVar("Result")
 METHODS = (
     "[a, b]: 95 % interval, from how the clusters (scenarios, routes, drives) vary: beta limits for shares and other "
     "bounded numbers, Student's t for other means. a–b: the range of the clusters' means, where they are fewer than "
-    "five or too alike for an interval. Copies of one case count once; n/a: not measured."
+    "five or too alike for an interval. Copies of one case count once. n and means: cases that ran; the limits of "
+    "shares and other bounded numbers hold whatever the failed ones were. n/a: not measured."
 )
 
 
@@ -57,17 +58,17 @@ class TableCell:
 
     @property
     def interval(self) -> str:
-        """`[low, high]` of an interval, `low–high` (`low to high` below 0) of a range, or empty."""
+        """`[low, high]` of an interval, `low–high` (`low to high` below 0) of a range or of bounds, or empty."""
         if math.isnan(self.low) or math.isnan(self.high):
             return ""
-        if self.method == "range":
+        if self.method in ("range", "bounds"):
             return f"{self.low:.2f}{' to ' if self.low < 0.0 else '–'}{self.high:.2f}"
         return f"[{self.low:.2f}, {self.high:.2f}]"
 
     @property
     def count(self) -> str:
-        """`n = 40 in 4 clusters`, with the failed ones named."""
-        if not self.n:
+        """`n = 40 in 4 clusters, 2 failed`; n are the cases that ran."""
+        if not self.n and not self.failed:
             return ""
         cluster_text = f" in {self.clusters} clusters" if self.clusters not in (0, self.n) else ""
         return f"n = {self.n}{cluster_text}" + (f", {self.failed} failed" if self.failed else "")
@@ -77,6 +78,7 @@ class TableCell:
         """Count and interval of the number, in a line."""
         method_names = {
             "range": "range over the clusters",
+            "bounds": "bounds, whatever the failed cases were",
             "beta": "95 % interval, beta",
             "t": "95 % interval, Student's t",
         }
@@ -202,7 +204,11 @@ def to_csv(table: Table) -> str:
         for column, cell in zip(table.columns, row.cells, strict=True):
             numbers = ["" if math.isnan(number) else repr(float(number)) for number in (cell.mean, cell.low, cell.high)]
             source = "published" if row.published else "ours"
-            details = [cell.n, cell.failed, source, cell.clusters, cell.method] if cell.n else ["", "", source, "", ""]
+            details = (
+                [cell.n, cell.failed, source, cell.clusters, cell.method]
+                if cell.n or cell.failed
+                else ["", "", source, "", ""]
+            )
             writer.writerow([*row.head, column, *numbers, *details])
     return buffer.getvalue()
 

@@ -49,7 +49,10 @@ def terminal_table(run: Run, table: Table) -> rich.table.Table:
             end_section=next_row is not None and next_row.head[0].startswith("Avg.") and not is_average,
         )
     failure_count = len(run.failures)
-    notes = [table.note, f"{failure_count} of {len(run.lines)} cells failed and count" if failure_count else ""]
+    notes = [
+        table.note,
+        f"{failure_count} of {len(run.lines)} cells failed; they widen the intervals" if failure_count else "",
+    ]
     result.caption, result.caption_justify = escape("\n".join(filter(None, notes))), "left"
     return result
 

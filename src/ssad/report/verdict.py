@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from ssad.metrics import CaseValue, estimate
 from ssad.report.load import Run
-from ssad.report.records import Line
+from ssad.report.records import Line, metric_cell, metric_of
 
 
 def complete_verdict(run: Run, sentences: Sequence[str]) -> list[str]:
@@ -33,6 +33,31 @@ def worst_condition(subject: str, metric: str, scores: Mapping[str, float], cond
         f"{subject}: {metric} {clean_score:.0%} clean; the {condition_noun} that costs most is {name}, "
         f"which leaves {perturbed_scores[name]:.0%}."
     )
+
+
+def event_sentence(subject: str, verb: str, lines: Sequence[Line], metric: str, *, rate: str, noun: str) -> str:
+    """Return in how many of the cells that ran an event happened, and what the failed ones leave open.
+
+    Args:
+        subject: System or detector.
+        verb: Verb with its preposition, such as "collided in".
+        lines: Lines of the subject, those of failed cells too.
+        metric: Metric that is 1 where the event happened.
+        rate: Name of the share, such as "collision rate".
+        noun: Name of the cells in the plural, such as "drives".
+
+    Returns:
+        The sentence without a full stop.
+    """
+    cell = metric_cell(lines, metric, "share")
+    ran = [line for line in lines if line["status"] == "ok"]
+    if not ran:
+        return f"{subject} has no {rate}: all of its {len(lines)} {noun} failed"
+    events = sum(metric_of(line, metric) == 1.0 for line in ran)
+    sentence = f"{subject} {verb} {events} of {len(ran)} {noun}"
+    if failed := len(lines) - len(ran):
+        sentence += f"; {failed} more failed, so its {rate} lies in {cell.interval} whatever they were"
+    return sentence
 
 
 def lines_by(run: Run, field: str, *, failed: bool = False) -> dict[str, list[Line]]:

@@ -10,7 +10,7 @@ from ssad.report.verdict import lines_by
 def verdict(run: Run) -> list[str]:
     """Collisions that generators find, a sentence a system; of many generators the best three and random search.
 
-    Searches that failed count, as in the tables.
+    Searches that failed are named; they are in no share.
     """
     sentences = []
     for system, lines in lines_by(run, "system", failed=True).items():
@@ -20,11 +20,8 @@ def verdict(run: Run) -> list[str]:
             survivors = sum(metric_of(line, "survived") == 1.0 for line in search_lines)
             if survivors:
                 failures = sum(line["status"] != "ok" for line in search_lines)
-                counts[generator] = (
-                    sum(metric_of(line, "CR") == 1.0 for line in search_lines),
-                    survivors + failures,
-                    failures,
-                )
+                collisions = sum(metric_of(line, "CR") == 1.0 for line in search_lines)
+                counts[generator] = (collisions, survivors, failures)
         if not counts:
             if any(line["status"] == "ok" for line in lines):
                 sentences.append(f"{system} survives none of its scenarios unchanged: there is nothing to find.")
@@ -43,4 +40,4 @@ def verdict(run: Run) -> list[str]:
 
 
 def _found_in(generator: str, found_count: int, tried_count: int, failed_count: int) -> str:
-    return f"{generator} in {found_count} of {tried_count}{f' ({failed_count} failed)' if failed_count else ''}"
+    return f"{generator} in {found_count} of {tried_count}{f' ({failed_count} more failed)' if failed_count else ''}"

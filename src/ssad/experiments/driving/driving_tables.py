@@ -36,8 +36,7 @@ def precrash_table(run: DrivingRun) -> Table | None:
         columns={**SCENARIOS, AVERAGE: "Avg."},
         metric=lambda row, group: _cell(run, (row[1], group), row[0]),
         published=published,
-        note=f"Shaded rows: {SOURCE}. Avg. is the mean of the scenarios' values. {METHODS} A failed episode counts in "
-        f"the denominator. {_counts(run, systems)}",
+        note=f"Shaded rows: {SOURCE}. Avg. is the mean of the scenarios' values. {METHODS} {_counts(run, systems)}",
         source=SOURCE,
     )
 

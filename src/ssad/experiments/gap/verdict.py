@@ -8,7 +8,7 @@ from ssad.experiments.gap import page as gap
 from ssad.report.load import Run
 from ssad.report.records import metric_of
 from ssad.report.tables import TableCell
-from ssad.report.verdict import mean_of
+from ssad.report.verdict import event_sentence, mean_of
 
 
 def verdict(run: Run) -> list[str]:
@@ -19,14 +19,17 @@ def verdict(run: Run) -> list[str]:
     sentences_by_system: dict[str, list[tuple[float, str]]] = {system: [] for system in systems}
     for system, perturbation, severity in lines_by_condition:
         lines = lines_by_condition[system, perturbation, severity]
-        collisions = sum(metric_of(line, "collision") == 1.0 for line in lines)
         if not severity:
             precision = mean_of(metric_of(line, "AP") for line in lines)
             precision_text = (
                 "" if math.isnan(precision) else f" It found objects with an AP of {precision:.2f} on the way."
             )
             sentences_by_system[system].append(
-                (math.inf, f"{system} collided in {collisions} of {len(lines)} drives.{precision_text}")
+                (
+                    math.inf,
+                    event_sentence(system, "collided in", lines, "collision", rate="collision rate", noun="drives")
+                    + f".{precision_text}",
+                )
             )
             continue
         ap_change, collision_change = (
