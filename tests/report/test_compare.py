@@ -60,7 +60,7 @@ def test_differences_are_paired_by_name(tmp_path: Path):
     assert (before.mean, now.mean, difference.mean, difference.n) == (8 / 40, 18 / 40, pytest.approx(0.25), 40)
     assert 0.0 < difference.low < 0.25 < difference.high < 1.0
     assert p.mean == pytest.approx(2 * 0.5**10)
-    assert (found.both, found.equal, found.only, found.left_out) == (40, 30, (0, 0), ())
+    assert (found.both, found.equal, found.only, found.remarks) == (40, 30, (0, 0), [])
     assert found.changes == ("code: nothing → new",)
     assert found.findings == (
         f"a: CR 0.20 → 0.45 ({difference.text} {difference.interval}): more than chance alone makes.",
@@ -103,6 +103,70 @@ def test_two_runs_of_one_system_each_are_compared_whatever_they_are_called(tmp_p
     assert found.table.rows[0].cells[2].mean == -1.0
 
 
+def two_systems(folder: Path, **hits: int) -> Path:
+    """A run of several systems, with a number of collisions each."""
+    parts = [driving_run(folder / name, hits=count, system=name) for name, count in hits.items()]
+    lines = [json.loads(line) for part in parts for line in (part / "results.jsonl").read_text().splitlines()]
+    cells = [cell for part in parts for cell in load_run(part).header["cells"]]
+    return write_run(folder / "both", {"kind": "driving", "cells": cells, "suite": {"seed": 0}}, lines)
+
+
+def test_systems_of_one_run_are_compared_by_name(tmp_path: Path):
+    folder = two_systems(tmp_path, autopilot=8, mine=18)
+    (comparison,) = compare_runs([folder], ["autopilot=mine"])
+    assert comparison.table.rows[0].head == ("autopilot → mine", "all", "CR")
+    assert comparison.table.rows[0].cells[2].mean == pytest.approx(0.25)
+    assert comparison.findings[0].startswith("autopilot → mine: CR 0.20 → 0.45")
+    assert comparison.remarks == []
+    shown = CliRunner().invoke(app, ["compare", str(folder), "--pair", "mine=autopilot", "--out", str(tmp_path)])
+    assert shown.exit_code == 0, shown.output
+    assert "mine → autopilot" in shown.output
+
+
+def test_what_only_one_run_has_is_said_first(tmp_path: Path):
+    first = two_systems(tmp_path / "one", blind=40, autopilot=8)
+    second = two_systems(tmp_path / "two", blind=40, mine=0)
+    (comparison,) = compare_runs([first, second])
+    assert comparison.remarks == [
+        f"Only {comparison.first.label} has autopilot: compared with nothing.",
+        f"Only {comparison.second.label} has mine: compared with nothing.",
+        "To compare two systems of different names: --pair autopilot=mine.",
+    ]
+    shown = CliRunner().invoke(app, ["compare", str(first), str(second), "--out", str(tmp_path)]).output
+    assert shown.index("compared with nothing") < shown.index("blind"), "before the table, which names who is compared"
+    (paired,) = compare_runs([first, second], ["autopilot=mine", "blind=blind"])
+    assert [row.head[0] for row in paired.table.rows if row.head[2] == "CR"] == ["autopilot → mine", "blind"]
+    assert paired.remarks == []
+
+
+@pytest.mark.parametrize("pair", ["mine=nobody", "mine", "=mine", "autopilot"])
+def test_a_pair_that_a_run_lacks_is_refused(pair: str, tmp_path: Path):
+    folder = two_systems(tmp_path, autopilot=8, mine=18)
+    with pytest.raises(ConfigError, match="FIRST one of autopilot, mine"):
+        compare_runs([folder], [pair])
+
+
+def test_names_of_a_pair_may_hold_settings(tmp_path: Path):
+    first = driving_run(tmp_path / "one", hits=8, system="mine:Mine?reach=20")
+    second = driving_run(tmp_path / "two", hits=8, system="mine:Mine?reach=40")
+    (comparison,) = compare_runs([first, second], ["mine:Mine?reach=20=mine:Mine?reach=40"])
+    assert comparison.both == 40
+
+
+def test_a_difference_that_failed_cells_may_explain_is_no_finding(tmp_path: Path):
+    """Ten cells more collide, and eleven of those that did not have failed: they may have been as bad."""
+    first, second = driving_run(tmp_path / "one", hits=8), driving_run(tmp_path / "two", hits=18)
+    assert "more than chance" in compare_runs([first, second])[0].findings[0]
+    lines = [json.loads(line) for line in (first / "results.jsonl").read_text().splitlines()]
+    for line in lines[18:]:
+        line |= {"status": "failed", "reason": "hung", "metrics": {}}
+    (first / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (comparison,) = compare_runs([first, second])
+    difference = next(row.cells[2] for row in comparison.table.rows if row.head[2] == "CR")
+    assert difference.low < 0.0 < difference.mean < difference.high
+    assert not any("CR" in sentence for sentence in comparison.findings)
+
+
 def test_scores_are_paired_by_their_replicates(tmp_path: Path):
     first, second = scores(tmp_path / "one", 0.4), scores(tmp_path / "two", 0.5)
     (found,) = compare_runs([first, second])
@@ -121,6 +185,7 @@ def test_a_page_and_tables_are_written(tmp_path: Path):
     folders = [driving_run(tmp_path / name, hits=hits) for name, hits in (("one", 8), ("two", 18), ("three", 0))]
     page, found = write_comparison(folders, tmp_path / "out")
     text = page.read_text()
+    assert "Replays side by side" not in text, "these runs have none"
     assert "two beside one" in text
     assert "three beside one" in text
     assert [each.table.name for each in found] == ["difference", "difference_2"]

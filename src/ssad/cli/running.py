@@ -156,17 +156,26 @@ def compare(
         list[Path],
         typer.Argument(metavar="DIR DIR...", help="Results folders of `ssad run`; all are compared with the first."),
     ],
+    pair: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FIRST=SECOND", help="Compare these systems or detectors; may be repeated."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder.  [default: that of the last DIR]")] = None,
 ) -> None:
-    """Compare runs with the first one, cell by cell: differences with intervals and a test, and what changed."""
+    """Compare runs with the first one, cell by cell: differences with intervals and a test, and what changed.
+
+    One DIR is enough where --pair names two of its systems.
+    """
     from rich.console import Console
 
     from ssad.report.compare import write_comparison
     from ssad.report.terminal import comparison_table
 
-    page, comparisons = write_comparison(folders, out or folders[-1])
+    page, comparisons = write_comparison(folders, out or folders[-1], pair or [])
     console = Console()
     for comparison in comparisons:
+        for remark in comparison.remarks:
+            console.print(remark, markup=False, highlight=False)
         console.print(comparison_table(comparison.table))
         message = f"{comparison.both} cells in both, {comparison.equal} of them equal to the last digit"
         console.print(
@@ -174,8 +183,6 @@ def compare(
         )
         for sentence in comparison.findings:
             console.print(sentence, markup=False, highlight=False)
-        if comparison.left_out:
-            console.print(f"left out, since only one of them has it: {', '.join(comparison.left_out)}", markup=False)
     print(f"comparison: {page}")
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
@@ -24,6 +26,8 @@ from ssad.report.load import Run, load_run
 from ssad.report.pages import render
 from ssad.report.tables import METHODS, Table, TableCell, TableRow, write_tables
 
+REPORT = "report.html"
+MAX_REPLAYS = 200  # replays that a page offers
 SHOWN = ("CR", "OR", "DR", "RC", "DS")
 EVERYTHING = "all"
 _SUBJECTS = ("system", "detector")
@@ -72,7 +76,8 @@ class Comparison:
         equal: Cells whose metrics are equal to the last digit, of those that both runs measure.
         both: Number of cells that both have.
         only: Number of cells that only the first has, and that only the second has.
-        left_out: Systems or detectors that only one of them has.
+        unpaired: Systems or detectors that are compared with none, of the first and of the second run.
+        replays: Pairs of replays of the cells whose outcome changed, where both runs have a page with them.
     """
 
     first: ComparedRun
@@ -85,42 +90,86 @@ class Comparison:
     equal: int
     both: int
     only: tuple[int, int]
-    left_out: tuple[str, ...]
+    unpaired: tuple[tuple[str, ...], tuple[str, ...]]
+    replays: tuple[ReplayPair, ...]
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is in one of the runs alone, in sentences."""
+        sentences = [
+            f"Only {compared_run.label} has {', '.join(names)}: compared with nothing."
+            for compared_run, names in zip((self.first, self.second), self.unpaired, strict=True)
+            if names
+        ]
+        if all(self.unpaired):
+            sentences.append(
+                f"To compare two systems of different names: --pair {self.unpaired[0][0]}={self.unpaired[1][0]}."
+            )
+        sentences += [
+            f"{count} cells of the compared systems are in {compared_run.label} alone."
+            for compared_run, count in zip((self.first, self.second), self.only, strict=True)
+            if count
+        ]
+        return sentences
 
 
-def compare_runs(folders: Sequence[Path]) -> list[Comparison]:
+@dataclass(frozen=True)
+class ReplayPair:
+    """Replays of one cell in two runs.
+
+    Attributes:
+        title: Name of the cell, and how its outcome changed.
+        first: Folder of the first run, and key of the cell in it.
+        second: The same of the second run.
+    """
+
+    title: str
+    first: tuple[Path, str]
+    second: tuple[Path, str]
+
+
+def compare_runs(folders: Sequence[Path], pairs: Sequence[str] = ()) -> list[Comparison]:
     """Compare runs with the first of them, cell by cell.
 
     Cells belong together if they have the same name: the same scenario and repetition, the same shift and severity,
     and the same system or detector. If the runs test one system each, these are compared, whatever they are called.
 
     Args:
-        folders: Two or more run folders of one kind.
+        folders: Run folders of one kind: two or more, or one whose systems are paired.
+        pairs: Systems or detectors that are compared, as FIRST=SECOND; empty: those of the same name.
 
     Returns:
         A comparison for each folder but the first.
 
     Raises:
-        ConfigError: Fewer than two folders, runs of different kinds, or runs that share no cell.
+        ConfigError: Too few folders, runs of different kinds, runs that share no cell, or a pair that they lack.
         StoreError: A folder holds no run with results.
     """
+    if len(folders) == 1 and pairs:
+        run = load_run(folders[0])
+        label = folders[0].resolve().name
+        return [_compare(ComparedRun(label, run), ComparedRun(label, run), 1, pairs)]
     if len(folders) < 2:
-        raise ConfigError("compare needs at least two results folders, such as: ssad compare runs/a runs/b")
+        raise ConfigError(
+            "compare needs two results folders, such as: ssad compare runs/a runs/b; "
+            "or one and two of its systems, such as: ssad compare runs/a --pair mine=autopilot"
+        )
     labels = _labels(folders)
     runs = [ComparedRun(label, load_run(folder)) for label, folder in zip(labels, folders, strict=True)]
     for compared_run in runs[1:]:
         if compared_run.run.kind != runs[0].run.kind:
             kinds = f"{runs[0].run.kind} and {compared_run.run.kind}"
             raise ConfigError(f"{compared_run.run.folder}: runs of different kinds cannot be compared ({kinds})")
-    return [_compare(runs[0], compared_run, number) for number, compared_run in enumerate(runs[1:], 1)]
+    return [_compare(runs[0], compared_run, number, pairs) for number, compared_run in enumerate(runs[1:], 1)]
 
 
-def write_comparison(folders: Sequence[Path], out: Path) -> tuple[Path, list[Comparison]]:
+def write_comparison(folders: Sequence[Path], out: Path, pairs: Sequence[str] = ()) -> tuple[Path, list[Comparison]]:
     """Compare runs and write OUT/compare.html and OUT/tables/difference*.csv|md|tex.
 
     Args:
         folders: As for `compare_runs`.
         out: Output folder.
+        pairs: As for `compare_runs`.
 
     Returns:
         Path of the page, and the comparisons.
@@ -129,12 +178,29 @@ def write_comparison(folders: Sequence[Path], out: Path) -> tuple[Path, list[Com
         ConfigError: As for `compare_runs`.
         StoreError: A folder holds no run with results, or the files cannot be written.
     """
-    comparisons = compare_runs(folders)
+    comparisons = compare_runs(folders, pairs)
     safeio.make_folder(out)
     write_tables(out, [table for comparison in comparisons for table in (comparison.table, comparison.groups) if table])
     path = out / "compare.html"
-    safeio.write_atomic(path, render("compare.html", comparisons[0].first.run, comparisons=comparisons))
+    replays = [
+        {
+            "title": replay_pair.title,
+            "first": _replay_address(out, *replay_pair.first),
+            "second": _replay_address(out, *replay_pair.second),
+        }
+        for comparison in comparisons
+        for replay_pair in comparison.replays[:MAX_REPLAYS]
+    ]
+    safeio.write_atomic(
+        path, render("compare.html", comparisons[0].first.run, comparisons=comparisons, replays=replays)
+    )
     return path, comparisons
+
+
+def _replay_address(out: Path, folder: Path, key: str) -> str:
+    """Return the address of a replay on the page of a run, relative to the page of the comparison."""
+    page = os.path.relpath(folder.resolve() / REPORT, out.resolve())
+    return f"{quote(page)}?replay#cell-{quote(key)}"
 
 
 def _labels(folders: Sequence[Path]) -> list[str]:
@@ -147,10 +213,11 @@ def _labels(folders: Sequence[Path]) -> list[str]:
     raise ConfigError("a run is compared with itself; give different folders")
 
 
-def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison:
-    pairs = _subject_pairs(first, second)
+def _compare(first: ComparedRun, second: ComparedRun, number: int, wanted_pairs: Sequence[str]) -> Comparison:
+    pairs = _wanted_pairs(first, second, wanted_pairs) if wanted_pairs else _subject_pairs(first, second)
     rows: list[TableRow] = []
     verdicts: list[str] = []
+    replays: list[ReplayPair] = []
     equal = shared_count = 0
     unshared_counts = [0, 0]
     for first_subject, second_subject in pairs:
@@ -164,20 +231,24 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
         ]
         equal += sum(_equal(_metrics(first_lines[name]), _metrics(second_lines[name])) for name in shared_names)
         title = first_subject if first_subject == second_subject else f"{first_subject} → {second_subject}"
-        verdicts += [
-            f"{title}/{name}: {verdict_change}"
-            for name in shared_names
-            if (verdict_change := _verdict(first_lines[name], second_lines[name]))
-        ]
+        for name in shared_names:
+            first_line, second_line = first_lines[name], second_lines[name]
+            if verdict_change := _verdict(first_line, second_line):
+                verdicts.append(f"{title}/{name}: {verdict_change}")
+                if _has_replay(first, first_line) and _has_replay(second, second_line):
+                    first_place = (first.run.folder, str(first_line["key"]))
+                    second_place = (second.run.folder, str(second_line["key"]))
+                    replays.append(ReplayPair(verdicts[-1], first_place, second_place))
         if shared_names:
             rows += _rows(first.run, second.run, title, first_lines, second_lines)
     if not shared_count:
         raise ConfigError(f"{second.run.folder}: it shares no cell with {first.run.folder}; run the same suite twice")
     note = (
-        f"Difference: {second.label} minus {first.label}, over the cells that both have. p: how often chance alone "
+        "Difference: the second minus the first, over the cells that both have. p: how often chance alone "
         f"makes as large a difference (signs of the clusters' differences drawn anew). {METHODS}"
     )
-    columns = (first.label, second.label, "difference", "p")
+    labels = (first.label, second.label) if first.label != second.label else ("first", "second")
+    columns = (*labels, "difference", "p")
     name = "difference" if number == 1 else f"difference_{number}"
     overall_rows = [row for row in rows if row.head[1] == EVERYTHING]
     title, heads = f"{second.label} beside {first.label}", (*_heads(first.run), "Metric")
@@ -186,7 +257,10 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
     groups = (
         Table(f"{name}_groups", "Each group of scenarios", heads, columns, group_rows, note) if overall_rows else None
     )
-    left_out = {*first.subjects, *second.subjects} - {name for pair in pairs for name in pair}
+    unpaired_first, unpaired_second = (
+        tuple(name for name in compared_run.subjects if name not in {pair[side] for pair in pairs})
+        for side, compared_run in enumerate((first, second))
+    )
     return Comparison(
         first,
         second,
@@ -198,7 +272,8 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
         equal=equal,
         both=shared_count,
         only=(unshared_counts[0], unshared_counts[1]),
-        left_out=tuple(sorted(left_out)),
+        unpaired=(unpaired_first, unpaired_second) if first.run is not second.run else ((), ()),
+        replays=tuple(replays),
     )
 
 
@@ -209,9 +284,12 @@ def _findings(table: Table) -> Iterator[str]:
     changes_by_subject: dict[str, list[str]] = {}
     for rank, row in enumerate(tested_rows):
         first_cell, second_cell, difference, p_value = row.cells
+        is_open = difference.failed > 0 and difference.low <= 0.0 <= difference.high
         # Holm: the k-th smallest p-value is compared with 5 % over the number of tests that are left.
         if p_value.mean > 0.05 / (len(tested_rows) - rank):
             break
+        if is_open:  # the cells that failed may have been the other way round
+            continue
         quantity = " ".join(name for name in row.head[1:] if name != EVERYTHING)
         change_text = f"{difference.text} {difference.interval}".strip()
         changes_by_subject.setdefault(row.head[0], []).append(
@@ -251,6 +329,28 @@ def _subject_pairs(first: ComparedRun, second: ComparedRun) -> list[tuple[str, s
         f"{second.run.folder}: none of its systems or detectors is in {first.run.folder}, and there are several; "
         "compare runs of one each"
     )
+
+
+def _wanted_pairs(first: ComparedRun, second: ComparedRun, texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Return pairs of subjects from FIRST=SECOND; names may hold "=" themselves."""
+    pairs = []
+    for text in texts:
+        parts = text.split("=")
+        splits = [("=".join(parts[:count]), "=".join(parts[count:])) for count in range(1, len(parts))]
+        known = [pair for pair in splits if pair[0] in first.subjects and pair[1] in second.subjects]
+        if not known:
+            raise ConfigError(
+                f"--pair {text}: expected FIRST=SECOND with FIRST one of {', '.join(first.subjects)} "
+                f"and SECOND one of {', '.join(second.subjects)}"
+            )
+        pairs.append(known[0])
+    return pairs
+
+
+def _has_replay(compared_run: ComparedRun, line: Mapping[str, Any]) -> bool:
+    """Return whether the page of a run has a replay of a cell."""
+    has_trace = bool((line.get("artefacts") or {}).get("trace"))
+    return compared_run.run.kind == "driving" and has_trace and (compared_run.run.folder / REPORT).is_file()
 
 
 def _rows(

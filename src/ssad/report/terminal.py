@@ -58,7 +58,10 @@ def terminal_table(run: Run, table: Table) -> rich.table.Table:
 
 
 def comparison_table(table: Table) -> rich.table.Table:
-    """Return a table of differences: the interval in its own column, leading columns with one value left out."""
+    """Return a table of differences: who is compared first, the interval in its own column.
+
+    Other leading columns are left out if they have one value.
+    """
     result = rich.table.Table(
         title=escape(table.title),
         title_justify="left",
@@ -68,7 +71,7 @@ def comparison_table(table: Table) -> rich.table.Table:
         padding=(0, 1, 0, 0),
     )
     varying_columns = [
-        column for column in range(len(table.heads)) if len({row.head[column] for row in table.rows}) > 1
+        column for column in range(len(table.heads)) if column == 0 or len({row.head[column] for row in table.rows}) > 1
     ]
     for column in varying_columns:
         result.add_column(escape(table.heads[column].lower()))

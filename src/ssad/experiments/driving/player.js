@@ -237,6 +237,13 @@ canvas.addEventListener("pointermove", (e) => {
 canvas.addEventListener("pointerup", () => { grip = null; });
 window.addEventListener("resize", draw);
 
+// In the frame of a comparison the page shows the replay alone, and both replays start together.
+if (new URLSearchParams(location.search).has("replay")) document.body.classList.add("replay-only");
+window.addEventListener("message", (event) => {
+  if (event.data !== "ssad-play" || !now) return;
+  time = 0; playing = true; button();
+});
+
 const marks = [...document.querySelectorAll(".matrix .mark")];
 for (const system of new Set(marks.map((m) => m.dataset.system))) $("by-system").add(new Option(system, system));
 function filter() {
