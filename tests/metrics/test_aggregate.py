@@ -31,16 +31,26 @@ def outcomes(episodes, group="g", family="other"):
 
 
 def test_failed_episodes_are_in_the_limits_and_in_no_mean():
-    ran = [episode(hit=True, complete=50, distance=2), *[episode(distance=1)] * 5]
+    ran = [episode(hit=True, complete=50, distance=2), *[episode(distance=1)] * 9]
     result = aggregate(outcomes([*ran, None, None]))
-    assert result["CR"].mean == 1 / 6
-    assert result["CR"].low == share_limits(1 / 8, 8)[0]
-    assert result["CR"].high == share_limits(3 / 8, 8)[1]
-    assert (result["CR"].n, result["CR"].failed, result["CR"].clusters) == (6, 2, 6)
-    assert result["RC"].mean == pytest.approx(5.5 / 6)
-    assert result["RC"].low < 5.5 / 8 < 7.5 / 8 < result["RC"].high
-    assert (result["DR"].mean, result["DR"].n, result["DR"].failed) == (pytest.approx(7 / 6), 6, 2)
-    assert (result["DS"].n, result["DS"].failed) == (6, 2)
+    assert result["CR"].mean == pytest.approx(1 / 10)
+    assert result["CR"].low == share_limits(1 / 12, 12)[0]
+    assert result["CR"].high == share_limits(3 / 12, 12)[1]
+    assert (result["CR"].n, result["CR"].failed, result["CR"].clusters) == (10, 2, 10)
+    assert result["RC"].mean == pytest.approx(9.5 / 10)
+    assert result["RC"].low < 9.5 / 12 < 11.5 / 12 < result["RC"].high
+    assert (result["DR"].mean, result["DR"].n, result["DR"].failed) == (pytest.approx(11 / 10), 10, 2)
+    assert (result["DS"].n, result["DS"].failed) == (10, 2)
+
+
+@pytest.mark.parametrize(("routes", "method"), [(9, "range"), (10, "beta")])
+def test_a_town_of_fewer_than_ten_routes_has_a_range_and_no_interval(routes, method):
+    two_drives_each = [
+        EpisodeOutcome(episode(hit=k < 3), "Town02", f"Town02 {k // 2}", f"{k}", "natural") for k in range(2 * routes)
+    ]
+    cr = aggregate(two_drives_each)["CR"]
+    assert (cr.method, cr.clusters, cr.n) == (method, routes, 2 * routes)
+    assert ((cr.low, cr.high) == (0.0, 1.0)) == (method == "range")
 
 
 def test_empty_and_all_failed():
@@ -193,7 +203,7 @@ def test_the_metrics_are_the_published_ones():
 def test_counts_are_shares_of_the_episodes_that_have_any():
     several = [replace(episode(), collisions_vehicle=k, collision_events=k) for k in (0, 1, 3, 0, 2)]
     result = aggregate(outcomes(several))
-    assert result["CR_vehicle"].mean == 3 / 5
+    assert result["CR_vehicle"].mean == pytest.approx(3 / 5)
     assert result["CE"].mean == pytest.approx(6 / 5)
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.lane_graph import SignKind, save_graph, town_file
 from ssad.core.machine import quiet_warp
 from ssad.core.safeio import plain
-from ssad.core.seeding import seed32
+from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 from ssad.engine.kind import Cell, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
@@ -35,9 +35,12 @@ class ScenarioSuite(SuiteBase):
     Attributes:
         scenarios: Arguments of `load_scenarios` (sets, types, names, YAML files), or highway-env: that simulator's
             intersection and highway.
+        cluster: What is drawn independently of one another, for the intervals: towns' routes, each of which may have
+            several scenarios, or scenarios.
     """
 
     scenarios: Names
+    cluster: Literal["route", "scenario"] = "route"
 
     def beside(self, path: Path) -> Self:
         """Return the suite with its scenario files resolved: in the working folder, then beside the suite."""
@@ -51,6 +54,12 @@ class ScenarioSuite(SuiteBase):
             )
 
         return self.model_copy(update={"scenarios": [find(ref) for ref in self.scenarios]})
+
+
+def route_of(scenario: Scenario) -> str:
+    """Return a key of the town and the route of a scenario; scenarios with the same key points share it."""
+    points = [(round(float(pose.x), 2) + 0.0, round(float(pose.y), 2) + 0.0) for pose in scenario.route]  # no -0.0
+    return f"{scenario.town} {digest('route', scenario.town, points)[:8]}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +100,8 @@ class ScenarioKind(Kind):
         kind, *seed_parts = chance
         seed = seed32(kind, suite.seed, safeio.dump_json(described_scenario.data), *seed_parts)
         scenario = described_scenario.scenario
-        identification = {"system": system, "group": scenario.group or scenario.type, "cluster": scenario.name}
+        cluster = scenario.name if suite.cluster == "scenario" else route_of(scenario)
+        identification = {"system": system, "group": scenario.group or scenario.type, "cluster": cluster}
         cell_spec = {"scenario": described_scenario.data, "system": system, **spec}
         return self.make_cell(
             title, system, seed, {**identification, **(fields or {})}, cell_spec, *described_scenario.versions, *inputs

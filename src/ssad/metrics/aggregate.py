@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from ssad.metrics.driving import DIVISORS, WEIGHTS, EpisodeMetrics, overall_score
+from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.uncertainty import NOTHING, CaseValue, Estimate, Kind, estimate
 
 PRECRASH_GROUPS = (
@@ -91,7 +92,7 @@ class EpisodeOutcome:
     Attributes:
         metrics: None if the episode failed.
         group: Group in tables: the pre-crash scenario, the town.
-        cluster: Scenario or route that dependent episodes share.
+        cluster: Key that dependent episodes share: their town and route, or their scenario.
         case: Key of the motion; two outcomes of one system with the same case are copies.
         family: A key of `FAMILIES`.
     """
@@ -148,7 +149,9 @@ def aggregate(outcomes: Sequence[EpisodeOutcome]) -> dict[str, Estimate]:
     for symbol, metric in METRICS.items():
         if metric.field:
             values = [_value(outcome, metric) for outcome in outcomes]
-            estimates[symbol] = estimate(values, metric.kind, scale=metric.scale, min_value=0.0)
+            estimates[symbol] = estimate(
+                values, metric.kind, scale=metric.scale, min_value=0.0, min_clusters=MIN_ROUTES
+            )
     return {symbol: estimates.get(symbol) or _overall(outcomes) for symbol in METRICS}
 
 
@@ -217,7 +220,9 @@ def _overall(outcomes: Sequence[EpisodeOutcome]) -> Estimate:
     if not scores:
         return replace(NOTHING, failed=failed)
     mean = math.fsum(scores) / len(scores)
-    lower_estimate, upper_estimate = estimate(optimistic, "mean", min_value=0.0), estimate(pessimistic, "mean")
+    lower_estimate, upper_estimate = (
+        estimate(values, "mean", min_value=0.0, min_clusters=MIN_ROUTES) for values in (optimistic, pessimistic)
+    )
     return replace(
         lower_estimate,
         mean=mean,

@@ -20,6 +20,8 @@ from ssad.core.types import F64, Bool
 
 LEVEL = 0.95
 MIN_CLUSTERS = 5
+MIN_ROUTES = 10
+"""Routes of a town from which on a number of drives has an interval: fewer show their range."""
 """With fewer clusters there is no interval; their range is shown."""
 MIN_DIFFERENT = 8
 """A mean without bounds has an interval only if so many clusters differ from the commonest value."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -85,7 +86,14 @@ class Estimate:
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
-def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, min_value: float = -math.inf) -> Estimate:
+def estimate(
+    values: Iterable[CaseValue],
+    kind: Kind,
+    *,
+    scale: float = 1.0,
+    min_value: float = -math.inf,
+    min_clusters: int = MIN_CLUSTERS,
+) -> Estimate:
     """Mean of case values with its 95 % interval; with several strata, the unweighted mean of their means.
 
     The mean is over the cases that have a value. Failed cases, whose outcome is unknown, widen the limits of a share
@@ -99,24 +107,26 @@ def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, min
             have no bounds and are only counted.
         scale: Upper bound of a bounded value.
         min_value: Lower bound of a mean; the interval does not go below it.
+        min_clusters: Clusters that an interval needs.
 
     Returns:
-        The estimate. Fewer than five clusters, or clusters too alike for an interval: low and high are the range.
+        The estimate. Fewer clusters, or clusters too alike for an interval: low and high are the range.
     """
     distinct_values = _distinct(values)
     failed = sum(case_value.failed for case_value in distinct_values)
     measured_values = [case_value for case_value in distinct_values if not math.isnan(case_value.value)]
     if not measured_values:
         return replace(NOTHING, failed=failed)
-    measured_limits, cluster_count = _limits_of(measured_values, kind, scale, min_value, assumed_value=math.nan)
+    limits_of = partial(_limits_of, kind=kind, scale=scale, min_value=min_value, min_clusters=min_clusters)
+    measured_limits, cluster_count = limits_of(measured_values, assumed_value=math.nan)
     mean, low, high = (float(limit) for limit in (measured_limits.mean, measured_limits.low, measured_limits.high))
     method = measured_limits.method
     counted_values = [
         case_value for case_value in distinct_values if case_value.failed or not math.isnan(case_value.value)
     ]
     if kind != "mean" and len(counted_values) > len(measured_values):
-        lowest, _ = _limits_of(counted_values, kind, scale, min_value, assumed_value=0.0)
-        highest, _ = _limits_of(counted_values, kind, scale, min_value, assumed_value=1.0)
+        lowest, _ = limits_of(counted_values, assumed_value=0.0)
+        highest, _ = limits_of(counted_values, assumed_value=1.0)
         low, high, method = float(lowest.low), float(highest.high), lowest.method
         if math.isnan(low) or math.isnan(high):  # one cluster has no interval, but its failed cases have bounds
             low, high, method = float(lowest.mean), float(highest.mean), "bounds"
@@ -132,14 +142,20 @@ def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, min
 
 
 def _limits_of(
-    values: Sequence[CaseValue], kind: Kind, scale: float, min_value: float, *, assumed_value: float
+    values: Sequence[CaseValue],
+    *,
+    kind: Kind,
+    scale: float,
+    min_value: float,
+    min_clusters: int,
+    assumed_value: float,
 ) -> tuple[ConfidenceLimits, int]:
     """Return limits of values over `scale`, with an assumed value for those that are NaN; number of clusters."""
     clusters, cluster_index = _clusters(values)
     scaled_values = np.array([case_value.value for case_value in values]) / scale
     scaled_values[np.isnan(scaled_values)] = assumed_value
     cluster_sums = np.bincount(cluster_index, scaled_values, len(clusters.size)).astype(np.float64)
-    return _ends(cluster_sums, clusters, kind, min_value / scale), len(clusters.size)
+    return _ends(cluster_sums, clusters, kind, min_value / scale, min_clusters), len(clusters.size)
 
 
 def replicate_estimate(
@@ -179,7 +195,11 @@ def replicate_difference(value: float, differences: Sequence[float], *, n: int, 
 
 
 def paired_difference(
-    first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, kind: Literal["share", "mean"] = "mean"
+    first: Mapping[str, CaseValue],
+    second: Mapping[str, CaseValue],
+    *,
+    kind: Literal["share", "mean"] = "mean",
+    min_clusters: int = MIN_CLUSTERS,
 ) -> Estimate:
     """Return the mean of first - second over the cells that both have, by the rules of `estimate`.
 
@@ -192,6 +212,7 @@ def paired_difference(
         first: Values of one system by cell (scenario and repetition); clusters count, strata do not.
         second: Values of the other system. Two pairs are copies if both halves are.
         kind: "share": values are 0 or 1. "mean": any values.
+        min_clusters: Clusters that an interval needs.
 
     Returns:
         The estimate; failed: cells that only one has, or that failed or were not measured in either.
@@ -203,23 +224,30 @@ def paired_difference(
     """
     pairs, missing = _pairs(first, second)
     if kind == "mean" or not pairs:
-        return replace(estimate(pairs, "mean"), failed=missing)
+        return replace(estimate(pairs, "mean", min_clusters=min_clusters), failed=missing)
     unknown_pairs = [
         CaseValue(math.nan, first[key].cluster, f"{key}\nfailed", failed=True)
         for key in set(first) & set(second)
         if first[key].failed or second[key].failed
     ]
     only_first, only_second = (
-        estimate([*(replace(pair, value=float(sign * pair.value > 0.0)) for pair in pairs), *unknown_pairs], "share")
+        estimate(
+            [*(replace(pair, value=float(sign * pair.value > 0.0)) for pair in pairs), *unknown_pairs],
+            "share",
+            min_clusters=min_clusters,
+        )
         for sign in (1, -1)
     )
     first_share, second_share = only_first.mean, only_second.mean
     if "beta" not in (only_first.method, only_second.method):
         lowest, highest = (
-            estimate([*pairs, *(replace(pair, value=bound) for pair in unknown_pairs)], "mean") for bound in (-1.0, 1.0)
+            estimate(
+                [*pairs, *(replace(pair, value=bound) for pair in unknown_pairs)], "mean", min_clusters=min_clusters
+            )
+            for bound in (-1.0, 1.0)
         )
         return replace(
-            estimate(pairs, "mean"),
+            estimate(pairs, "mean", min_clusters=min_clusters),
             low=np.fmin(lowest.low, lowest.mean) if unknown_pairs else lowest.low,
             high=np.fmax(highest.high, highest.mean) if unknown_pairs else highest.high,
             failed=missing,
@@ -333,9 +361,9 @@ def _clusters(values: Sequence[CaseValue]) -> tuple[Clusters, npt.NDArray[np.int
     return Clusters(size, np.array([strata[stratum] for stratum, _ in names])), cluster_index
 
 
-def _ends(cluster_sums: F64, clusters: Clusters, kind: Kind, min_value: float) -> ConfidenceLimits:
+def _ends(cluster_sums: F64, clusters: Clusters, kind: Kind, min_value: float, min_clusters: int) -> ConfidenceLimits:
     """The interval, or the range of the clusters' means where there is none; one cluster has neither."""
-    if len(cluster_sums) >= MIN_CLUSTERS:
+    if len(cluster_sums) >= min_clusters:
         if kind == "mean":
             limits = mean_limits(cluster_sums, clusters)
         else:

@@ -22,6 +22,7 @@ from ssad.metrics import (
     replicate_difference,
     sign_flip_test,
 )
+from ssad.metrics.intervals import MIN_ROUTES
 from ssad.report.load import Run, load_run
 from ssad.report.pages import render
 from ssad.report.tables import METHODS, Table, TableCell, TableRow, write_tables
@@ -395,7 +396,7 @@ def _driving_row(
         for name in shared_names
         if not any(cases[name].failed or math.isnan(cases[name].value) for cases in values)
     ]
-    difference = paired_difference(values[1], values[0], kind=kind)  # type: ignore[arg-type]
+    difference = paired_difference(values[1], values[0], kind=kind, min_clusters=MIN_ROUTES)  # type: ignore[arg-type]
     p_value = TableCell(sign_flip_test(values[1], values[0]), digits=4)
     means = [
         TableCell(

@@ -28,6 +28,12 @@ def field(name: str) -> Callable[[Line], str]:
     return value_of
 
 
+def scenario_of(line: Line) -> str:
+    """Return the name of the scenario of a line; of a kind without scenarios its cluster or key."""
+    scenario = (line.get("spec") or {}).get("scenario") or {}
+    return str(scenario.get("name") or line.get("cluster") or line["key"])
+
+
 def metric_of(line: Line, name: str) -> float:
     """Return a metric of a line; NaN where it was not measured or the cell failed."""
     value = (line.get("metrics") or {}).get(name) if line["status"] == "ok" else None

@@ -19,10 +19,11 @@ Column = TypeVar("Column")
 Result = TypeVar("Result")
 
 METHODS = (
-    "[a, b]: 95 % interval, from how the clusters (scenarios, routes, drives) vary: beta limits for shares and other "
-    "bounded numbers, Student's t for other means. a–b: the range of the clusters' means, where they are fewer than "
-    "five or too alike for an interval. Copies of one case count once. n and means: cases that ran; the limits of "
-    "shares and other bounded numbers hold whatever the failed ones were. n/a: not measured."
+    "[a, b]: 95 % interval, from how the clusters (routes of towns, recorded drives) vary: beta limits for shares and "
+    "other bounded numbers, Student's t for other means. a–b: the range of the clusters' means, where they are too few "
+    "(ten routes of a town, five drives of a recording) or too alike for an interval. Copies of one case count once. "
+    "n and means: cases that ran; the limits of shares and other bounded numbers hold whatever the failed ones were. "
+    "n/a: not measured."
 )
 
 

@@ -19,7 +19,7 @@ from ssad.engine.kind import Cell, Job, Plan, Resources
 from ssad.experiments import scenario_kind
 from ssad.experiments.driving import kind as driving_kind
 from ssad.experiments.driving.kind import Driving, DrivingSuite
-from ssad.experiments.scenario_kind import suite_scenarios
+from ssad.experiments.scenario_kind import route_of, suite_scenarios
 
 
 def replace_name(monkeypatch: pytest.MonkeyPatch, name: str, value: Any) -> None:
@@ -104,7 +104,7 @@ def test_cells_are_named_and_described(monkeypatch: pytest.MonkeyPatch) -> None:
         f"{system}/{name}" for system in ("autopilot", "blind") for name in ("a/00", "a/00#1", "b", "b#1")
     ]
     one, again = plan.cells[:2]
-    assert one.fields == {"system": "autopilot", "group": "A", "cluster": "a/00"}
+    assert one.fields == {"system": "autopilot", "group": "A", "cluster": route_of(scenario("a/00"))}
     assert plan.cells[2].fields["group"] == "StraightObstacle"
     assert (one.spec["repetition"], one.spec["spread"]) == (0, 0.0)
     assert (again.spec["repetition"], again.spec["spread"]) == (1, 0.5)
@@ -113,6 +113,19 @@ def test_cells_are_named_and_described(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(plan.inputs) == {"towns", "systems"}
     assert list(plan.inputs["towns"]) == ["Nowhere"]
     assert plan.device == "cpu"
+
+
+def test_scenarios_on_one_route_of_a_town_share_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The key points and the town decide, not the name. A suite may say that scenarios are independent."""
+    first, other = scenario("a/00"), scenario("b/07", route=(Pose(0.001, 0), Pose(9, 0)))
+    elsewhere, beyond = scenario("c", town="Elsewhere"), scenario("d", route=(Pose(0, 0), Pose(9.1, 0)))
+    scenarios = (first, other, elsewhere, beyond)
+    clusters = [cell.fields["cluster"] for cell in plan_of(monkeypatch, *scenarios, systems=["blind"]).cells]
+    assert clusters[0] == clusters[1]
+    assert len(set(clusters)) == 3
+    assert clusters[0].startswith("Nowhere ")
+    independent = plan_of(monkeypatch, *scenarios, systems=["blind"], cluster="scenario")
+    assert [cell.fields["cluster"] for cell in independent.cells] == ["a/00", "b/07", "c", "d"]
 
 
 def test_each_scenario_is_built_once_to_check_it(monkeypatch: pytest.MonkeyPatch) -> None:

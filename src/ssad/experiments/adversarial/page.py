@@ -16,12 +16,13 @@ from ssad.core.lane_graph import load_graph, town_file
 from ssad.core.traces import load_trace
 from ssad.experiments.adversarial.collision_view import found_view
 from ssad.metrics import CaseValue, estimate
+from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.uncertainty import Kind, paired_difference
 from ssad.report.default import result_table
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import NATURAL, SOURCE
-from ssad.report.records import Line, field, metric_of
+from ssad.report.records import Line, field, metric_of, scenario_of
 from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -49,7 +50,7 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
     table_builders = main_table, careful_table, budget_table, against_table, group_table, traffic_table, transfer_table
     tables = [table for table in (build_table(run) for build_table in table_builders) if table]
     failures = [
-        ([str(line.get(name, "")) for name in ("generator", "system", "cluster")], line["status"], line["reason"])
+        ([str(line["generator"]), str(line["system"]), scenario_of(line)], line["status"], line["reason"])
         for line in run.failures
     ]
     return render(TEMPLATE, run, verdict=verdict, tables=tables, failures=failures, views=views(run)), tables
@@ -103,8 +104,10 @@ def transfer_table(run: Run) -> Table | None:
             for condition in ("found", "base")
         )
         if column == "difference":
-            return TableCell.of(paired_difference(with_adversary, base))
-        return TableCell.of(estimate((with_adversary if column == "found" else base).values(), "bounded"))
+            return TableCell.of(paired_difference(with_adversary, base, min_clusters=MIN_ROUTES))
+        return TableCell.of(
+            estimate((with_adversary if column == "found" else base).values(), "bounded", min_clusters=MIN_ROUTES)
+        )
 
     table = Table.pivot(
         "transfer",
@@ -145,13 +148,13 @@ def against_table(run: Run) -> Table | None:
     def metric(lines: Sequence[Line], _: str) -> TableCell:
         generator_cases, random_cases = (
             {
-                f"{line['cluster']}#{line['spec']['repetition']}": _case(line, _within(line))
+                f"{scenario_of(line)}#{line['spec']['repetition']}": _case(line, _within(line))
                 for line in search_lines
                 if line["status"] != "ok" or not math.isnan(_within(line))
             }
             for search_lines in (lines, random_lines[str(lines[0]["system"])])
         )
-        return TableCell.of(paired_difference(generator_cases, random_cases, kind="share"))
+        return TableCell.of(paired_difference(generator_cases, random_cases, kind="share", min_clusters=MIN_ROUTES))
 
     table = Table.pivot(
         "against_random",
@@ -197,9 +200,13 @@ def traffic_table(run: Run) -> Table | None:
         }
         among_adversaries = drives[0][1] == "Adv.PPO"
         if column == "CR":
-            return TableCell.of(estimate((adversarial if among_adversaries else natural_cases).values(), "share"))
+            return TableCell.of(
+                estimate(
+                    (adversarial if among_adversaries else natural_cases).values(), "share", min_clusters=MIN_ROUTES
+                )
+            )
         return (
-            TableCell.of(paired_difference(adversarial, natural_cases, kind="share"))
+            TableCell.of(paired_difference(adversarial, natural_cases, kind="share", min_clusters=MIN_ROUTES))
             if among_adversaries
             else TableCell.value(None)
         )
@@ -249,7 +256,7 @@ def views(run: Run) -> list[dict[str, str]]:
             continue  # named on the page as missing or damaged
         image = found_view(trace, graph, [int(agent) for agent in line["adversaries"]])
         encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-        caption = f"{generator} against {system} in {line['cluster']}"
+        caption = f"{generator} against {system} in {scenario_of(line)}"
         command = f"ssad run quick --set scenarios={run.folder / line['artefacts']['scenarios']} --set systems={system}"
         uri = f"data:image/png;base64,{base64.b64encode(encoded).decode()}"
         entries.append({"data": uri, "caption": caption, "command": command})
@@ -279,7 +286,7 @@ def _within(line: Line, max_rollouts: float = math.inf) -> float:
 
 def _mean(lines: Sequence[Line], value: Callable[[Line], float], kind: Kind) -> TableCell:
     """Return the mean of a value of searches, over their base scenarios."""
-    return TableCell.of(estimate([_case(line, value(line)) for line in lines], kind))
+    return TableCell.of(estimate([_case(line, value(line)) for line in lines], kind, min_clusters=MIN_ROUTES))
 
 
 def _case(line: Line, value: float) -> CaseValue:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -82,11 +83,24 @@ def natural_table(run: DrivingRun) -> Table | None:
             for (system, traffic), by_town in NATURAL.items()
             for town, numbers in by_town.items()
         ],
-        note=f"Shaded rows: {SOURCE}. Their DR fits SafeBench's normalised scale (DR / 5 m); ours here is in metres, "
+        note=f"{_town_weights(run, towns)}Shaded rows: {SOURCE}. "
+        "Their DR fits SafeBench's normalised scale (DR / 5 m); ours here is in metres, "
         "and includes up to half a metre of spacing between route points. See also the normalised table. "
         f"{METHODS}",
         source=SOURCE,
     )
+
+
+def _town_weights(run: DrivingRun, towns: Mapping[str, str]) -> str:
+    """Return in a sentence how towns are weighed where they are averaged; empty for one town."""
+    route_counts = {}
+    for group, town in towns.items():
+        counts = [values["CR"].clusters for (_, name), values in run.numbers.items() if name == group]
+        route_counts[town] = max(counts, default=0)
+    if len(route_counts) < 2:
+        return ""
+    listing = ", ".join(f"{town} {count} routes" for town, count in route_counts.items())
+    return f"The mean of the towns weighs each town the same ({listing}). "
 
 
 def full_table(run: DrivingRun) -> Table:

@@ -10,14 +10,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Literal
 
 from ssad.core import safeio
 from ssad.metrics import CaseValue, estimate, paired_difference
+from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.rank import family_correlation
 from ssad.report.figures import MetricChange, change_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
-from ssad.report.records import Line, case_of, field, metric_of
+from ssad.report.records import Line, case_of, field, metric_of, scenario_of
 from ssad.report.tables import METHODS, Table, TableCell
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -85,7 +87,7 @@ def section(run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]
     ceilings, errors, signs = (build_table(run) for build_table in (ceiling_table, error_table, sign_table))
     tables = [main, drop, rank, cause, *(table for table in (ceilings, errors, signs) if table.rows)]
     failures = [
-        ([line["system"], line["perturbation"], str(line["severity"]), line["cluster"]], line["reason"])
+        ([line["system"], line["perturbation"], str(line["severity"]), scenario_of(line)], line["reason"])
         for line in run.failures
     ]
     page = render(
@@ -320,7 +322,7 @@ def sheets(run: Run) -> list[dict[str, str]]:
         cause = (line.get("cause") or {}).get("cause", "")
         condition_text = f"{line['perturbation']} {line['severity']}" if line["severity"] else "clean"
         outcome = str(line.get("end", "")).replace("_", " ")
-        caption = f"{line['system']}, {line['cluster']}, {condition_text}: {outcome}{f' ({cause})' if cause else ''}"
+        caption = f"{line['system']}, {scenario_of(line)}, {condition_text}: {outcome}{f' ({cause})' if cause else ''}"
         entries.append({"caption": caption, "data": f"data:image/jpeg;base64,{encoded}", "key": str(line["key"])})
     return entries
 
@@ -328,9 +330,7 @@ def sheets(run: Run) -> list[dict[str, str]]:
 def values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
     """Return a metric by drive: scenario and repetition."""
     return {
-        f"{line.get('cluster') or line['key']}#{line['spec'].get('repetition', 0)}": case_of(
-            line, metric_of(line, name)
-        )
+        f"{scenario_of(line)}#{line['spec'].get('repetition', 0)}": case_of(line, metric_of(line, name))
         for line in lines
     }
 
@@ -338,8 +338,8 @@ def values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
 def _cell(lines: Sequence[Line], name: str) -> TableCell:
     cases = values(lines, name).values()
     if name == "collision":
-        return TableCell.of(estimate(cases, "share"))
-    return TableCell.of(estimate(cases, "bounded" if name in BOUNDED else "mean"))
+        return TableCell.of(estimate(cases, "share", min_clusters=MIN_ROUTES))
+    return TableCell.of(estimate(cases, "bounded" if name in BOUNDED else "mean", min_clusters=MIN_ROUTES))
 
 
 def change(run: Run, condition: Condition, name: str) -> TableCell:
@@ -364,4 +364,5 @@ def _difference(lines: Sequence[Line], other_lines: Sequence[Line], name: str) -
     """Return the difference of a metric from that of other lines of the same drives."""
     cases, other_cases = values(lines, name), values(other_lines, name)
     shared_cases = {drive: other_cases[drive] for drive in cases if drive in other_cases}
-    return TableCell.of(paired_difference(cases, shared_cases, kind="share" if name == "collision" else "mean"))
+    kind: Literal["share", "mean"] = "share" if name == "collision" else "mean"
+    return TableCell.of(paired_difference(cases, shared_cases, kind=kind, min_clusters=MIN_ROUTES))
