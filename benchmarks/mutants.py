@@ -262,6 +262,7 @@ class Copy:
 
     def make(self) -> None:
         """Copy what the tests read."""
+        self.folder.mkdir(parents=True, exist_ok=True)
         for name in _top_level_names(self.root):
             if (self.root / name).is_dir():
                 shutil.copytree(self.root / name, self.folder / name, ignore=shutil.ignore_patterns("__pycache__"))
