@@ -112,6 +112,21 @@ def test_contact_sheets(tiny_set: Path, tmp_path: Path) -> None:
     assert str(own) in done.stdout
 
 
+def test_a_contact_sheet_shows_the_shifts_that_are_named(tiny_set: Path, tmp_path: Path) -> None:
+    """Clean, fog and noise in a row of three, and a row of five severities for each. Snow begins a second row."""
+    picture = next((tiny_set / "samples" / "CAM_BACK").iterdir())
+    heights: dict[int, tuple[int, int]] = {}
+    for names, rows in (("fog,uniform", 1), ("fog,uniform,snow", 2)):
+        out = tmp_path / f"{rows}.png"
+        done = ssad("shift", picture, out, "--shifts", names)
+        assert done.returncode == 0, done.stderr
+        sheet, severities = (cv2.imread(str(path)) for path in (out, tmp_path / f"{rows}-severities.png"))
+        assert sheet.shape[1] % 3 == severities.shape[1] % 5 == 0, "columns"
+        heights[rows] = sheet.shape[0], severities.shape[0]
+    assert heights[2] == (2 * heights[1][0], 1.5 * heights[1][1])
+    assert ssad("shift", picture, tmp_path / "no.png", "--shifts", "fgo").returncode == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [

@@ -70,6 +70,7 @@ def shift(
         write_contact_sheets(
             source,
             out,
+            shifts=names,
             version=version,
             channel=channel,
             split=split,

@@ -89,6 +89,8 @@ def _attack_list() -> dict[str, str]:
         if needs(name):
             return f"made in Python: needs {', '.join(needs(name))} (docs/how-to/attack-detectors.md)"
         access = make_attack(name).access
+        if name == "universal":
+            return f"one change for all images, fitted to other drives, loss {default_loss(name)}"
         return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
 
     rows = {name: describe(name, origin) for name, origin in attack_names().items()}

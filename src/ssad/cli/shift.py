@@ -211,6 +211,7 @@ def write_contact_sheets(
     source: Path,
     out: Path,
     *,
+    shifts: Sequence[str],
     version: str | None,
     channel: str,
     split: str | None,
@@ -225,6 +226,7 @@ def write_contact_sheets(
     Args:
         source: The image, or a nuScenes root.
         out: Output folder of the sheets.
+        shifts: See `shift_names`.
         version: Version of the dataset; None: the only one.
         channel: Name of the camera.
         split: Must be None: a contact sheet has no split.
@@ -260,8 +262,9 @@ def write_contact_sheets(
         severity=severity_level,
         seed=seed,
         calibration=checked_calibration,
+        shifts=shift_names(shifts),
     )
-    print(f"all shifts: {shift_sheet}\nall severities: {severity_sheet}")
+    print(f"shifts: {shift_sheet}\nseverities: {severity_sheet}")
 
 
 def checked(dataset_root: Path) -> Callable[[dict[str, Any], GroundTruth], dict[str, Any]]:

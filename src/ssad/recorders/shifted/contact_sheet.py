@@ -126,13 +126,15 @@ def contact_sheet(
     severity: int = 3,
     seed: int = 0,
     calibration: Calibration = "physical",
+    shifts: Sequence[str] = tuple(SHIFTS),
     width: int = 480,
 ) -> U8:
-    """The clean picture and the 11 shifts, 12 panels in three columns as in the paper's figure: [rows, columns, 3]."""
+    """The clean picture and the shifts in three columns, as in the paper's figure of all 11: [rows, columns, 3]."""
     panels = [captioned(image, "clean", width)]
-    for name in SHIFTS:
+    for name in shifts:
         spec = ShiftSpec(name, severity, seed, calibration)
         panels.append(captioned(*_shifted(image, frame, spec, context), width))
+    panels += [np.full_like(panels[0], 255)] * (-len(panels) % 3)
     return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
 
@@ -143,11 +145,12 @@ def severity_sheet(
     context: SceneContext | None = None,
     seed: int = 0,
     calibration: Calibration = "physical",
+    shifts: Sequence[str] = tuple(SHIFTS),
     width: int = 300,
 ) -> U8:
     """Draw one row per shift, severities 1 to 5 from left to right."""
     rows = []
-    for name in SHIFTS:
+    for name in shifts:
         specs = [ShiftSpec(name, severity, seed, calibration) for severity in SEVERITIES]
         cells = [_shifted(image, frame, spec, context) for spec in specs]
         captioned_cells = [
@@ -179,6 +182,7 @@ def write_sheets(
     severity: int = 3,
     seed: int = 0,
     calibration: Calibration = "physical",
+    shifts: Sequence[str] = tuple(SHIFTS),
 ) -> tuple[Path, Path]:
     """Both sheets of a picture or of a nuScenes folder: OUT, and beside it OUT with "-severities" in its name."""
     quiet_warp()
@@ -189,9 +193,12 @@ def write_sheets(
         image = read_image(source)
         frame = own_frame(image, boxes)
     severities_path = out.with_name(f"{out.stem}-severities{out.suffix}")
-    sheet = contact_sheet(image, frame, context=context, severity=severity, seed=seed, calibration=calibration)
+    sheet = contact_sheet(
+        image, frame, context=context, severity=severity, seed=seed, calibration=calibration, shifts=shifts
+    )
     save_picture(out, sheet)
-    save_picture(severities_path, severity_sheet(image, frame, context=context, seed=seed, calibration=calibration))
+    severities_image = severity_sheet(image, frame, context=context, seed=seed, calibration=calibration, shifts=shifts)
+    save_picture(severities_path, severities_image)
     return out, severities_path
 
 
