@@ -186,7 +186,7 @@ def test_what_a_system_does_wrong_is_a_record(tmp_path: Path, monkeypatch: pytes
     console = Console(file=io.StringIO(), width=100)
     console.print(summary(tmp_path / "run"))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "3 of 4 cells failed and count" in shown
+    assert "3 of 4 cells failed; they widen the intervals" in shown
     with pytest.raises(StoreError, match="left no trace: failed"):
         replay(tmp_path / "run", "wicked_system:Wicked/StraightObstacle/00")
 
