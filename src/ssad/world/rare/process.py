@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Believer, Branching, Driver, WorldState
+from ssad.core.driving import Believer, Branching, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, Bool, Controller, End, Episode
 from ssad.world.noise import Keys, Noise
+from ssad.world.rare.branching import branch_obstacle, refusal
 from ssad.world.rollout import Loop
 from ssad.world.world import World
 
@@ -83,32 +84,6 @@ class Process(Protocol):
         """Return the amount simulated so far, in agent-steps."""
 
 
-def branch_obstacle(driver: Driver, history_sensors: Collection[str] = ()) -> str:
-    """Return why episodes of a driver cannot branch, in a clause that begins with its name; "" where they can.
-
-    Args:
-        driver: The driver, with its name.
-        history_sensors: Names of the sensors that keep a history of each episode.
-    """
-    if isinstance(driver, Believer):
-        return f"{driver.name} plans over a belief, which no snapshot holds"
-    if driver.controller != Controller.EXTERNAL:
-        return ""  # it runs inside the world, whose snapshots hold all of it
-    if not isinstance(driver, Branching):
-        return f"{driver.name} has no methods snapshot() and restore(states)"
-    used_sensors = [name for name in getattr(driver, "sensors", ()) if name in history_sensors]
-    return f"{driver.name} reads {used_sensors[0]}, a sensor with a history that no snapshot holds" * bool(used_sensors)
-
-
-def refusal(obstacle: str) -> str:
-    """Return the message that an accelerated estimator refuses a driver, from its `branch_obstacle`."""
-    advice = "add both (ssad.core.driving.Branching), or " if "snapshot()" in obstacle else ""
-    return (
-        f"{obstacle}, so splitting and importance sampling cannot branch its episodes: {advice}"
-        "set methods=[monte-carlo]"
-    )
-
-
 class WorldProcess:
     """A world with noise and its drivers as a `Process`; failure is a collision of the ego.
 
@@ -144,7 +119,7 @@ class WorldProcess:
             for number, driver in enumerate(external_drivers)
             if isinstance(driver, Branching)
         }
-        self._forms: dict[str, tuple[tuple[int, ...], Any]] = {}
+        self._forms: dict[str, dict[str, tuple[tuple[int, ...], Any]]] = {}
         self._work = 0.0
         self._pushed = self._recorded = False
 
@@ -227,14 +202,12 @@ class WorldProcess:
                     f"{name}: snapshot()['{key}'] has shape {value.shape} and type {value.dtype}; expected numbers, "
                     f"and a row for each of the {self.batch} episodes"
                 )
-        form = {prefix + key: (value.shape, value.dtype) for key, value in states.items()}
-        first_form = {key: value for key, value in self._forms.items() if key.startswith(prefix)}
-        if first_form and form != first_form:
-            changed = sorted(key.removeprefix(prefix) for key, _ in form.items() ^ first_form.items())
+        form = {key: (value.shape, value.dtype) for key, value in states.items()}
+        changed = sorted(key for key, _ in form.items() ^ self._forms.setdefault(prefix, form).items())
+        if changed:
             raise ConfigError(
                 f"{name}: snapshot()['{changed[0]}'] changed its shape or type in an episode; make it in reset()"
             )
-        self._forms |= form
         return states
 
     def put(self, rows: Rows, states: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -302,7 +275,7 @@ class WorldProcess:
 
 
 def driver_seeds(keys: Keys) -> list[int]:
-    """Return the seeds, of 32 bits, of the episodes that drivers are given where the world's futures have these keys."""
+    """Return the seeds, of 32 bits, that drivers find in their episodes where the world has these keys."""
     return [int(key) & 0xFFFFFFFF for key in keys]
 
 
