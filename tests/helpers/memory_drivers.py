@@ -13,7 +13,7 @@ import numpy as np
 from ssad.core.driving import Observation
 from ssad.core.types import F32, Bool, Controller, Episode
 
-AWAY = (30, 48)  # steps in which it goes on as it is
+AWAY = (30, 50)  # steps in which it goes on as it is
 _calls = {"all": 0}
 
 
@@ -37,7 +37,7 @@ class Clock:
         gap = np.where((kind > 0) & (x > 0) & (np.abs(y) < 2), x, np.inf)
         nearest = gap.argmin(1)[:, None]
         gap, lead = np.take_along_axis(gap, nearest, 1)[:, 0], np.take_along_axis(speed, nearest, 1)[:, 0]
-        wanted = np.minimum(view.target_speed, np.where(np.isfinite(gap), lead + 0.4 * (gap - 16.0), np.inf))
+        wanted = np.minimum(view.target_speed, np.where(np.isfinite(gap), lead + 0.4 * (gap - 10.0), np.inf))
         push = np.where(self.looks_away(view), 0.05, np.clip(0.5 * (wanted - view.speed), -1.0, 1.0))
         steer = np.clip(np.arctan2(view.route[:, 6, 1], view.route[:, 6, 0]) * 1.5, -1, 1)
         return np.stack([np.maximum(push, 0.0), np.maximum(-push, 0.0), steer], 1).astype(np.float32)

@@ -133,7 +133,7 @@ class _History:
         if differs.any():
             raise ConfigError(
                 f"{process.name}: {differs.sum()} of {process.batch} episodes went another way from a restored "
-                f"snapshot, at first in step {min(first_steps)}: snapshot() and restore(states) must cover all that "
+                f"snapshot, the first in step {min(first_steps)}: snapshot() and restore(states) must cover all that "
                 "its actions depend on, separately for each episode (ssad.core.driving.Branching); or set "
                 "methods=[monte-carlo]"
             )
@@ -146,7 +146,7 @@ class _History:
         Raises:
             ConfigError: A particle ended otherwise.
         """
-        process, step = self.process, 0
+        process, step, differs = self.process, 0, np.zeros(self.process.batch, bool)
         process.reset(self.keys[0])
         while (running := process.running()).any():
             changed = np.flatnonzero(self.keys[step] != self.keys[max(step - 1, 0)])
@@ -154,7 +154,9 @@ class _History:
             process.step()
             self.step_counts[running] += 1
             step += 1
-        differs = _different(process.snapshot(), self.states, self.rows, (self.now, self.rows))
+            # A driver is called for ended rows too, and may go on to change what it remembers of them.
+            rows = np.flatnonzero(running & ~process.running())
+            differs[rows] = _different(process.snapshot(), self.states, rows, (self.now[rows], rows))
         if differs.any():
             raise ConfigError(
                 f"{process.name}: {differs.sum()} of {process.batch} branched episodes end otherwise where they are "
@@ -171,7 +173,7 @@ def _different(
 ) -> Bool:
     """Return the rows whose states differ in any bit from those at places (step, row) of a history."""
     differs = np.zeros(len(rows), bool)
-    for name, values in states.items():
+    for name, values in states.items() if len(rows) else ():
         current, recorded = (np.ascontiguousarray(array) for array in (values[rows], history[name][places]))
         equal = current.view(np.uint8).reshape(len(rows), -1) == recorded.view(np.uint8).reshape(len(rows), -1)
         differs |= ~equal.all(axis=1)
