@@ -67,17 +67,9 @@ FEW = ["noise.accel=2", "episodes=200", "batch=200", "particles=30", "repeats=2"
 def test_a_hidden_memory_is_counted_and_its_accelerated_cells_fail_in_a_line(tmp_path: Path) -> None:
     """It drives like one that reads the clock and remembers nothing, whose cells have the same random numbers."""
     settings = [*FEW, f"systems=[{HIDDEN},{CLOCK}]", "methods=[monte-carlo,splitting,importance]"]
-    results = run(
-        "how-often",
-        set=settings,
-        out=tmp_path,
-        workers=0,
-        quiet=True,
-        only={
-            "name": [f"{method}/{HIDDEN}/lane-traffic/05" for method in METHODS]
-            + [f"monte-carlo/{CLOCK}/lane-traffic/05"]
-        },
-    )
+    names = [*(f"{method}/{HIDDEN}" for method in METHODS), f"monte-carlo/{CLOCK}"]
+    cells = {"name": [f"{name}/lane-traffic/05" for name in names]}
+    results = run("how-often", set=settings, out=tmp_path, workers=0, quiet=True, only=cells)
     rows = {(row["system"].partition(":")[2], row["method"]): row for row in results.rows}
     counted, truth = rows["Hidden", "monte-carlo"], rows["Clock", "monte-carlo"]
     assert counted["metrics"]["events"] > 2

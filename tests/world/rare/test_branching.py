@@ -109,12 +109,12 @@ class Tiring(Walk):
     def step(self) -> None:
         self.means = np.where(self.tired[:, None], 1.0, np.zeros((self.batch, self.width)))
         super().step()
-        self.tired |= self.at > 0.7 * self.height
+        self.tired |= self.at > 0.8 * self.height
 
 
 def test_a_memory_that_shows_only_near_failures_is_refused_after_the_last_level() -> None:
     """None of the first episodes comes so near that the first test could notice it."""
-    walk = Tiring(100, 14.0, steps=6)
+    walk = Tiring(100, 20.0, steps=20)
     with pytest.raises(ConfigError, match=r"tiring: \d+ of 100 branched episodes end otherwise"):
         splitting(walk, generator("tiring"), repeats=1)
     walk.external = False
