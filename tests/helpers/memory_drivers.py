@@ -98,6 +98,18 @@ class Shared(Saved):
         self.count = np.full_like(states["count"], states["count"][0])
 
 
+class Seeded(Clock):
+    """Looks away in steps that it chooses at the start of each episode, and does not save which."""
+
+    name = "seeded"
+
+    def reset(self, episodes: Sequence[Episode]) -> None:
+        self.phase = np.array([episode.seed % 5 for episode in episodes])
+
+    def looks_away(self, view: Observation) -> Bool:
+        return (np.round(np.asarray(view.time, float) / 0.1) + self.phase[view.scene]) % 5 == 0
+
+
 class Dice(Clock):
     """Looks away by a generator of its own, which it does not save."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -85,6 +87,7 @@ def test_a_memory_that_is_saved_is_split_like_none_and_agrees_with_monte_carlo(c
         (memory_drivers.Forgetful, "forgetful: 60 of 60 episodes went another way"),
         (memory_drivers.Undeclared, "undeclared: .* went another way from a restored snapshot, the first in step 3"),
         (memory_drivers.Shared, "shared: .* went another way"),
+        (memory_drivers.Seeded, "seeded: .* went another way"),
         (memory_drivers.Dice, "dice: .* went another way"),
         (memory_drivers.Global, "global: .* went another way"),
         (memory_drivers.Rattled, "rattled: .* went another way"),
@@ -138,6 +141,19 @@ def test_the_careful_drivers_save_what_they_remember() -> None:
     rows = process(driver, 16)
     splitting(rows, generator("careful"), repeats=2)
     assert rows.snapshot()["driver.0.brake"].any()
+
+
+def test_the_drivers_of_the_guide_branch() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "measure-failure-rates.md").read_text()
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    assert names["Mine"]().snapshot() == {}
+    drowsy = names["Drowsy"]()
+    drowsy.name, drowsy.controller = "drowsy", Controller.EXTERNAL
+    rows = process(drowsy, 16)
+    splitting(rows, generator("guide"), repeats=2)
+    assert rows.snapshot()["driver.0.count"].any()
 
 
 def test_learned_drivers_say_that_they_remember_nothing() -> None:
