@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
@@ -155,7 +156,9 @@ class HowOften(ScenarioKind):
 
     def summary(self, run: Run) -> Table:
         """Return the main table; its note says which methods contradict each other, and which systems lack some."""
-        return replace(default.summary(run), note="\n".join([*contradictions(run), *unbranched(run)]))
+        # A terminal cuts what is wider than itself, and the table may be.
+        notes = [textwrap.fill(sentence, 78) for sentence in (*contradictions(run), *unbranched(run))]
+        return replace(default.summary(run), note="\n".join(notes))
 
 
 def methods_of(suite: HowOftenSuite, system: str, scenario: Scenario) -> Sequence[Method]:
