@@ -127,17 +127,20 @@ class RSS(CarefulModel):
         brake: m/s^2 that both sides are sure to reach.
         sideways: m/s^2, the same across the path, to add and to take away.
         wander: m across the path that bodies wander.
+        drifts: True if the driver itself may move towards the other during the delay, as in definition 6; False: it
+            keeps its path, as in JRC's grids.
     """
 
     name: str = "rss"
     delay: float = 0.75
-    jerk: float = np.inf
+    jerk: float = JERK
     coast: float = 0.0
     hold: float = HARD
     accelerate: float = 3.0
     brake: float = 6.0
     sideways: float = 1.0
     wander: float = 0.3
+    drifts: bool = True
 
     def _runs(self, speed: F64, acceleration: float, brake: float) -> F64:
         """Return the stopping distance, m, of a body that speeds up during the delay and then brakes."""
@@ -150,10 +153,9 @@ class RSS(CarefulModel):
         leader_distance = -encounter.lead * np.abs(encounter.lead) / (2.0 * self.brake)
         oncoming_distance = self._runs(np.abs(encounter.lead), self.accelerate, self.brake)
         safe_gap = np.maximum(ego_distance + np.where(encounter.lead >= 0.0, leader_distance, oncoming_distance), 0.0)
-        lateral_stop = self._runs(np.zeros_like(encounter.speed), self.sideways, self.sideways)
-        safe_lateral = (
-            self.wander + lateral_stop + self._runs(np.maximum(encounter.approach, 0.0), self.sideways, self.sideways)
-        )
+        safe_lateral = self.wander + self._runs(np.maximum(encounter.approach, 0.0), self.sideways, self.sideways)
+        if self.drifts:
+            safe_lateral = safe_lateral + self._runs(np.zeros_like(encounter.speed), self.sideways, self.sideways)
         is_beside = (encounter.lateral <= 0.0) | ((encounter.lateral < safe_lateral) & (encounter.approach > 0.0))
         is_danger = (
             (encounter.gap < safe_gap)
@@ -232,7 +234,9 @@ def _danger_level(gap: F64, safe: F64, unsafe: F64) -> F64:
 
 def stays_in_path(encounter: Encounter) -> Bool:
     """Return True where the other agent is still in the path when the driver reaches it."""
-    return np.asarray(encounter.time_to_leave() + SPARE > encounter.time_to_reach())
+    # an agent that never leaves stays, also before a driver that never reaches it
+    time_to_leave = encounter.time_to_leave()
+    return np.isinf(time_to_leave) | (time_to_leave + SPARE > encounter.time_to_reach())
 
 
 MODELS: dict[str, CarefulModel] = {m.name: m for m in (CarefulHuman(), Reg157(), RSS(), FSM())}
