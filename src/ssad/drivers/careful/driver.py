@@ -23,14 +23,18 @@ PULL = 2.0  # m/s^2, acceleration to its target speed
 WAIT = 3.0  # m to a standing agent in its path at which it stays standing
 SOON = 3.0  # s to a conflict within which it does not accelerate
 CROSSING = 10.0  # m ahead within which a standing driver lets others cross
+RESPONSE = 0.5  # s, time constant with which its speed follows a change
+APPROACH = 1.0  # m/s^2, braking with which it comes to its following gap
+OPENING = 0.3  # 1/s, share of a missing gap by which it is slower than the vehicle in front
 
 
 class Careful:
     """A careful driver of the regulation literature, at the wheel.
 
     It keeps its route at its target speed, slower in bends, and stops at red lights. Of others it knows what is in line
-    of sight; it does nothing about them but what its model says, which is to brake, and waits behind who stands in its
-    way. It neither changes lane nor swerves, and knows no right of way and no stop signs.
+    of sight; it brakes for them as its model says, keeps the following gap of its model behind a vehicle in front, and
+    waits behind who stands in its way. It neither changes lane nor swerves, and knows no right of way and no stop
+    signs.
     """
 
     controller = Controller.EXTERNAL
@@ -42,7 +46,8 @@ class Careful:
         Args:
             name: Its short name, one of `ssad.drivers.careful.MODELS`.
             model: A custom model instead.
-            keep_speed: Keep the speed at the takeover instead of the target speed; at least 1 m/s.
+            keep_speed: Keep the speed at the takeover instead of the target speed, at least 1 m/s, and follow a vehicle
+                only once the model has braked for it.
 
         Raises:
             UnknownNameError: There is no such model.
@@ -54,6 +59,7 @@ class Careful:
         self._cruise = np.zeros(0)
         self._memory: Reaction | None = None
         self._moved = np.zeros((0, 0))
+        self._follows = np.zeros((0, 0), bool)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Forget all agents and prepare for new episodes."""
@@ -70,6 +76,7 @@ class Careful:
         if self._memory is None:
             shape = (len(self._half), agent_count)
             self._memory, self._moved = Reaction(np.full(shape, -1.0), np.zeros(shape)), np.zeros(shape)
+            self._follows = np.full(shape, not self.keep_speed)
         path, half_size = Path(view.route), self._half[scenes]
         encounter, visible, lateral_travel = encounters(
             view, path, half=half_size, reach=REACH, moved=self._moved[scenes], dt=STEP
@@ -82,6 +89,7 @@ class Careful:
             updated_memory.brake,
             lateral_travel,
         )
+        self._follows[scenes] |= updated_memory.brake > 0.0
         speed = np.asarray(view.speed, np.float64)
         is_new = np.isnan(self._cruise[scenes])
         self._cruise[scenes] = np.where(is_new, speed, self._cruise[scenes])
@@ -89,7 +97,9 @@ class Careful:
         target = np.maximum(self._cruise[scenes], 1.0) if self.keep_speed else target_speed
         allowed = squared_bend_speeds(view.route)
         bend_limit = bend_speed(allowed, np.arange(allowed.shape[1], dtype=np.float64))
-        acceleration = np.clip(2.0 * (np.minimum(target, bend_limit) - speed), -2.0 * EASY, PULL)
+        acceleration = np.clip((np.minimum(target, bend_limit) - speed) / RESPONSE, -2.0 * EASY, PULL)
+        following = following_acceleration(self.model, encounter, self._follows[scenes] & visible).min(1, initial=PULL)
+        acceleration = np.minimum(acceleration, np.maximum(following, -EASY if self.keep_speed else -2.0 * EASY))
         must_wait = (visible & is_in_the_way(encounter, half_size[:, :1])).any(1)
         acceleration = np.where((visible & is_coming(encounter)).any(1), np.minimum(acceleration, 0.0), acceleration)
         brake = np.maximum(demanded.max(1, initial=0.0), _red_light_braking(view, half_size[:, 0]))
@@ -114,6 +124,27 @@ def is_in_the_way(encounter: Encounter, half_length: F64) -> Bool:
     is_blocking = (encounter.lateral <= 0.0) & (encounter.gap < WAIT)
     is_crossing = (encounter.approach > 0.3) & (encounter.gap < CROSSING) & (encounter.time_to_enter() < 3.0)
     return np.asarray(is_near & (is_blocking | is_crossing))
+
+
+def following_acceleration(model: CarefulModel, encounter: Encounter, follows: Bool) -> F64:
+    """Return the acceleration, m/s^2, with which a driver comes to or keeps its gap to each vehicle in front.
+
+    Args:
+        model: The model with the following gap.
+        encounter: The others that the driver sees.
+        follows: Which of them it follows, if they are in its path and move along it or stand.
+
+    Returns:
+        The acceleration, of any size; infinite where there is no vehicle to follow.
+    """
+    is_in_front = (encounter.lateral <= 0.0) & np.isinf(encounter.through) & (encounter.gap > -0.5 * encounter.length)
+    lead = np.maximum(encounter.lead, 0.0)
+    # what the gap will be when the speed has followed
+    gap = encounter.gap - RESPONSE * np.maximum(encounter.speed - lead, 0.0)
+    room = gap - np.maximum(model.following_gap(lead), WAIT)
+    approach_speed = np.sqrt(lead * lead + 2.0 * APPROACH * np.maximum(room, 0.0))
+    allowed = np.where(room > 0.0, approach_speed, np.maximum(lead + OPENING * room, 0.0))
+    return np.where(follows & is_in_front & (encounter.lead > -0.5), (allowed - encounter.speed) / RESPONSE, np.inf)
 
 
 def is_coming(encounter: Encounter) -> Bool:
