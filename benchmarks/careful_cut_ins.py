@@ -149,11 +149,16 @@ def share_table(name: str, published: Mapping[str, Bool], repeated: Mapping[str,
     ]
     for label, (models, rules) in changes.items():
         lines.append(row(label, sweep(name, models, dict.fromkeys(models, rules))))
-    swept = {"no lead-in": {"lead_in": np.inf}, "delays within steps, braking goes on": {"whole_steps": False}}
-    swept["a driver is past with its rear, not its centre"] = {"past_at_centre": False}
-    for label, change in swept.items():
-        rules_by_model = {model: replace(rules, **change) for model, rules in JRC_SWEEP.items()}
-        lines.append(row(label, sweep(name, JRC_MODELS, rules_by_model)))
+    changed_rules = {
+        "no lead-in": {model: replace(rules, lead_in=np.inf) for model, rules in JRC_SWEEP.items()},
+        "delays within steps, braking goes on": {
+            model: replace(rules, whole_steps=False) for model, rules in JRC_SWEEP.items()
+        },
+        "a driver is past with its rear, not its centre": {
+            model: replace(rules, past_at_centre=False) for model, rules in JRC_SWEEP.items()
+        },
+    }
+    lines += [row(label, sweep(name, JRC_MODELS, rules_by_model)) for label, rules_by_model in changed_rules.items()]
     models = {model: MODELS[model.lower()] for model in JRC_MODELS}
     lines.append(row("SSAD's own", sweep(name, models, dict.fromkeys(models, SweepRules(lead_in=JRC_RULES.lead_in)))))
     return lines

@@ -32,9 +32,9 @@ class Hindsight:
     """Remembers the last 6 s of scenes, and plays them again with a careful driver at the wheel.
 
     It is `ssad.drivers.careful.grade` for two in an empty town: the careful driver takes over when the danger begins,
-    goes on along the ego's route at the speed that it finds (less in bends), and brakes as its model says. The other
-    does what it did, and from the contact on brakes to a stop straight ahead, as in a saved scenario. Whom else there
-    is, red lights and what hides the other from sight are left out.
+    goes on along the ego's route at the speed that it finds (less in bends), brakes as its model says, and follows the
+    other once it has braked for it. The other does what it did, and from the contact on brakes to a stop straight
+    ahead, as in a saved scenario. Whom else there is, red lights and what hides the other from sight are left out.
     """
 
     def __init__(self, scenes: int, agents: int, *, dt: float = 0.1, model: CarefulModel | None = None) -> None:

@@ -85,9 +85,7 @@ def test_they_keep_their_gap_behind_slower_standing_and_braking_cars(name: str) 
         for speed, brake in ((8.0, 4.0), (12.0, 6.0), (15.0, 8.0))
     ]
     episodes = [*slower.values(), scripted, *standing, *braking]
-    traces = dict(
-        zip([one.key for one in episodes], rollout(World(episodes, GRAPHS), make_system(name)), strict=True)
-    )
+    traces = dict(zip([one.key for one in episodes], rollout(World(episodes, GRAPHS), make_system(name)), strict=True))
     for key, trace in traces.items():
         assert not trace.contact.any(), key
         assert gaps(trace).min() > 2.5, key

@@ -98,8 +98,10 @@ class Careful:
         allowed = squared_bend_speeds(view.route)
         bend_limit = bend_speed(allowed, np.arange(allowed.shape[1], dtype=np.float64))
         acceleration = np.clip((np.minimum(target, bend_limit) - speed) / RESPONSE, -2.0 * EASY, PULL)
-        following = following_acceleration(self.model, encounter, self._follows[scenes] & visible).min(1, initial=PULL)
-        acceleration = np.minimum(acceleration, np.maximum(following, -EASY if self.keep_speed else -2.0 * EASY))
+        following = following_acceleration(self.model, encounter, self._follows[scenes] & visible)
+        hardest = -EASY if self.keep_speed else -2.0 * EASY
+        following_limit: F64 = np.maximum(following, hardest).min(1, initial=PULL)
+        acceleration = np.minimum(acceleration, following_limit)
         must_wait = (visible & is_in_the_way(encounter, half_size[:, :1])).any(1)
         acceleration = np.where((visible & is_coming(encounter)).any(1), np.minimum(acceleration, 0.0), acceleration)
         brake = np.maximum(demanded.max(1, initial=0.0), _red_light_braking(view, half_size[:, 0]))
@@ -144,7 +146,8 @@ def following_acceleration(model: CarefulModel, encounter: Encounter, follows: B
     room = gap - np.maximum(model.following_gap(lead), WAIT)
     approach_speed = np.sqrt(lead * lead + 2.0 * APPROACH * np.maximum(room, 0.0))
     allowed = np.where(room > 0.0, approach_speed, np.maximum(lead + OPENING * room, 0.0))
-    return np.where(follows & is_in_front & (encounter.lead > -0.5), (allowed - encounter.speed) / RESPONSE, np.inf)
+    is_followed = follows & is_in_front & (encounter.lead > -0.5)
+    return np.where(is_followed, (allowed - encounter.speed) / RESPONSE, np.inf)
 
 
 def is_coming(encounter: Encounter) -> Bool:

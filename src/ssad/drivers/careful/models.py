@@ -116,7 +116,8 @@ class Reg157(CarefulModel):
 
     def following_gap(self, speed: F64) -> F64:
         """Return the minimum following distance of paragraph 5.2.3.3, m: a time gap by speed, but at least 2 m."""
-        return np.maximum(speed * np.interp(speed, FOLLOWING_SPEEDS, FOLLOWING_TIMES), FOLLOWING_DISTANCE)
+        time_gap = np.interp(speed, FOLLOWING_SPEEDS, FOLLOWING_TIMES)
+        return np.asarray(np.maximum(speed * time_gap, FOLLOWING_DISTANCE))
 
     def demand(self, encounter: Encounter) -> F64:
         """Brake once the TTC of a vehicle in the lane falls below the time that braking takes."""
@@ -160,7 +161,7 @@ class RSS(CarefulModel):
     drifts: bool = True
 
     def following_gap(self, speed: F64) -> F64:
-        """Return the gap, m, that is still safe when the leader has braked during the delay, as JRC's `RSS_distance`."""
+        """Return the gap, m, that is still safe after the leader has braked during the delay (JRC's `RSS_distance`)."""
         leader_speed = np.maximum(speed - self.brake * self.delay, 0.0)
         leader_distance = leader_speed * leader_speed / (2.0 * self.brake)
         return self._runs(speed, self.accelerate, self.brake) - leader_distance + 0.5 * self.brake * self.delay**2
