@@ -115,7 +115,7 @@ def test_they_do_not_brake_at_a_safe_gap_and_open_one_that_is_too_small(name: st
 def test_a_witness_follows_only_whom_its_model_has_braked_for(name: str) -> None:
     """A grade judges the model, so a driver that takes over at a danger has no anticipation of its own."""
     careful = careful_model(name.removeprefix("careful-"))
-    scene = [episode(ego(speed=8.0), car_in_front(60.0, 3.0), key="lead")]
+    scene = [episode(ego(speed=8.0), car_in_front(60.0, 3.0), key="lead", limits=EpisodeLimits(max_steps=200))]
     (driven,) = rollout(World(scene, GRAPHS), Careful(careful.name))
     (graded,) = rollout(World(scene, GRAPHS), Careful(careful.name, keep_speed=True))
     gap_at_braking = lambda trace: gaps(trace)[trace.speed[:, 0] < 7.7].max()  # noqa: E731
