@@ -78,6 +78,21 @@ def test_every_attack_keeps_its_budget_and_beats_the_clean_image(name: str, norm
         assert bool((found.after > found.before).all())
 
 
+@pytest.mark.parametrize("name", ["fgsm", "pgd", "apgd", "cw", "square", "nes", "spsa", "noise"])
+def test_an_attack_spends_its_l2_budget_on_images_whose_values_stop_at_0_and_255(name: str) -> None:
+    images, truth = toy_scene()
+    draws = torch.Generator().manual_seed(0)
+    ends = torch.randint(0, 2, images.shape, generator=draws).float()
+    images = torch.where(torch.rand(images.shape, generator=draws) < 0.4, ends, images)
+    options: dict[str, Any] = {"queries": 60} if name == "square" else {"samples": 4} if name in ("nes", "spsa") else {}
+    budget = Budget(px(40), "l2")
+    attack = make_attack(name, **options)
+    stored = run_attack(attack, ToyDetector(), images, truth, budget, objective=default_loss(name)).images
+    stored_lengths = 255 * lengths(stored - images).flatten()
+    assert bool((stored_lengths <= 40.001).all())
+    assert bool((stored_lengths > 39.0).all())
+
+
 @pytest.mark.parametrize("name", [*WHITE, "noise", "cw-min"])
 def test_an_image_fares_the_same_alone(name: str) -> None:
     detector = ToyDetector()
