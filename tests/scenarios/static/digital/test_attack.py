@@ -16,7 +16,7 @@ from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.detectors import make_detector
 from ssad.scenarios.static.digital import ATTACKS, Budget, default_loss, make_attack, needs, px, run_attack
-from ssad.scenarios.static.digital.apgd import checkpoints
+from ssad.scenarios.static.digital.apgd import MIN_STEPS, checkpoints
 from ssad.scenarios.static.digital.budget import lengths
 from ssad.scenarios.static.digital.check import is_within_budget, remaining_quality
 from ssad.scenarios.static.digital.gradient_check import check_gradient
@@ -279,6 +279,12 @@ def test_all_names_are_listed_with_what_they_need() -> None:
 
 def test_checkpoints_shrink() -> None:
     assert sorted(checkpoints(100)) == [22, 41, 57, 70, 80, 87, 93, 99]  # Croce and Hein, section 3
+
+
+def test_apgd_says_that_it_needs_more_steps() -> None:
+    with pytest.warns(UserWarning, match=f"apgd: 10 steps are too few .* take {MIN_STEPS} or more, or pgd"):
+        make_attack("apgd", steps=10)
+    assert make_attack("apgd").steps == MIN_STEPS, "without a warning, which would be an error"
 
 
 def test_pgd_steps_shrink_to_nothing() -> None:
