@@ -273,6 +273,8 @@ def test_all_names_are_listed_with_what_they_need() -> None:
     assert rows.keys() == {*ATTACKS, *PHYSICAL, *LIGHTS, "module:object"}
     assert rows["adv-patch"] == "physical: trains a patch (docs/how-to/paint-a-car.md)"
     assert rows["pgd"] == "white-box, loss full"
+    assert "noise" not in rows["universal"]
+    assert "one change" in rows["universal"]
     assert rows["transfer"].startswith("made in Python: needs surrogate, inner")
     assert [name for name in ATTACKS if needs(name)] == ["transfer", "expected"]
 
