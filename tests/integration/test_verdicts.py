@@ -200,19 +200,31 @@ def test_what_harms_the_system_most_is_said_first(tmp_path: Path) -> None:
 def texture(attack: str, hidden: float | None, **more: Any) -> dict[str, Any]:
     """A line of kind physical."""
     about = {"carrier": "paint", "test": "Oldmarket", "train": "Twinford", "view": "drive", "source": ""}
-    return {"detector": "d", "attack": attack, "metrics": {"ASR_25": hidden}} | about | more
+    metrics = {} if attack == "clean" else {"ASR_25": hidden, "n0_25": 38}
+    return {"detector": "d", "attack": attack, "metrics": metrics, "n": 40} | about | more
 
 
 def test_what_learns_nothing_is_no_attack_however_much_it_hides(tmp_path: Path) -> None:
     rows = [texture("clean", None), texture("noise", 0.4), texture("random", 0.1), texture("das", 0.2)]
     assert told(tmp_path / "paint", "physical", rows) == (
-        "das hides 20% of the targets from d. The strongest control (noise) hides 40%."
+        "das hides 20% of the 38 targets that d finds clean. The strongest control (noise) hides 40%."
     )
     lights = [texture(name, share, carrier="light, night") for name, share in (("random laser", 0.4), ("laser", 0.2))]
     assert told(tmp_path / "light", "physical", lights) == (
-        "laser hides 20% of the targets from d. The strongest control (random laser) hides 40%."
+        "laser hides 20% of the 38 targets that d finds clean. The strongest control (random laser) hides 40%."
     )
     assert told(tmp_path / "only", "physical", rows[:3]) == "See the table."
+
+
+def test_what_is_rarely_found_clean_has_no_success_rate(tmp_path: Path) -> None:
+    rows = [texture("clean", None), texture("das", None), texture("grey", None)]
+    for row in rows[1:]:
+        row["metrics"]["n0_25"] = 3
+    assert told(tmp_path / "few", "physical", rows) == (
+        "d finds 3 of 40 clean targets with a score above 0.25, less than 90%: attacks on it have no success rate."
+    )
+    uncounted = [texture("das", 0.9) | {"metrics": {"ASR_25": 0.9}}]
+    assert told(tmp_path / "old", "physical", uncounted) == "See the table.", "without n0 a rate says nothing"
 
 
 def test_an_attack_is_held_against_controls_of_its_own_pictures(tmp_path: Path) -> None:
@@ -225,7 +237,7 @@ def test_an_attack_is_held_against_controls_of_its_own_pictures(tmp_path: Path) 
         texture("grey", 0.3, carrier="patch"),
     ]
     assert told(tmp_path, "physical", rows) == (
-        "das hides 90% of the targets from d in Oldmarket. The strongest control (grey) hides 0%."
+        "das hides 90% of the 38 targets that d finds clean in Oldmarket. The strongest control (grey) hides 0%."
     )
 
 

@@ -297,11 +297,15 @@ class Kind(ABC):
 
         A kind of your own renders its own template with `ssad.report.pages.render`, or leaves this out.
         """
-        return default.section(run, verdict=self.verdict(run))
+        return default.section(run, verdict=self.verdict(run), note=self.note(run))
 
     def summary(self, run: Run) -> Table:
         """Return the main table of a run, for the terminal and for pages that link to the run."""
-        return default.summary(run)
+        return default.summary(run, note=self.note(run))
+
+    def note(self, run: Run) -> str:
+        """Return the text under the table of columns by factors, on page and terminal; empty: there is none."""
+        return ""
 
     def verdict(self, run: Run) -> list[str]:
         """Return the findings of a run in sentences, the most important first; empty: there are none."""

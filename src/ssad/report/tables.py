@@ -237,8 +237,9 @@ def tex(text: str) -> str:
 
 
 def to_latex(table: Table) -> str:
-    r"""Return a booktabs tabular; it needs \usepackage{booktabs}."""
+    r"""Return a booktabs tabular, with the note as a comment before it; it needs \usepackage{booktabs}."""
     lines = [
+        *(f"% {line}" for line in table.note.splitlines()),
         "\\begin{tabular}{" + "l" * len(table.heads) + "c" * len(table.columns) + "}",
         "\\toprule",
         " & ".join(tex(head) for head in [*table.heads, *table.columns]) + r" \\",

@@ -297,7 +297,7 @@ class OpenLoopKind(Kind):
                 f"the floor of {floor:g}"
             )
         attacked = tuple(sightings(detector, perturbation.on_target(images)))
-        scores = target_scores(attacked, clean, **bootstrap) | {"clean_AP50": clean_precision}
+        scores = target_scores(attacked, clean, floor=floor, **bootstrap) | {"clean_AP50": clean_precision}
         return scores | self.target_columns(cell, job, condition, clean, attacked)
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[SceneCondition], job: Job) -> dict[str, Any]:

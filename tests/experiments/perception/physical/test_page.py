@@ -17,6 +17,7 @@ from ssad.experiments.perception.physical.page import (
     main_table,
     margin_table,
     score,
+    summary,
     tiles,
     transfer_table,
 )
@@ -40,7 +41,12 @@ def line(attack: str, carrier: str, ap: float, **changes: Any) -> dict[str, Any]
         "status": "ok",
         "n": 40,
         "drives": 8,
-        "metrics": {"AP50": ap, "AP50_25": ap, "ASR_25": None if attack == "clean" else 1 - ap, "confidence": ap},
+        "metrics": {
+            "AP50": ap,
+            "AP50_25": ap,
+            **({} if attack == "clean" else {"ASR_25": 1 - ap, "n0_25": 38}),
+            "confidence": ap,
+        },
         "intervals": {"AP50": [max(ap - 0.05, 0.0), min(ap + 0.05, 1.0)]},
     }
     found |= changes
@@ -104,9 +110,9 @@ def test_the_papers_rows_stand_below_ours(folder: Path) -> None:
         "TPA, Town04",
     ]
     text = {row.head[0]: [cell.text for cell in row.cells] for row in rows}
-    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30"]
-    assert text["DAS"] == ["48.00", "48.00", "52.00"]
-    assert text["TPA"] == ["n/a", "n/a", "n/a"], "what was refused has no number"
+    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30", "n/a"]
+    assert text["DAS"] == ["48.00", "48.00", "52.00", "38"]
+    assert text["TPA"] == ["n/a"] * 4, "what was refused has no number"
     random = next(row for row in rows if row.head == ("random patch",)).cells[0]
     assert (random.text, random.interval) == ("94.00", "[85.00, 100.00]"), "mean of two draws, ends of their intervals"
 
@@ -119,10 +125,21 @@ def test_records_that_tell_of_any_class_have_a_column_of_it(folder: Path) -> Non
         one["metrics"]["ASR_any_25"] = 0.25 if one["attack"] == "das" else None
     (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     made = main_table(PhysicalRun(load_run(folder)), 0)
-    assert made.columns == ("yolov5n AP50", "yolov5n AP50 > 0.25", "yolov5n ASR", "yolov5n ASR, any class")
+    assert [name.removeprefix("yolov5n ") for name in made.columns[2:]] == ["ASR", "ASR, any class", "n0"]
     text = {row.head[0]: [cell.text for cell in row.cells] for row in made.rows}
-    assert text["DAS"] == ["48.00", "48.00", "52.00", "25.00"]
-    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30", "n/a"]
+    assert text["DAS"] == ["48.00", "48.00", "52.00", "25.00", "38"]
+    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30", "n/a", "n/a"]
+
+
+def test_a_success_rate_stands_beside_its_n0_or_not_at_all(folder: Path) -> None:
+    made = main_table(PhysicalRun(load_run(folder)), 0)
+    assert "n/a where the target is found so in less than 90% of the clean images" in made.note
+    few = line("das", "camouflage", 0.5) | {"metrics": {"AP50": 0.5, "ASR_25": None, "n0_25": 3}}
+    assert [score([few], name).text for name in ("ASR_25", "n0_25")] == ["n/a", "3"]
+    uncounted = few | {"metrics": {"AP50": 0.5, "ASR_25": 0.67}}
+    assert score([uncounted], "ASR_25").text == "n/a"
+    assert score([line("das", "camouflage", 0.5)], "ASR_25").n == 38
+    assert "n0: targets found clean" in summary(load_run(folder)).note
 
 
 def test_the_interval_of_several_draws_covers_drives_and_draws() -> None:
@@ -237,7 +254,7 @@ def test_transfer_and_the_worst_cell(folder: Path) -> None:
     clean, das = grid_table(run).rows
     assert clean.head[4] == "5 m, 180°"
     assert das.head[4] == "5 m, 0°"
-    assert das.cells[2].text == "35.00"
+    assert [cell.text for cell in das.cells[2:]] == ["38", "35.00"]
 
 
 def test_the_page_shows_all_and_says_what_was_refused(folder: Path) -> None:

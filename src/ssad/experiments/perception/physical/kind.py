@@ -37,7 +37,8 @@ class PhysicalSuite(SuiteBase, TargetTable):
     """One table: detectors x textures on a car, each trained on drives in one town and tested in another.
 
     Attributes:
-        floor: Minimum AP50 of the clean images, below which no attack is reported.
+        floor: Minimum AP50 of the clean images, below which no attack is reported; minimum share of them in which the
+            target is found, below which no ASR at that score is.
         replicates: Replicates of the bootstrap over drives.
     """
 
@@ -59,9 +60,12 @@ class Physical(OpenLoopKind):
         Column("AP50_all", "AP50 of the whole class", "", "lower"),
         Column("AP50_all_25", "AP50 of the whole class above 0.25", "", "lower"),
         Column("ASR_25", "ASR at 0.25", "", "higher"),
+        Column("n0_25", "n0 at 0.25"),
         Column("ASR_50", "ASR at 0.5", "", "higher"),
+        Column("n0_50", "n0 at 0.5"),
         Column("ASR_any_25", "ASR at 0.25, of any class", "", "higher"),
         Column("ASR_all_25", "ASR of the whole class at 0.25", "", "higher"),
+        Column("n0_all_25", "n0 of the whole class at 0.25"),
         Column("confidence", "mean score", "", "lower"),
     )
     factors = ("test", "view", "detector", "attack", "carrier", "source")
