@@ -312,10 +312,11 @@ def route_lines(draws: int) -> list[str]:
     """Coverage and width on routes with the design effects of `natural` and `frea`, as Markdown."""
     natural = natural_sizes()
     lines = [
-        f"Routes with unequal numbers of cases, as those of `natural` ({natural.sum():.0f} cases on {len(natural)}) and",
-        "`frea` (150 on 15). The cases of a route are alike by the design effect (beta-binomial). In brackets: the mean",
-        "width over that of an oracle that knows the design effect, and over that of one that knows the standard error.",
-        "A dash: routes too small for the design effect.",
+        "Routes with unequal numbers of cases, as those of "
+        f"`natural` ({natural.sum():.0f} cases on {len(natural)}) and `frea` (150 on 15).",
+        "The cases of a route are alike by the design effect (beta-binomial). In brackets: the mean width over that",
+        "of an oracle that knows the design effect, and over that of one that knows the standard error. A dash: routes",
+        "too small for the design effect.",
     ]
     for title, columns in (
         ("Shares", {f"p = {share:g}": (share,) for share in ROUTE_SHARES}),
@@ -417,8 +418,8 @@ def limits_if_known(sums: F64, layout: Clusters, design_effect: float) -> tuple[
 
 ALTERNATIVES: dict[str, Limits] = {
     "here": limits_here,
-    "design effect as estimated": lambda sums, layout, _: limits_of_effective(sums, layout, kurtosis=False),
-    "and degrees of freedom by the kurtosis": lambda sums, layout, _: limits_of_effective(sums, layout, kurtosis=True),
+    "the same without room for alike cases": lambda sums, layout, _: limits_of_effective(sums, layout, kurtosis=True),
+    "degrees of freedom: clusters less one": lambda sums, layout, _: limits_of_effective(sums, layout, kurtosis=False),
     "profile likelihood of beta-binomial counts": limits_of_likelihood,
     "design effect known unless there is no event": limits_if_known,
 }

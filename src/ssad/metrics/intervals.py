@@ -29,7 +29,7 @@ MIN_DIFFERENT = 8
 _EXTREME_WEIGHT = 0.3
 """Part of a cluster that each end of an interval of a mean leaves room for: of the intervals simulated, at least
 93.4 % hold in every case (93.9 with 0.5), and at most 97.5 % where clusters are normal (97.8 with 0.5)."""
-_ALIKE_WEIGHT = 0.4
+_ALIKE_WEIGHT = 0.1
 """Part of a cluster, all of whose cases are alike, that the design effect of a share makes room for."""
 _Z = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
 _TAIL_PROBABILITY = 0.5 - 0.5 * LEVEL
@@ -76,9 +76,7 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> C
     and Graubard 1998), less for few degrees of freedom. It is never below the number of clusters, since no values
     in [0, 1] vary more. A stratum whose clusters are all 0 or all 1 counts as if half a cluster differed.
 
-    For values that are 0 or 1 the design effect is averaged with that of cases all alike, which stand for 0.4 of a
-    cluster beside those that carry the variation: few clusters with events rarely include the largest ones. The
-    degrees of freedom are clusters less strata. For other values they fall with the kurtosis of the clusters.
+    Values that are 0 or 1 make room for clusters that are more alike than those seen (`alike_inverse`).
 
     Args:
         sums: [..., K] sum of the values of each cluster.
@@ -103,14 +101,11 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> C
         effective = np.full(mean.shape, clusters.size.sum())  # nothing to estimate: the cases are independent
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
-            variance_ratio = spread.variance / (mean * (1.0 - mean))
-            freedom = spread.freedom
-            if math.isfinite(cap):
-                # Few clusters with events show too small a design effect: it is drawn towards the greatest possible.
-                freedom = np.full(mean.shape, spread.max_freedom)
-                alike_part = _ALIKE_WEIGHT / (spread.active_clusters + _ALIKE_WEIGHT)
-                variance_ratio = (1.0 - alike_part) * variance_ratio + alike_part / min_effective
-            effective = (_Z / t_quantile(freedom)) ** 2 / variance_ratio
+            inverse = spread.variance / (mean * (1.0 - mean))
+        if math.isfinite(cap):
+            inverse = alike_inverse(inverse, spread.active_clusters, min_effective)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            effective = (_Z / t_quantile(spread.freedom)) ** 2 / inverse
         is_constant = _flat(spread.variance, mean) & (mean > 0.0) & (mean < 1.0)
         effective = np.clip(
             np.where(is_constant, np.inf, np.nan_to_num(effective, nan=min_effective)), min_effective, cap
@@ -118,6 +113,35 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> C
     lower, upper = share_limits(mean, np.where(np.isinf(effective), 1.0, effective))
     has_interval = np.isfinite(effective)
     return ConfidenceLimits(mean, np.where(has_interval, lower, np.nan), np.where(has_interval, upper, np.nan), "beta")
+
+
+def alike_inverse(inverse: F64, active_clusters: F64, min_effective: float) -> F64:
+    """Return one over the effective number of a share, averaged with that of cases all alike.
+
+    Few clusters with events rarely include the largest ones. So cases all alike stand for 0.1 of a cluster beside
+    those that carry the variation.
+
+    Args:
+        inverse: [...] variance of the share over that of a single case.
+        active_clusters: [...] number of clusters that carry the variation.
+        min_effective: Effective number of cases all alike.
+    """
+    alike_part = _ALIKE_WEIGHT / (active_clusters + _ALIKE_WEIGHT)
+    return np.asarray((1.0 - alike_part) * inverse + alike_part / min_effective)
+
+
+def variance_freedom(active_clusters: F64, clusters: int, max_freedom: float) -> F64:
+    """Return the degrees of freedom of a variance that few clusters may carry.
+
+    Args:
+        active_clusters: [...] number of equal contributions with the same kurtosis.
+        clusters: Number of clusters.
+        max_freedom: Clusters less strata.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kurtosis = clusters / active_clusters
+    freedom = np.nan_to_num(2.0 * clusters / np.maximum(kurtosis - 1.0, 1e-9), nan=max_freedom)
+    return np.asarray(np.clip(freedom, 1.0, max_freedom))
 
 
 def mean_limits(sums: F64, clusters: Clusters) -> ConfidenceLimits:
@@ -237,14 +261,12 @@ class _Spread:
     Attributes:
         variance: [...] variance of their sum.
         freedom: [...] degrees of freedom, fewer where few clusters carry the variation.
-        max_freedom: Clusters less strata.
         active_clusters: [...] number of equal contributions that would have the same kurtosis.
         skew: [...] skewness of the sum.
     """
 
     variance: F64
     freedom: F64
-    max_freedom: float
     active_clusters: F64
     skew: F64
 
@@ -270,14 +292,13 @@ def _spread(contributions: F64, clusters: Clusters) -> _Spread:
     variance = (contributions**2 * stratum_count / (stratum_count - 1.0)).sum(axis=-1)
     cluster_count, max_freedom = contributions.shape[-1], float((cluster_counts - 1.0).sum())
     with np.errstate(divide="ignore", invalid="ignore"):
-        kurtosis = cluster_count * (contributions**4).sum(axis=-1) / (contributions**2).sum(axis=-1) ** 2
-        freedom = np.nan_to_num(2.0 * cluster_count / np.maximum(kurtosis - 1.0, 1e-9), nan=max_freedom)
+        active_clusters = (contributions**2).sum(axis=-1) ** 2 / (contributions**4).sum(axis=-1)
         third_moment = (
             contributions**3 * stratum_count**2 / np.maximum((stratum_count - 1.0) * (stratum_count - 2.0), 1.0)
         ).sum(axis=-1)
         skew = np.nan_to_num(third_moment / variance**1.5)
-        active_clusters = np.nan_to_num(cluster_count / kurtosis)
-    return _Spread(variance, np.clip(freedom, 1.0, max_freedom), max_freedom, active_clusters, skew)
+    freedom = variance_freedom(active_clusters, cluster_count, max_freedom)
+    return _Spread(variance, freedom, np.nan_to_num(active_clusters), skew)
 
 
 def _different(means: F64) -> npt.NDArray[np.intp]:

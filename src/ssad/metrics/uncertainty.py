@@ -301,18 +301,26 @@ def _as_limits(share: Estimate) -> ConfidenceLimits:
     return ConfidenceLimits(mean, low, high, share.method)
 
 
+def complete_pairs(
+    first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]
+) -> list[tuple[CaseValue, CaseValue]]:
+    """Return the values of the cells that both have, that failed in neither and are measured in both.
+
+    Args:
+        first: Values of one system by cell.
+        second: Values of the other system.
+    """
+    pairs = [(first[key], second[key]) for key in sorted(set(first) & set(second))]
+    return [pair for pair in pairs if not any(half.failed or math.isnan(half.value) for half in pair)]
+
+
 def _pairs(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -> tuple[list[CaseValue], int]:
     """Return the differences of the cells that both have, and the number of cells without one."""
     pairs = [
         CaseValue(
             first_value.value - second_value.value, first_value.cluster, f"{first_value.case}\n{second_value.case}"
         )
-        for key in sorted(set(first) & set(second))
-        if not (
-            (first_value := first[key]).failed
-            or (second_value := second[key]).failed
-            or math.isnan(first_value.value - second_value.value)
-        )
+        for first_value, second_value in complete_pairs(first, second)
     ]
     return pairs, len(set(first) | set(second)) - len(pairs)
 
