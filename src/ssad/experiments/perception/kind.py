@@ -16,6 +16,7 @@ from pydantic import Field
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
+from ssad.core.run_records import SHARE
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan
@@ -67,9 +68,9 @@ class Perception(OpenLoopKind):
     suite = PerceptionSuite
     columns = (
         *OpenLoopKind.columns,
-        Column("AP50", "AP50 of the target", "", "lower"),
-        Column("ASR_25", "attack success rate at 0.25", "", "higher"),
-        Column("ASR_50", "attack success rate at 0.5", "", "higher"),
+        Column("AP50", "AP50 of the target", "", "lower", limits=SHARE),
+        Column("ASR_25", "attack success rate at 0.25", "", "higher", limits=SHARE),
+        Column("ASR_50", "attack success rate at 0.5", "", "higher", limits=SHARE),
     )
     factors = ("data", "detector", "perturbation", "severity")
 
