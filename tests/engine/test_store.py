@@ -12,6 +12,7 @@ from helpers.descriptors import open_files
 
 from ssad.core.errors import StoreError
 from ssad.core.jsonl import read_lines
+from ssad.core.run_records import counts_text
 from ssad.engine import store as stores
 from ssad.engine.store import Store, locked, read_run
 
@@ -284,10 +285,19 @@ def test_a_folder_is_for_one_command_at_a_time(tmp_path: Path) -> None:
 def test_episodes_without_a_result_go_and_no_others(tmp_path: Path) -> None:
     fill(tmp_path, "a", "b")
     whole = (tmp_path / "episodes.jsonl").read_bytes()
+    counts = (tmp_path / "seal.json").read_bytes()
+    results = (tmp_path / "results.jsonl").read_bytes()
+    fill(tmp_path, "c", "d")
     with open(tmp_path / "episodes.jsonl", "a") as file:
-        file.write('{"key": "c"}\n{"key": "d"}\n{"ke')
+        file.write('{"ke')
+    (tmp_path / "results.jsonl").write_bytes(results)
+    (tmp_path / "seal.json").write_bytes(counts)
     fill(tmp_path)
     assert (tmp_path / "episodes.jsonl").read_bytes() == whole
     (tmp_path / "results.jsonl").write_bytes(b"")
+    (tmp_path / "seal.json").unlink()
+    with pytest.raises(StoreError, match=r"seal\.json: is missing, though the run has lines"):
+        Store.open(tmp_path, RUN)
+    (tmp_path / "seal.json").write_text(counts_text({"results.jsonl": 0, "episodes.jsonl": 0}))
     fill(tmp_path)
     assert (tmp_path / "episodes.jsonl").read_bytes() == b""

@@ -100,7 +100,7 @@ def check_lines(
             raise lines.error(number, f"key is {shown(key)}, which is no key of a cell")
         if first_lines.setdefault(key, number) != number:
             raise lines.error(
-                number, f"the cell {key} is there twice, first in line {first_lines[key]}", "remove one of the two"
+                number, f"the cell {key} is there twice, first in line {first_lines[key]}", "remove this line"
             )
         problem = value_problem(record) or (seal_problem(record, number) if sealed else "")
         if problem == CHANGED and (detail := contradiction(record)):
