@@ -42,10 +42,13 @@ def write_run(
     return folder
 
 
-def write_lines(folder: Path, lines: Sequence[Mapping[str, Any]], episodes: Sequence[Mapping[str, Any]] = ()) -> None:
-    """Lines in the place of those of a run, sealed."""
+def write_lines(
+    folder: Path, lines: Sequence[Mapping[str, Any]], episodes: Sequence[Mapping[str, Any]] | None = None
+) -> None:
+    """Lines in the place of those of a run, sealed; episodes stay without others."""
     for name, records in ((RESULTS, lines), (EPISODES, episodes)):
-        (folder / name).write_text("".join(safeio.dump_json(dict(record)) + "\n" for record in records))
+        if records is not None:
+            (folder / name).write_text("".join(safeio.dump_json(dict(record)) + "\n" for record in records))
     reseal(folder)
 
 
@@ -58,9 +61,7 @@ def reseal(folder: Path) -> None:
     for name, lines in files.items():
         torn = (folder / name).read_bytes().rpartition(b"\n")[2] if lines.tail == "open" else b""
         text = "".join(
-            safeio.dump_json(
-                sealed(record, number, episode=episodes.get(record["key"]) if name == RESULTS else None)
-            )
+            safeio.dump_json(sealed(record, number, episode=episodes.get(record["key"]) if name == RESULTS else None))
             + "\n"
             for number, record in enumerate(lines.records, 1)
         )

@@ -141,7 +141,10 @@ ALTERATIONS: dict[str, tuple[Alter, str]] = {
         f"{RESULTS}:1: {CHANGED}{REMEDY}",
     ),
     "another key": (set_field(RESULTS, 3, "key", "0123456789abcdef"), f"{RESULTS}:3: {CHANGED}{REMEDY}"),
-    "a metric taken out": (edit(RESULTS, 2, lambda record: record["metrics"].pop("pet")), f"{RESULTS}:2: {CHANGED}{REMEDY}"),
+    "a metric taken out": (
+        edit(RESULTS, 2, lambda record: record["metrics"].pop("pet")),
+        f"{RESULTS}:2: {CHANGED}{REMEDY}",
+    ),
     "a new field": (set_field(EPISODES, 2, "note", "checked"), f"{EPISODES}:2: {CHANGED}{REMEDY}"),
     # doubled, deleted, reordered lines
     "first line doubled at the end": (
@@ -316,7 +319,9 @@ def test_commands_refuse_an_altered_folder_in_a_line(folder: Path, finished_run:
         assert re.fullmatch(rf"error: .*{RESULTS}:1: {CHANGED}.*\n", end.stderr), end.stderr
 
 
-@pytest.mark.parametrize("name", ["first line doubled at the end", "middle line doubled in place", "last episode doubled"])
+@pytest.mark.parametrize(
+    "name", ["first line doubled at the end", "middle line doubled in place", "last episode doubled"]
+)
 def test_a_doubled_line_is_mended_as_the_message_says(folder: Path, name: str) -> None:
     alter, message = ALTERATIONS[name]
     alter(folder)
