@@ -431,24 +431,6 @@ def test_what_waits_for_pieces_of_a_system_that_was_given_up_is_not_tried(
     assert sum(reason.startswith("not tried after 2 others of a") for reason in lost) >= 3
 
 
-class ShortWords(Words):
-    """Words of three letters at most."""
-
-    columns = (Column("length", "of a word", limits=(0.0, 3.0)),)
-
-
-def test_an_impossible_value_fails_alone_with_its_reason(bench: Bench) -> None:
-    records = bench.run("a", "one three two", kind=ShortWords, batch=3)
-    assert {name: record["status"] for name, record in records.items()} == {
-        "a/one": "ok",
-        "a/three": "failed",
-        "a/two": "ok",
-    }
-    assert records["a/three"]["reason"] == "the result is impossible: metrics.length is 5, outside of [0, 3]"
-    assert not records["a/three"]["metrics"]
-    assert read_json(bench.folder / "run.json")["limits"] == {"length": [0.0, 3.0]}
-
-
 def test_run_json_says_what_the_folder_holds(bench: Bench) -> None:
     bench.run("a b", "one two", seed=2)
     header = read_json(bench.folder / "run.json")

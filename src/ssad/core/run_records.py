@@ -93,10 +93,9 @@ def read_records(folder: Path, header: Mapping[str, Any]) -> RunRecords:
     finished = tuple(unsealed(record) for record in results.records if record["key"] != unfinished_key)
     keys = {record["key"] for record in finished}
     finished_episodes = {record["key"]: unsealed(record) for record in episodes.records if record["key"] in keys}
-    is_whole = not (results.tail or episodes.tail) and len(finished) == len(results.records)
-    return RunRecords(
-        finished, finished_episodes, is_sealed, is_whole and len(finished_episodes) == len(episodes.records)
-    )
+    is_complete = len(finished) == len(results.records) and len(finished_episodes) == len(episodes.records)
+    is_whole = is_complete and not (results.tail or episodes.tail)
+    return RunRecords(finished, finished_episodes, is_sealed, is_whole)
 
 
 def value_problem(record: Mapping[str, Any], limits: Mapping[str, ValueLimits], *, is_result: bool = True) -> str:
@@ -156,12 +155,14 @@ def _contradiction(record: Mapping[str, Any], other_lines: JsonLines, positions:
 
 def _difference(record: Mapping[str, Any], other_record: Mapping[str, Any]) -> str:
     """Return the first field or metric that two lines of a cell give different values, in words."""
-    pairs = [(name, record[name], other_record[name]) for name in record if name in other_record and name != SEAL]
-    for name, value, other_value in pairs:
-        if name == "metrics" and isinstance(value, dict) and isinstance(other_value, dict):
-            pairs += [(f"metrics.{key}", value[key], other_value[key]) for key in value if key in other_value]
-        elif value != other_value:
-            return f"{name} is {shown(value)} here and {shown(other_value)}"
+    metrics, other_metrics = record.get("metrics"), other_record.get("metrics")
+    groups = [(record, other_record, "")]
+    if isinstance(metrics, dict) and isinstance(other_metrics, dict):
+        groups.append((metrics, other_metrics, "metrics."))
+    for values, other_values, prefix in groups:
+        for name in values:
+            if name in other_values and name not in (SEAL, "metrics") and values[name] != other_values[name]:
+                return f"{prefix}{name} is {shown(values[name])} here and {shown(other_values[name])}"
     return ""
 
 

@@ -56,6 +56,6 @@ def seal_problem(record: Mapping[str, Any], line: int) -> str:
         return f"this line was written as line {seal['line']}, so lines were removed or moved"
     try:
         is_intact = seal.get("digest") == content_digest(record)
-    except ValueError:  # a number too large for JSON, such as 1e999, becomes infinite
+    except (ValueError, RecursionError):  # 1e999 is read as infinity, which JSON does not have
         is_intact = False
     return "" if is_intact else CHANGED

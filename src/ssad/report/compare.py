@@ -490,9 +490,8 @@ def _state(line: Mapping[str, Any]) -> str:
 
 def _changes(first: Run, second: Run) -> Iterator[str]:
     """Yield the differences between the headers of two runs: code, versions, suite, systems, weights, towns."""
-    for name in sorted(
-        (set(first.header) | set(second.header)) - {"cells", "columns", "identity", "command", "started"}
-    ):
+    unmentioned_keys = {"cells", "columns", "limits", "identity", "command", "started", "sealed"}
+    for name in sorted((set(first.header) | set(second.header)) - unmentioned_keys):
         yield from _differences(name, first.header.get(name), second.header.get(name))
 
 
