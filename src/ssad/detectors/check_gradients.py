@@ -17,6 +17,8 @@ ROUGHLY = 4.0  # tolerated factor between a gradient and finite differences
 ROUNDING = 1e-5  # share of a value below which its changes drown in float32
 LEVELS = (0.21, 0.47, 0.78)  # grey values in the middle between the steps of coarse quantisation
 SMALL, LARGE = 0.5 / 255, 0.1  # changes of a grey picture: below and above such a step
+RIPPLE_STEPS = (0.5 / 255, 1 / 255, 2 / 255)  # steps of attacks
+RIPPLE_SHARE = 0.1  # minimum change along the gradient, as a share of what its slope foretells
 
 
 def check_slopes(trial: CheckCase) -> None:
@@ -40,7 +42,11 @@ def check_slopes(trial: CheckCase) -> None:
             for is_silent, channel_values in zip(silent_channels, perturbed_values, strict=True)
         ]
         if all(silent_channels):
-            trial.need(not any(lost_channels), f"the gradient of {name} reaches the image, which {name} depends on")
+            trial.need(
+                not any(lost_channels),
+                f"the gradient of {name} reaches the image, which {name} depends on (gradient masking: rounding or a "
+                "detached tensor cuts it off)",
+            )
             continue
         trial.need(not any(lost_channels), f"the gradient of {name} reaches all three colour channels")
         ratios: list[float] = []
@@ -132,8 +138,43 @@ def check_small_changes(trial: CheckCase) -> None:
         ):  # else hardly anything changes it, as with some fresh weights
             is_sensitive = bool(small_response > 0.02 * SMALL / LARGE * large_response)
             trial.need(
-                is_sensitive, "changes of half a step of 8 bits change Dense.logit: the image is not quantised inside"
+                is_sensitive,
+                "changes of half a step of 8 bits change Dense.logit: the image is not quantised inside (gradient "
+                "masking by rounding)",
             )
+
+
+def check_ripples(trial: CheckCase) -> None:
+    """Check that the gradient of Dense.logit foretells what steps of an attack do.
+
+    A ripple finer than the budget of an attack turns the gradient from place to place, though finite differences agree
+    with it everywhere. Along the signs of such a gradient the output hardly changes over half a code value to two. Of
+    the detectors that SSAD ships, and of fresh weights, the change is 0.2 to 1 of what the slope foretells; with
+    ripples of 0.7 to 3 code values whose slope is twice that of the image, below 0.1 at one of the steps. The fault
+    must show in all images.
+    """
+    name = "Dense.logit"
+    shares = []
+    for image_index in range(BATCH):
+        probe = _Probe(trial, image_index)
+        gradient = probe.gradient(name).double()
+        slope = float(gradient.abs().sum())
+        step_shares = []
+        for step in RIPPLE_STEPS:
+            ahead, behind = (float(probe.at(probe.images + sign * step * gradient.sign())[name]) for sign in (1, -1))
+            # The expected difference would drown in float32 rounding.
+            if 2 * step * slope > 10 * ROUNDING * (abs(ahead) + abs(behind)) / 2:
+                step_shares.append((ahead - behind) / (2 * step * slope))
+        if not step_shares:
+            return  # another check reports it, or hardly anything changes the output
+        shares.append(min(step_shares))
+        if shares[-1] >= RIPPLE_SHARE:
+            return
+    trial.need(
+        False,
+        f"steps of up to 2/255 along the gradient of {name} change it by a tenth at least of what the gradient "
+        f"foretells (gradient masking by rippling: {max(shares):.2g})",
+    )
 
 
 def check_loss_signs(trial: CheckCase) -> None:

@@ -28,7 +28,7 @@ from ssad.engine.run import run
 from ssad.experiments.perception import scored_data
 from ssad.experiments.perception.digital import kind as digital
 from ssad.experiments.perception.digital.attack_sheet import magnified
-from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
+from ssad.experiments.perception.digital.kind import Digital, DigitalSuite, _reference_shares
 from ssad.experiments.perception.digital.page import (
     attempts_of,
     effort_table,
@@ -50,10 +50,12 @@ from ssad.experiments.perception.scene_boxes import (
 )
 from ssad.experiments.runs import summary, write_report
 from ssad.experiments.suites import load_suite
+from ssad.metrics.attack_audit import audit
 from ssad.report.load import load_run
 from ssad.report.paper import DIGITAL as PUBLISHED
 from ssad.scenarios.static.digital import scene_attacker
 from ssad.scenarios.static.digital.perturbation import DigitalAttack
+from ssad.scenarios.static.digital.reference_ensemble import REFERENCE_IMAGES
 from ssad.scenarios.static.digital.scene_attacker import SceneAttacker
 from ssad.scenarios.static.digital.spec import AttackSpec
 from ssad.scenarios.static.digital.tally import sum_notes
@@ -429,6 +431,7 @@ def test_notes_of_scenes_are_put_together() -> None:
         "gradient_error": 0.1,
         "coupling": None,
         "halved": 2,
+        "references": [{"attack": "pgd", "token": "b"}, {"attack": "pgd", "token": "a"}],
     }
     empty = one | dict.fromkeys(("images", "idle", "gradients", "queries", "before", "after", "used", "batch"), 0)
     other = one | {
@@ -441,6 +444,7 @@ def test_notes_of_scenes_are_put_together() -> None:
         "batch": 1,
         "gradient_error": 0.3,
     }
+    del other["references"], empty["references"]  # as older versions have it
     assert sum_notes([one, empty, other]) == {
         "access": "white-box",
         "images": 4,
@@ -455,6 +459,7 @@ def test_notes_of_scenes_are_put_together() -> None:
         "gradient_error": 0.3,
         "coupling": None,
         "halved": 4,
+        "references": [{"attack": "pgd", "token": "a"}, {"attack": "pgd", "token": "b"}],
     }
 
 
@@ -557,3 +562,29 @@ def test_the_papers_table_is_the_papers(data_dir: Path) -> None:
         ]
         numbers = [float(value) for value in line.rstrip("\\").split("&")[-4:]]
         assert numbers == [*scores["FCOS3D"], *scores["PGD"]], attack
+
+
+def test_every_attack_is_compared_with_the_reference_ensemble(root: Path, tmp_path: Path) -> None:
+    weak = "helpers.weak_attacks:"
+    names = ["fgsm", *({"name": name, "options": {"steps": 3}} for name in ("pgd", f"{weak}FlippedChannel"))]
+    suite = suite_of(root, detectors=[LINEAR], attacks=[*names, "square"], sweeps=[], steps=3, replicates=2)
+    records = {record["attack"]: record for record in run_digital(Digital().plan(suite), tmp_path / "run")}
+    for attack in ("fgsm", "pgd", f"{weak}FlippedChannel"):
+        compared = records[attack]["references"]
+        assert 8 <= len({entry["token"] for entry in compared}) == len(compared) <= REFERENCE_IMAGES
+        assert set(compared[0]["references"]) == {"pgd", "square", *(["apgd"] if attack != "fgsm" else [])}
+        assert all(entry["loss"] > entry["loss_before"] for entry in compared)
+    assert records["square"]["references"] == [], "without gradients there is nothing to compare"
+    assert not records["noise"]["references"]
+    loaded = load_digital_run(load_run(tmp_path / "run"))
+    faults = [fault.text for fault in audit(attempts_of(loaded)).faults if fault.rule == "reference"]
+    assert len(faults) == 1, faults
+    assert faults[0].startswith(f"{weak}FlippedChannel on loss full with 3 steps at 5 px raises its loss by")
+    assert Digital().verdict(load_run(tmp_path / "run"))[0].startswith("Audit of the attacks: ")
+
+
+def test_the_images_of_the_ensemble_do_not_depend_on_the_cell() -> None:
+    assert _reference_shares(["a", "b", "c"]) == {"a": 6, "b": 7, "c": 7}
+    many = _reference_shares([str(number) for number in range(50)])
+    assert sum(many.values()) == REFERENCE_IMAGES
+    assert set(many.values()) == {0, 1}
