@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from ssad.core.driving import Observation
 from ssad.core.types import F32, F64, Bool, Controller, Episode, SignalState
 from ssad.drivers.careful.encounter import Encounter
-from ssad.drivers.careful.models import CarefulModel, Reaction, careful_model, react
+from ssad.drivers.careful.models import CarefulModel, Reaction, careful_model, initial_reaction, react
 from ssad.drivers.careful.sight import Path, encounters
 from ssad.drivers.careful.steering import pursue
 from ssad.world.models import model
@@ -52,7 +53,7 @@ class Careful:
         self.keep_speed = keep_speed
         self._half = self._power = self._wheel = np.zeros((0, 2))
         self._cruise = np.zeros(0)
-        self._memory: Reaction | None = None
+        self._memory = initial_reaction((0, 0))
         self._moved = np.zeros((0, 0))
 
     def reset(self, episodes: Sequence[Episode]) -> None:
@@ -62,14 +63,32 @@ class Careful:
         self._power = np.array([(body.max_accel, body.max_brake) for body in bodies]).reshape(-1, 2)
         self._wheel = np.array([(body.wheelbase, body.max_steer) for body in bodies]).reshape(-1, 2)
         self._cruise = np.full(len(bodies), np.nan)
-        self._memory = None
+        self._forget(max((len(episode.agents) for episode in episodes), default=0))
+
+    def _forget(self, agent_count: int) -> None:
+        """Make a new memory of this many agents in each episode."""
+        shape = (len(self._half), agent_count)
+        self._memory, self._moved = initial_reaction(shape), np.zeros(shape)
+
+    def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return its memory of the agents [B, A], and its speed at the takeover [B], m/s."""
+        return {
+            "since": self._memory.since,
+            "brake": self._memory.brake,
+            "lateral_travel": self._moved,
+            "cruise": self._cruise,
+        }
+
+    def restore(self, states: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Set the memory of each episode."""
+        self._memory = Reaction(states["since"], states["brake"])
+        self._moved, self._cruise = states["lateral_travel"], states["cruise"]
 
     def act(self, view: Observation) -> F32:
         """Return the controls: speed keeping limited by bends, other agents, red lights and the model."""
         scenes, agent_count = view.scene, view.readings["truth"].kind.shape[1]
-        if self._memory is None:
-            shape = (len(self._half), agent_count)
-            self._memory, self._moved = Reaction(np.full(shape, -1.0), np.zeros(shape)), np.zeros(shape)
+        if agent_count > self._moved.shape[1]:  # the world has room for more agents than these episodes have
+            self._forget(agent_count)
         path, half_size = Path(view.route), self._half[scenes]
         encounter, visible, lateral_travel = encounters(
             view, path, half=half_size, reach=REACH, moved=self._moved[scenes], dt=STEP
