@@ -171,6 +171,7 @@ class Kind(ABC):
         suite: Schema of its suites.
         columns: Metrics of its records.
         factors: Fields of a record that make a row of the default table, from coarse to fine.
+        rates: Rates over cells, by symbol: the metric of the records that is above 0 where the event occurred.
         patience: Crashes and time-outs of one system after which its other cells are skipped (None: all are tried);
             for systems of which one hanging call predicts the others.
     """
@@ -179,6 +180,7 @@ class Kind(ABC):
     suite: ClassVar[type[SuiteBase]]
     columns: ClassVar[tuple[Column, ...]]
     factors: ClassVar[tuple[str, ...]]
+    rates: ClassVar[Mapping[str, str]] = {}
     patience: ClassVar[int | None] = None
 
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
