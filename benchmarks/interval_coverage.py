@@ -57,7 +57,7 @@ STRATA = {
 
 ROUTE_COUNTS = (10, 15, 20, 38)
 DESIGN_EFFECTS = (1.6, 2.5, 4.0, 5.1, 6.4)
-"""Between the least and the greatest that the shipped drivers have on `natural` and `frea`."""
+"""From cases that are weakly alike to the greatest that a few routes of ten cases show."""
 ROUTE_SHARES = (0.02, 0.05, 0.1, 0.3, 0.5)
 FLIPS = ((0.02, 0.02), (0.05, 0.02), (0.1, 0.05), (0.3, 0.1), (0.5, 0.3))
 """Shares of the cases where only the first, and only the second system has the event."""
@@ -309,7 +309,7 @@ def known_effect_limits(sums: F64, layout: Clusters, design_effect: float) -> Co
 
 
 def route_lines(draws: int) -> list[str]:
-    """Coverage and width on routes with the design effects of `natural` and `frea`, as Markdown."""
+    """Coverage and width on routes like those of `natural` and `frea`, as Markdown."""
     natural = natural_sizes()
     lines = [
         "Routes with unequal numbers of cases, as those of "

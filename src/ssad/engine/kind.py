@@ -194,6 +194,7 @@ class Kind(ABC):
         columns: Metrics of its records.
         factors: Fields of a record that make a row of the default table, from coarse to fine.
         metric_limits: Least and greatest possible value of metrics that are no columns.
+        rates: Rates over cells, by symbol: the metric of the records that is above 0 where the event occurred.
         patience: Crashes and time-outs of one system after which its other cells are skipped (None: all are tried);
             for systems of which one hanging call predicts the others.
     """
@@ -203,6 +204,7 @@ class Kind(ABC):
     columns: ClassVar[tuple[Column, ...]]
     factors: ClassVar[tuple[str, ...]]
     metric_limits: ClassVar[Mapping[str, ValueLimits]] = {}
+    rates: ClassVar[Mapping[str, str]] = {}
     patience: ClassVar[int | None] = None
 
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -70,6 +70,7 @@ class Adversarial(ScenarioKind):
     name = "adversarial"
     suite = AdversarialSuite
     factors = ("generator", "system", "group")
+    rates: ClassVar[Mapping[str, str]] = {"CR": "CR", "CR_any": "CR_any"}
     columns = (
         Column("applies", "generator applies", limits=SHARE),
         Column("survived", "plain replay survived", limits=SHARE),

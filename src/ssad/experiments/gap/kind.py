@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -114,6 +114,7 @@ class Gap(ScenarioKind):
     )
     factors = ("system", "perturbation", "severity")
     metric_limits = LIMITS
+    rates: ClassVar[Mapping[str, str]] = {"CR": "collision"}
 
     def plan(self, suite: GapSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Look up names and build detectors once; with `check`, build each scenario once."""
