@@ -267,7 +267,7 @@ SUBTLE: dict[str, tuple[Callable[[CheckCase], None], str, type[Wrapped], str]] =
         (check_small_changes, "fcos", WithThreeBitsCutOff, "gradient masking by rounding"),
         (check_slopes, "yolov5n", WithRoundedLogits, "gradient masking: rounding or a detached tensor cuts it off"),
         (check_ripples, "yolov5n", WithRipples, "gradient masking by rippling"),
-        (check_ripples, "fcos", WithFineRipples, "gradient masking by rippling"),
+        (check_ripples, "yolov5n", WithFineRipples, "gradient masking by rippling"),
         (check_places, "yolov5n", WithTheBestPlacesOnly, "Dense.place depends on the size of the pictures alone"),
         (
             check_places,

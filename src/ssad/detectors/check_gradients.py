@@ -18,7 +18,9 @@ ROUNDING = 1e-5  # share of a value below which its changes drown in float32
 LEVELS = (0.21, 0.47, 0.78)  # grey values in the middle between the steps of coarse quantisation
 SMALL, LARGE = 0.5 / 255, 0.1  # changes of a grey picture: below and above such a step
 RIPPLE_STEPS = (0.5 / 255, 1 / 255, 2 / 255)  # steps of attacks
-RIPPLE_SHARE = 0.1  # minimum change along the gradient, as a share of what its slope foretells
+RIPPLE_SHARE = 0.25  # change along the gradient, as a share of what its slope foretells, below which it is looked at
+RIPPLE_DRAWS = 64  # images nearby whose gradients are averaged then
+MAX_RIPPLE_RATIO = 0.5  # rise along the gradient, divided by that along the mean gradient, that counts as a ripple
 
 
 def check_slopes(trial: CheckCase) -> None:
@@ -66,9 +68,11 @@ def check_slopes(trial: CheckCase) -> None:
 class _Probe:
     """An image with all differentiable quantities: one number for each output and each loss."""
 
-    def __init__(self, trial: CheckCase, number: int) -> None:
+    def __init__(self, trial: CheckCase, number: int, change: Tensor | None = None) -> None:
         self.trial = trial
         self.images = trial.images()[number : number + 1]
+        if change is not None:
+            self.images = self.images + change
         self.differentiable_images = self.images.clone().requires_grad_()
         dense = trial.dense(self.differentiable_images)
         self.assignment = trial.detector.assign(dense, trial.truth(((2, 0, 1)[number],)))
@@ -145,36 +149,44 @@ def check_small_changes(trial: CheckCase) -> None:
 
 
 def check_ripples(trial: CheckCase) -> None:
-    """Check that the gradient of Dense.logit foretells what steps of an attack do.
+    """Check that the gradient of Dense.logit is of use to an attack whose steps are half a code value to two.
 
-    A ripple finer than the budget of an attack turns the gradient from place to place, though finite differences agree
-    with it everywhere. Along the signs of such a gradient the output hardly changes over half a code value to two. Of
-    the detectors that SSAD ships, and of fresh weights, the change is 0.2 to 1 of what the slope foretells; with
-    ripples of 0.7 to 3 code values whose slope is twice that of the image, below 0.1 at one of the steps. The fault
-    must show in all images.
+    A ripple finer than these steps turns the gradient from place to place, though finite differences agree with it
+    everywhere. Two signs together tell it from a detector that is merely steep: a step along the gradient changes the
+    output much less than its slope foretells, and a step along the mean gradient of many images nearby, in which the
+    ripple cancels out, does at least twice as much. The fault must show in all images.
     """
-    name = "Dense.logit"
-    shares = []
+    name, ratios = "Dense.logit", []
     for image_index in range(BATCH):
         probe = _Probe(trial, image_index)
-        gradient = probe.gradient(name).double()
+        gradient = probe.gradient(name)
         slope = float(gradient.abs().sum())
-        step_shares = []
-        for step in RIPPLE_STEPS:
-            ahead, behind = (float(probe.at(probe.images + sign * step * gradient.sign())[name]) for sign in (1, -1))
-            # The expected difference would drown in float32 rounding.
-            if 2 * step * slope > 10 * ROUNDING * (abs(ahead) + abs(behind)) / 2:
-                step_shares.append((ahead - behind) / (2 * step * slope))
-        if not step_shares:
-            return  # another check reports it, or hardly anything changes the output
-        shares.append(min(step_shares))
-        if shares[-1] >= RIPPLE_SHARE:
+        # A rise that would drown in float32 rounding says nothing.
+        if 2 * RIPPLE_STEPS[0] * slope < 10 * ROUNDING * abs(float(probe.values[name].detach())):
+            return
+        shares = {step: _rise(probe, gradient, step, name) / (2 * step * slope) for step in RIPPLE_STEPS}
+        weakest_step = min(RIPPLE_STEPS, key=lambda step: shares[step])
+        if shares[weakest_step] >= RIPPLE_SHARE:
+            return
+        mean_gradient = torch.zeros_like(gradient)
+        for draw in range(RIPPLE_DRAWS):
+            change = RIPPLE_STEPS[-1] * noise(probe.images, 1.0, draw)
+            mean_gradient += _Probe(trial, image_index, change).gradient(name) / RIPPLE_DRAWS
+        mean_rise = _rise(probe, mean_gradient, weakest_step, name)
+        ratios.append(2 * weakest_step * slope * shares[weakest_step] / max(mean_rise, 1e-30))
+        if ratios[-1] > MAX_RIPPLE_RATIO:
             return
     trial.need(
         False,
-        f"steps of up to 2/255 along the gradient of {name} change it by a tenth at least of what the gradient "
-        f"foretells (gradient masking by rippling: {max(shares):.2g})",
+        f"steps of up to 2/255 along the gradient of {name} raise it at least half as much as those along the mean "
+        f"gradient of nearby images (gradient masking by rippling: {max(ratios):.2g} times as much)",
     )
+
+
+def _rise(probe: _Probe, gradient: Tensor, step: float, name: str) -> float:
+    """Return the rise of a number from a step against the signs of a gradient to one along them."""
+    ahead, behind = (float(probe.at(probe.images + sign * step * gradient.sign())[name]) for sign in (1, -1))
+    return ahead - behind
 
 
 def check_loss_signs(trial: CheckCase) -> None:

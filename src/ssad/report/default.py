@@ -51,7 +51,7 @@ def result_table(run: Run, factors: Sequence[str] = ()) -> Table:
         columns = {metric: {"name": metric} for line in run.lines for metric in line.get("metrics") or {}}
     titles = {name: _title(column) for name, column in columns.items()}
     notes = [f"{titles[name]}: {c['better']} is better." for name, c in columns.items() if c.get("better")]
-    return Table.pivot(
+    table = Table.pivot(
         "results",
         "Results",
         run.lines,
@@ -60,6 +60,7 @@ def result_table(run: Run, factors: Sequence[str] = ()) -> Table:
         metric=_cell,
         note=" ".join([*notes, METHODS]),
     )
+    return replace(table, clock=tuple(titles[name] for name, column in columns.items() if column.get("clock")))
 
 
 def _factors(run: Run) -> list[str]:

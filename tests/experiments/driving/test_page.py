@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from helpers.browser import ask
 from helpers.metric_traces import make_trace
-from helpers.run_folder import DRIVING_HEADER, driving_line, driving_lines, write_run
+from helpers.run_folder import DRIVING_HEADER, driving_line, driving_lines, reseal, write_run
 from rich.console import Console
 
 from ssad.core import safeio
@@ -84,6 +84,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "episodes.jsonl").write_text("".join(json.dumps(e) + "\n" for e in episodes))
     header = {"suite": {"name": "t", "title": "A <b>title</b>", "seed": 1}, "versions": {"ssad": "0"}, "cells": cells}
     (folder / "run.json").write_text(json.dumps(header))
+    reseal(folder)
     return folder
 
 
@@ -257,7 +258,7 @@ def test_bad_folders_and_suffixes_end_in_one_line(run_folder: Path, tmp_path: Pa
 
 
 def test_a_lost_trace_costs_only_its_replay(run_folder: Path, tmp_path: Path) -> None:
-    for name in ("run.json", "results.jsonl", "episodes.jsonl"):
+    for name in ("run.json", "results.jsonl", "episodes.jsonl", "seal.json"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
     text = write_report(tmp_path).read_text()
     assert "8 episodes have no replay" in text

@@ -140,7 +140,9 @@ def test_the_careful_drivers_save_what_they_remember() -> None:
     assert isinstance(driver, Branching)
     rows = process(driver, 16)
     splitting(rows, generator("careful"), repeats=2)
-    assert rows.snapshot()["driver.0.brake"].any()
+    memory = rows.snapshot()
+    assert (memory["driver.0.since"] > 0.0).any(), "it counts the time since it noticed a vehicle in front"
+    assert memory["driver.0.follows"].shape == memory["driver.0.brake"].shape
 
 
 def test_the_drivers_of_the_guide_branch() -> None:

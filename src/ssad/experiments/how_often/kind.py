@@ -12,6 +12,7 @@ from pydantic import Field
 
 from ssad.core.errors import ConfigError
 from ssad.core.machine import quiet_warp
+from ssad.core.run_records import NOT_NEGATIVE
 from ssad.core.safeio import plain
 from ssad.core.schema import Schema
 from ssad.core.traces import save_trace
@@ -80,18 +81,18 @@ class HowOften(ScenarioKind):
     suite = HowOftenSuite
     factors = ("system", "group", "method")
     columns = (
-        Column("per_million", "collisions in a million episodes", "", "lower"),
+        Column("per_million", "collisions in a million episodes", "", "lower", limits=NOT_NEGATIVE),
         Column("low", "lower 95 % limit"),
         Column("high", "upper 95 % limit"),
-        Column("effective", "effective number of collisions", "", "higher"),
-        Column("events", "collisions simulated"),
-        Column("episodes", "episodes"),
-        Column("work", "million agent-steps"),
-        Column("training", "of these for learning"),
-        Column("hours", "simulated", "h"),
-        Column("km", "simulated", "km"),
-        Column("per_hour", "collisions in 1,000 h", "", "lower"),
-        Column("per_km", "collisions in 1,000 km", "", "lower"),
+        Column("effective", "effective number of collisions", "", "higher", limits=NOT_NEGATIVE),
+        Column("events", "collisions simulated", limits=NOT_NEGATIVE),
+        Column("episodes", "episodes", limits=NOT_NEGATIVE),
+        Column("work", "million agent-steps", limits=NOT_NEGATIVE),
+        Column("training", "of these for learning", limits=NOT_NEGATIVE),
+        Column("hours", "simulated", "h", limits=NOT_NEGATIVE),
+        Column("km", "simulated", "km", limits=NOT_NEGATIVE),
+        Column("per_hour", "collisions in 1,000 h", "", "lower", limits=NOT_NEGATIVE),
+        Column("per_km", "collisions in 1,000 km", "", "lower", limits=NOT_NEGATIVE),
     )
 
     def plan(self, suite: HowOftenSuite, *, device: str = "cpu", check: bool = True) -> Plan:

@@ -16,6 +16,7 @@ from pydantic import Field
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
+from ssad.core.run_records import COUNT, SHARE
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan
@@ -70,11 +71,11 @@ class Perception(OpenLoopKind):
     suite = PerceptionSuite
     columns = (
         *OpenLoopKind.columns,
-        Column("AP50", "AP50 of the target", "", "lower"),
-        Column("ASR_25", "attack success rate at 0.25", "", "higher"),
-        Column("n0_25", "n0 at 0.25"),
-        Column("ASR_50", "attack success rate at 0.5", "", "higher"),
-        Column("n0_50", "n0 at 0.5"),
+        Column("AP50", "AP50 of the target", "", "lower", limits=SHARE),
+        Column("ASR_25", "attack success rate at 0.25", "", "higher", limits=SHARE),
+        Column("n0_25", "n0 at 0.25", limits=COUNT),
+        Column("ASR_50", "attack success rate at 0.5", "", "higher", limits=SHARE),
+        Column("n0_50", "n0 at 0.5", limits=COUNT),
     )
     factors = ("data", "detector", "perturbation", "severity")
 

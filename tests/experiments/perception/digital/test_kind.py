@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.linear3d import CLEAN, GAINS
+from helpers.run_folder import reseal
 from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
 from ssad.core.errors import SSADError
 from ssad.core.images import read_image
+from ssad.core.jsonl import read_lines
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
 from ssad.engine.command import command_of
@@ -107,7 +109,7 @@ def folder(root: Path, shared: Shared) -> Path:
 
 
 def lines(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+    return read_lines(folder / "results.jsonl")
 
 
 def by_attack(folder: Path, detector: str) -> dict[tuple[str | None, float], dict[str, Any]]:
@@ -265,6 +267,7 @@ def test_what_is_there_is_not_run_again_and_what_failed_is_if_asked(
     kept = (out / "results.jsonl").read_text().splitlines()
     gone = [k for k, line in enumerate(kept) if json.loads(line)["attack"] == "fgsm"]
     (out / "results.jsonl").write_text("".join(f"{line}\n" for k, line in enumerate(kept) if k not in gone))
+    reseal(out)
     asked: list[Any] = []
     monkeypatch.setattr(scene_attacker, "run_attack", lambda *given, **named: asked.append(given))
     records = run_digital(Digital().plan(suite_of(root)), out)

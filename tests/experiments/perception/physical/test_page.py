@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.run_folder import write_lines
 
 from ssad.experiments.perception.physical.page import (
     PhysicalRun,
@@ -89,7 +90,7 @@ def folder(tmp_path: Path) -> Path:
         "reference": "physical",
     }
     (tmp_path / "run.json").write_text(json.dumps({"kind": "physical", "suite": suite, "cells": []}))
-    (tmp_path / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(tmp_path, lines)
     return tmp_path
 
 
@@ -123,7 +124,7 @@ def test_records_that_tell_of_any_class_have_a_column_of_it(folder: Path) -> Non
     lines = [json.loads(one) for one in (folder / "results.jsonl").read_text().splitlines()]
     for one in lines:
         one["metrics"]["ASR_any_25"] = 0.25 if one["attack"] == "das" else None
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     made = main_table(PhysicalRun(load_run(folder)), 0)
     assert [name.removeprefix("yolov5n ") for name in made.columns[2:]] == ["ASR", "ASR, any class", "n0"]
     text = {row.head[0]: [cell.text for cell in row.cells] for row in made.rows}
@@ -173,12 +174,12 @@ def test_a_control_that_is_worse_on_average_can_come_nearer(folder: Path) -> Non
         line("grey", "camouflage", 0.60, replicates={"AP50": (0.60 + draws).tolist()}),
         line("random", "camouflage", 0.62, replicates={"AP50": (0.62 - draws).tolist()}),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[3] == "random camouflage"
     assert row.cells[2].mean == pytest.approx(12.0)
     assert row.cells[2].low < 0.0
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines[:2]))
+    write_lines(folder, lines[:2])
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.cells[2].low == pytest.approx(10.0, abs=0.1), "alike in every drive"
 
@@ -193,7 +194,7 @@ def test_attacks_are_compared_draw_by_draw_of_the_same_drives(folder: Path) -> N
         line("adv-patch", "patch", 0.2, replicates={"AP50": (0.2 + draws).tolist()}, **own),
         line("random", "camouflage", 0.1),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = comparison_table(PhysicalRun(load_run(folder))).rows
     assert row.head == ("Oldmarket", "behind", "yolov5n", "TPA", "DAS"), "of one carrier, and no control"
     gap = row.cells[2]
@@ -203,7 +204,7 @@ def test_attacks_are_compared_draw_by_draw_of_the_same_drives(folder: Path) -> N
         "beta limits are close"
     )
     lines[1]["drives"] = 7
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = comparison_table(PhysicalRun(load_run(folder))).rows
     assert np.isnan(row.cells[2].low), "other drives: no pairs"
 
@@ -215,10 +216,10 @@ def test_the_first_screen_shows_the_clean_pictures_of_the_hour_of_the_strongest_
         line("shadow", "light, noon", 0.2),
         line("laser", "light, night, watts 10.0", 0.25),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (tile,) = tiles(PhysicalRun(load_run(folder)))
     assert (tile["worst"], tile["clean"].mean, tile["left"].mean) == ("shadow, noon", 90.0, 20.0)
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines[:2] + lines[3:]))
+    write_lines(folder, lines[:2] + lines[3:])
     (tile,) = tiles(PhysicalRun(load_run(folder)))
     assert (tile["clean"].mean, tile["left"].mean) == (30.0, 25.0)
 
@@ -232,19 +233,19 @@ def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -
         line("random laser", night, 0.94, number=1),
         line("random projector", night, 0.40),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[2:] == ("laser, night", "random laser, night")
     assert row.cells[2].mean == pytest.approx(90.0 - 70.0)
     lines[0] = line("laser, searches 4", night, 0.70, source="yolov5n")
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[2:] == ("laser, searches 4, night", "random laser, night")
 
 
 def test_transfer_and_the_worst_cell(folder: Path) -> None:
-    with (folder / "results.jsonl").open("a") as file:
-        file.write(json.dumps(line("clean", "", 0.91, detector="fcos3d-light")) + "\n")
+    lines = [json.loads(one) for one in (folder / "results.jsonl").read_text().splitlines()]
+    write_lines(folder, [*lines, line("clean", "", 0.91, detector="fcos3d-light")])
     run = PhysicalRun(load_run(folder))
     usual, moved = transfer_table(run).rows
     assert usual.head == ("Oldmarket", "clean", "")

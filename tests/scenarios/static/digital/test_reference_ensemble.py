@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,7 +129,9 @@ def test_a_sound_attack_is_not_flagged(street: Street, name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SOUND)
 def test_a_sound_attack_is_flagged_in_at_most_one_of_twenty_repeats(street: Street, name: str) -> None:
-    attack = make_attack(name, steps=STEPS) if name == "apgd" else make_attack(name, steps=STEPS, start="uniform")
+    # Without a random start all repeats were one: cw begins at the clean image.
+    options: dict[str, Any] = {"apgd": {}, "cw": {"restarts": 1}}.get(name, {"start": "uniform"})
+    attack = make_attack(name, steps=STEPS, **options)
     findings = [finding(street, attack, seed) for seed in range(1, 21)]
     assert sum(text is not None for text in findings) <= 1, findings
 

@@ -62,7 +62,10 @@ class Digital(OpenLoopKind):
     name = "digital"
     families: ClassVar = {"attacks": "digital"}
     suite = DigitalSuite
-    columns = (*OpenLoopKind.columns, Column("drop", "share of the clean mAP that is lost", "", "higher"))
+    columns = (
+        *OpenLoopKind.columns,
+        Column("drop", "share of the clean mAP that is lost", "", "higher", limits=(None, 1.0)),
+    )
     factors = (
         "detector",
         "attack",
