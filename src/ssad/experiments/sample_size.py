@@ -1,4 +1,4 @@
-"""Sample size of a suite: the cases that it has, and those that a difference of two rates needs."""
+"""ClusteredSample size of a suite: the cases that it has, and those that a difference of two rates needs."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ssad.engine.kind import Cell, Kind, Plan, SuiteBase
 from ssad.experiments.suites import KINDS, kind_of
 from ssad.metrics.intervals import MIN_ROUTES
 from ssad.metrics.sample_size import (
+    ClusteredSample,
     FlipRate,
-    Sample,
     detectable_difference,
     necessary_clusters,
     power,
@@ -67,10 +67,10 @@ class Need:
     detectable: float | None
 
 
-def sample_of(plan: Plan) -> Sample:
+def sample_of(plan: Plan) -> ClusteredSample:
     """Return the cases of a plan: scenarios with their repetitions, which all systems meet, in their clusters."""
     clusters = {_case(cell): str(cell.fields.get("cluster") or _case(cell)) for cell in plan.cells}
-    return Sample.of(clusters.values())
+    return ClusteredSample.of(clusters.values())
 
 
 def sample_line(plan: Plan) -> str:
@@ -216,11 +216,11 @@ def _rounded(value: Any) -> Any:
 def pair_from(entry: Mapping[str, Any]) -> PairFlips:
     """Return a flip rate from plain data, in which null stands for NaN."""
     numbers: dict[str, Any] = {name: math.nan if value is None else value for name, value in entry["flips"].items()}
-    flips = FlipRate(**(numbers | {"sample": Sample(**numbers["sample"])}))
+    flips = FlipRate(**(numbers | {"sample": ClusteredSample(**numbers["sample"])}))
     return PairFlips(entry["rate"], entry["first"], entry["second"], flips)
 
 
-def _need(pair: PairFlips, difference: float, sample: Sample, *, target: float) -> Need:
+def _need(pair: PairFlips, difference: float, sample: ClusteredSample, *, target: float) -> Need:
     flips = pair.flips
     # Where the cases of one cluster cannot be compared, they count as all alike.
     correlation, rate_correlation = (
@@ -237,7 +237,7 @@ def _need(pair: PairFlips, difference: float, sample: Sample, *, target: float) 
     )
 
 
-def _rows(needs: Mapping[str, Sequence[Need]], sample: Sample) -> Iterator[tuple[str, ...]]:
+def _rows(needs: Mapping[str, Sequence[Need]], sample: ClusteredSample) -> Iterator[tuple[str, ...]]:
     """Yield the lines of the table: several pairs of the first rate, and the first pair of each other rate."""
     for rate_index, rate_needs in enumerate(needs.values()):
         for need in rate_needs[: 1 if rate_index else MAX_PAIRS]:
@@ -258,7 +258,7 @@ def _rows(needs: Mapping[str, Sequence[Need]], sample: Sample) -> Iterator[tuple
             yield (rate_needs[0].pair.rate, f"and {hidden_count} other pairs", *[""] * (len(HEADS) - 2))
 
 
-def _remarks(needs: Mapping[str, Sequence[Need]], measurement: Measurement, sample: Sample) -> Iterator[str]:
+def _remarks(needs: Mapping[str, Sequence[Need]], measurement: Measurement, sample: ClusteredSample) -> Iterator[str]:
     """Yield sentences about the suite, the measured flip rates and the columns."""
     size = f"The suite has {sample.cases:.0f} cases in {sample.clusters:.0f} clusters"
     first_needs = next(iter(needs.values()))

@@ -8,7 +8,6 @@ change, are not judged.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -47,10 +46,7 @@ def reference_attacks(gradients: int) -> tuple[Attack, ...]:
     """
     members: list[Attack] = [PGD(gradients), Square(queries=QUERIES_PER_GRADIENT * gradients)]
     if gradients > 1:
-        with warnings.catch_warnings():
-            # Few steps weaken this member alone: the strongest member is the reference.
-            warnings.simplefilter("ignore", UserWarning)
-            members.insert(1, APGD(gradients))
+        members.insert(1, APGD(gradients))  # few steps weaken this member alone: the strongest one is the reference
     return tuple(members)
 
 
