@@ -275,7 +275,7 @@ def _remarks(needs: Mapping[str, Sequence[Need]], measurement: Measurement, samp
     yield f"Flip rates: {measurement.source}."
     yield (
         "difference, flip rate, design effect: as measured; pairs that differ by about as much as is to be detected "
-        "come first."
+        "come first. A flip rate below that counts as that, since a difference flips at least as many cases."
     )
     yield (
         f"cases, clusters: paired, both systems in each, with {sample.mean_size:.1f} cases a cluster as in the suite; "
