@@ -22,6 +22,7 @@ from ssad.experiments.scenario_kind import (
     drive_record,
 )
 from ssad.metrics import METRICS
+from ssad.metrics.driving import LIMITS
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.simulators.closed_loop import (
@@ -71,6 +72,7 @@ class Driving(ScenarioKind):
     suite = DrivingSuite
     columns = tuple(Column(m.symbol, m.title, m.unit, m.better) for m in METRICS.values() if m.field)
     factors = ("system", "group")
+    metric_limits = LIMITS
     rates: ClassVar[Mapping[str, str]] = {m.symbol: m.field for m in METRICS.values() if m.kind == "share"}
 
     def plan(self, suite: DrivingSuite, *, device: str = "cpu", check: bool = True) -> Plan:
