@@ -70,7 +70,11 @@ def changes(commit: str) -> dict[str, list[tuple[Cell, str, str]]]:
     changed: dict[str, list[tuple[Cell, str, str]]] = {}
     for path in sorted((ROOT / PAGES).glob("*.md")):
         old = subprocess.run(
-            ["git", "show", f"{commit}:{PAGES.as_posix()}/{path.name}"], cwd=ROOT, capture_output=True, text=True
+            ["git", "show", f"{commit}:{PAGES.as_posix()}/{path.name}"],
+            check=False,  # a page that the commit lacks has nothing to compare
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
         )
         if old.returncode or path.stem == PAGE:
             continue
