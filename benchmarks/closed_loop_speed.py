@@ -26,7 +26,7 @@ import numpy as np
 from ssad import World, build_episode, load_scenarios, load_town, make_system
 from ssad.core.machine import quiet_warp, versions
 from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import CameraEyes, nuscenes_cameras
+from ssad.drivers.perceiving.perceivers import CameraEyes, nuscenes_cameras
 from ssad.rendering.onboard import Onboard
 from ssad.world.rollout import Loop
 

@@ -22,10 +22,10 @@ from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.safeio import write_atomic
 from ssad.core.types import F64, LaneType, Pose, Scenario, TrafficPlan
-from ssad.scenarios.dynamic.catalog import PRECRASH
+from ssad.scenarios.dynamic.catalogue import PRECRASH
 from ssad.scenarios.dynamic.episode import build_episode
+from ssad.scenarios.dynamic.knowledge._caching import remembered
 from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.scenarios.dynamic.knowledge.natural_junction import candidates
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.scenarios.dynamic.yamlio import scenario_text

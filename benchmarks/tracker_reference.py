@@ -47,7 +47,7 @@ def boxes_of_drive(scenario: Any, detector: Any) -> Frames:
 
     from ssad import World, build_episode, load_town, make_system, rollout
     from ssad.core.rotations import upright_pose
-    from ssad.drivers.perceiving.eyes import nuscenes_cameras, project_boxes
+    from ssad.drivers.perceiving.perceivers import nuscenes_cameras, project_boxes
     from ssad.metrics.perception_in_drive import in_view
     from ssad.rendering.onboard import Onboard
     from ssad.world.models import MODELS

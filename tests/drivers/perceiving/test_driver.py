@@ -19,7 +19,7 @@ from ssad.core.frames import Camera
 from ssad.core.traces import trace_hash
 from ssad.core.types import AgentKind, Episode, EpisodeLimits
 from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
+from ssad.drivers.perceiving.perceivers import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
 from ssad.drivers.perceiving.tracker import Tracking, tracking_settings
 from ssad.simulators.closed_loop import system_version

@@ -16,9 +16,9 @@ from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, AgentKind
-from ssad.drivers.perceiving.eyes import object_boxes, project_boxes
 from ssad.drivers.perceiving.lift import Lifting, lift, merge_duplicates
 from ssad.drivers.perceiving.objects import KINDS, SIZES
+from ssad.drivers.perceiving.perceivers import object_boxes, project_boxes
 from ssad.rendering.camera.rig import RIG, rig_camera
 
 EGO = (120.0, -35.0, 2.1)

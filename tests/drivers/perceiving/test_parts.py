@@ -16,7 +16,6 @@ from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeLimits
 from ssad.drivers.perceiving.check import PartCheckError, check_perceiver, check_planner, check_tracker
 from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.parts import (
     make_perceiver,
     make_planner,
@@ -24,6 +23,7 @@ from ssad.drivers.perceiving.parts import (
     part_names,
     part_version,
 )
+from ssad.drivers.perceiving.perceivers import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.signs import SignReading
 from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking
 from ssad.simulators.closed_loop import system_version

@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.rotations import yaw_to_quaternion
 from ssad.core.types import EpisodeTrace, LaneType
 from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import PerfectEyes, nuscenes_cameras
+from ssad.drivers.perceiving.perceivers import PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.recorder import PerceptionRecorder
 from ssad.experiments.gap.drive_sheet import RecordedDrive
 from ssad.experiments.gap.mcap import COLOURS, need_mcap, write_mcap

@@ -34,8 +34,8 @@ from ssad.scenarios.dynamic import (
 )
 from ssad.scenarios.dynamic.episode import _start
 from ssad.scenarios.dynamic.knowledge import _meeting
+from ssad.scenarios.dynamic.knowledge._caching import remembered
 from ssad.scenarios.dynamic.knowledge._placing import polyline_route, trigger_index
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 from ssad.world.roads import load_town
 

@@ -14,8 +14,8 @@ from ssad.core.perception import I64, Objects, Tracks, no_objects
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, AgentKind, Episode
 from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent, TrackingEvent
-from ssad.drivers.perceiving.eyes import PerfectEyes
 from ssad.drivers.perceiving.parts import Perceiver, Percepts, Planner, Tracker, restored, snapshot_of
+from ssad.drivers.perceiving.perceivers import PerfectEyes
 from ssad.drivers.perceiving.sensors import sensors_of
 from ssad.drivers.perceiving.tracks import check_tracks
 from ssad.rendering.onboard import Onboard

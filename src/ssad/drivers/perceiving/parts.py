@@ -201,8 +201,8 @@ class Planner(Protocol):
 
 
 PERCEIVERS: Final[Mapping[str, str]] = {
-    "camera": "ssad.drivers.perceiving.eyes:camera_perceiver",
-    "truth": "ssad.drivers.perceiving.eyes:perfect_perceiver",
+    "camera": "ssad.drivers.perceiving.perceivers:camera_perceiver",
+    "truth": "ssad.drivers.perceiving.perceivers:perfect_perceiver",
 }
 TRACKERS: Final[Mapping[str, str]] = {"kalman": "ssad.drivers.perceiving.tracker:kalman_tracker"}
 PLANNERS: Final[Mapping[str, str]] = {"autopilot": "ssad.drivers.perceiving.planner:AutopilotPlanner"}

@@ -13,8 +13,8 @@ from ssad.core.perception import Objects, no_objects
 from ssad.core.rotations import upright_pose
 from ssad.core.types import Bool
 from ssad.core.visibility import in_sight
-from ssad.drivers.perceiving.eyes import PerfectEyes, object_boxes, project_boxes
 from ssad.drivers.perceiving.lift import Lifting, lift
+from ssad.drivers.perceiving.perceivers import PerfectEyes, object_boxes, project_boxes
 
 AROUND = 5.0  # m around the object within which what was found is taken for it
 

@@ -15,7 +15,6 @@ from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.safeio import dump_json, parse_json
 from ssad.core.schema import Schema
 from ssad.drivers.perceiving.driver import Perceiving, PerceptionEvent, TrackingEvent
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     cameras_of,
@@ -24,6 +23,7 @@ from ssad.drivers.perceiving.parts import (
     make_tracker,
     part_version,
 )
+from ssad.drivers.perceiving.perceivers import CameraEyes, PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.signs import SignReading, sign_labels
 from ssad.drivers.perceiving.tracker import Tracking, tracking_settings
@@ -71,7 +71,7 @@ class PerceivingSystem(Schema):
         high, low: scores of the tracker's two stages; none: those that suit the detector.
         reads_signs: true: stop signs are read by the detector; false: they are known from the map.
         sign_memory: time that a sign is remembered after its last reading, s; none: until it has been passed.
-        missed, burst, noise, phantoms: errors of a perfect detector (`ssad.drivers.perceiving.eyes.PerfectEyes`).
+        missed, burst, noise, phantoms: errors of a perfect detector (`ssad.drivers.perceiving.perceivers.PerfectEyes`).
         perceiver: source of detections in place of the one that the keys detector, weights, cameras, width,
             input_width, missed, burst, noise and phantoms describe (`ssad list perceivers`).
         tracker: tracker in place of the one that confirm, reserve, high and low describe (`ssad list trackers`).

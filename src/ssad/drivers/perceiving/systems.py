@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from ssad.drivers.perceiving.driver import Perceiving
-from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.parts import (
     Perceiver,
     Tracker,
@@ -14,6 +13,7 @@ from ssad.drivers.perceiving.parts import (
     make_tracker,
     part_version,
 )
+from ssad.drivers.perceiving.perceivers import CameraEyes, PerfectEyes, nuscenes_cameras
 from ssad.drivers.perceiving.tracker import KalmanTracker, Tracking, tracking_settings
 
 

@@ -24,10 +24,10 @@ from ssad.core.types import (
     SignalPlan,
     SignalState,
 )
-from ssad.scenarios.dynamic.catalog import scenario_type
+from ssad.scenarios.dynamic.catalogue import scenario_type
+from ssad.scenarios.dynamic.knowledge._caching import remembered
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import shifted
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.scenarios.dynamic.sampling import sample_parameters
 from ssad.scenarios.dynamic.schema import check, scenario_data
 from ssad.world.models import model

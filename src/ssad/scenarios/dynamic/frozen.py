@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Actor, AgentKind, Episode, EpisodeTrace, Pose, Scenario
-from ssad.scenarios.dynamic.catalog import CUSTOM, parameter_box, scenario_type
+from ssad.scenarios.dynamic.catalogue import CUSTOM, parameter_box, scenario_type
 
 CLOSE: Final = 0.002, 0.001
 """How far a row may be off the line between its neighbours to be left out, m and rad."""

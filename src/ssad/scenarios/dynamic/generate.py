@@ -33,11 +33,11 @@ GENERATORS: dict[str, str] = {
     "adv-sim": "ssad.scenarios.dynamic.transition.adv_sim:AdvSim",
     "adv-traj": "ssad.scenarios.dynamic.transition.adv_traj:AdvTraj",
     "near-miss": "ssad.scenarios.dynamic.logged.near_miss:NearMisses",
-    "king": "ssad.scenarios.dynamic.transition.kinematics:King",
+    "king": "ssad.scenarios.dynamic.transition.king:King",
     "adv-ppo": "ssad.scenarios.dynamic.policy.adv_ppo:AdvPPO",
     "frea": "ssad.scenarios.dynamic.policy.adv_ppo:Frea",
     "adv-ddpg": "ssad.scenarios.dynamic.policy.adv_ppo:AdvDDPG",
-    "cat": "ssad.scenarios.dynamic.transition.trajectory:Cat",
+    "cat": "ssad.scenarios.dynamic.transition.cat:Cat",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""
 FILE_GENERATORS = "ssad.generator_files"

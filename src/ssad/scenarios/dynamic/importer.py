@@ -24,7 +24,7 @@ import numpy as np
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import dotted, read_json, read_xml
 from ssad.core.types import Pose, Scenario
-from ssad.scenarios.dynamic.catalog import PRECRASH, scenario_type
+from ssad.scenarios.dynamic.catalogue import PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import problems
 from ssad.world.roads import load_town
 from ssad.world.roads.router import route_along

@@ -12,7 +12,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, EpisodeTrace
 from ssad.metrics.criticality import boxes
-from ssad.scenarios.dynamic.knowledge._remember import remembered
+from ssad.scenarios.dynamic.knowledge._caching import remembered
 from ssad.world.models import GRIP, model
 from ssad.world.roads.query import LaneQuery
 

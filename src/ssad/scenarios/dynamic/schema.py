@@ -14,7 +14,7 @@ import numpy as np
 from ssad.core.errors import ConfigError
 from ssad.core.safeio import Document, Location, dotted
 from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Scenario, SignalPlan, TrafficPlan
-from ssad.scenarios.dynamic.catalog import CUSTOM, scenario_type
+from ssad.scenarios.dynamic.catalogue import CUSTOM, scenario_type
 from ssad.world.models import model
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from pathlib import Path
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.safeio import home
 from ssad.core.types import Scenario
-from ssad.scenarios.dynamic.catalog import SCENARIOS
+from ssad.scenarios.dynamic.catalogue import SCENARIOS
 from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"

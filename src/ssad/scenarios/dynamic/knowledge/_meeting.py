@@ -11,6 +11,7 @@ import numpy as np
 from ssad.core.errors import RouteError
 from ssad.core.rotations import wrap
 from ssad.core.types import F64, LaneType, Route, Scenario
+from ssad.scenarios.dynamic.knowledge._caching import remembered
 from ssad.scenarios.dynamic.knowledge._placing import (
     LanePosition,
     junction_span,
@@ -18,7 +19,6 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     pose_at,
     turn_of,
 )
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 
 if TYPE_CHECKING:

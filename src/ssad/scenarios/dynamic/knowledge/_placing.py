@@ -12,7 +12,7 @@ import numpy as np
 from ssad.core.errors import RouteError
 from ssad.core.rotations import wrap
 from ssad.core.types import F64, Controller, EpisodeAgent, LaneType, Phase, PhaseTrigger, Pose, Route, Scenario
-from ssad.scenarios.dynamic.knowledge._remember import remembered
+from ssad.scenarios.dynamic.knowledge._caching import remembered
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph

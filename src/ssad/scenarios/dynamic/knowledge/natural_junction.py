@@ -26,9 +26,9 @@ from ssad.core.types import (
     SignalPlan,
     TrafficPlan,
 )
+from ssad.scenarios.dynamic.knowledge._caching import remembered
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import LanePosition, pose_at
-from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 
 if TYPE_CHECKING:

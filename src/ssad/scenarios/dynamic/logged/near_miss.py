@@ -20,7 +20,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, EpisodeTrace
 from ssad.metrics.criticality import boxes
 from ssad.scenarios.dynamic.frozen import frozen, with_motion
-from ssad.scenarios.dynamic.transition.kinematics import King
+from ssad.scenarios.dynamic.transition.king import King
 from ssad.scenarios.dynamic.transition.motion import MOVES, TimedPath
 
 LATEST: Final = 6.0  # s by which they missed each other at most

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import F64, Episode, Scenario
-from ssad.scenarios.dynamic.catalog import scenario_type
+from ssad.scenarios.dynamic.catalogue import scenario_type
 from ssad.scenarios.dynamic.sampling import TARGET_SPEED
 
 

@@ -19,7 +19,7 @@ from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.seeding import seed32
 from ssad.core.types import F64, EpisodeTrace
 from ssad.scenarios.dynamic.frozen import frozen, with_motion
-from ssad.scenarios.dynamic.transition.kinematics import King, adversaries
+from ssad.scenarios.dynamic.transition.king import King, adversaries
 
 KNOTS: Final = 8
 POPULATION: Final = 8

@@ -114,7 +114,7 @@ def _dispatch(
 
         return add_anomalies(batch, frames, specs, contexts)
     if calibration == "paper":
-        from ssad.scenarios.static.shifts.paper import paper_shift
+        from ssad.scenarios.static.shifts.paper_calibration import paper_shift
 
         if name in ("snow", "rain", "fog", "sunlight", "motion_blur"):
             return paper_shift(batch, frames, specs)

@@ -29,7 +29,7 @@ from ssad.core.types import F64, AgentKind, Bool, Controller, EpisodeTrace
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.frozen import frozen, with_motion
 from ssad.scenarios.dynamic.sets import load_scenarios
-from ssad.scenarios.dynamic.transition.kinematics import STEP, King, adversaries, sampled
+from ssad.scenarios.dynamic.transition.king import STEP, King, adversaries, sampled
 from ssad.scenarios.dynamic.transition.road import raster_of
 
 LENGTH: Final = 32  # steps of 0.25 s: 8 s, as CAT's forecast
