@@ -32,7 +32,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
-from ssad.core.machine import keep_memory
+from ssad.core.machine import retain_freed_memory
 from ssad.detectors import make_detector
 from ssad.detectors.on_scenes import score_2d
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
@@ -330,7 +330,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    keep_memory()  # as workers do
+    retain_freed_memory()  # as workers do
     if chosen.what == "torchattacks":
         found = beside_torchattacks(chosen.steps)
     elif chosen.what == "art":

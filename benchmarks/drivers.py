@@ -120,7 +120,7 @@ def measured(
 
     values = {
         "CR": [crashed(o) for o in found],
-        "valid": [o.valid for o in found],
+        "valid": [o.is_valid for o in found],
         "off": [o.off_road for o in found],
         "others": [o.hit_others for o in found],
     }

@@ -20,7 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.lit_images import LightableClips, LitClip
 from ssad.experiments.perception.physical.target_views import drive_of
@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--home", type=Path, default=Path("runs/physical-lights/data"))
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
     home = given.home / TOWN
     if not (home / "annotations").is_dir():

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from ssad.core.detections import Truth
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.metrics.target_attacks import sightings, target_scores
@@ -189,7 +189,7 @@ def main() -> None:
     parser.add_argument("--join", type=Path, nargs="*", default=[], metavar="FILE", help="add rows, measure nothing")
     given = parser.parse_args()
     rows = json.loads(given.out.read_text()) if given.out.is_file() else []
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
 
     def add(row: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ssad.core.images import save_picture
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_sheet import target_sheet
 from ssad.experiments.perception.physical.target_views import TargetClips
@@ -41,7 +41,7 @@ PANELS = {
 @torch.no_grad()
 def main() -> None:
     """Record, show, write."""
-    quiet_warp()
+    start_warp_quietly()
     detector, target = make_detector(DETECTOR), TargetCar()
     with tempfile.TemporaryDirectory() as folder:
         record_clips(TargetRecording(Path(folder), ((TOWN, 1),), (), target=target), workers=0)

@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
 
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.recorders.target_images import record_clips
@@ -120,7 +120,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
     found = measure(given.images, given.device)
     text = json.dumps(found, indent=1) + "\n"

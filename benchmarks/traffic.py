@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.insert import insert
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.seeding import generator
 from ssad.core.types import (
     Controller,
@@ -221,7 +221,7 @@ def main() -> None:
     parser.add_argument("--also", type=Path, nargs="*", default=[], help="files of --json whose towns are added")
     parser.add_argument("--page", action="store_true", help="write docs/results/traffic.md")
     given = parser.parse_args()
-    quiet_warp()
+    start_warp_quietly()
     traffic_of = {"world": VERSION, "vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
     about = traffic_of | {"first": given.first}
     rows = kept(given.json, about) if given.json and given.json.is_file() else {}

@@ -140,7 +140,7 @@ def test_lanelets_give_back_the_lanes(town: str, tmp_path: Path) -> None:
     assert np.abs(np.angle(np.exp(1j * (graph.yaw - other.yaw)))).max() < 0.01
     for field in ("kind", "left", "right", "offset", "left_marking", "right_marking", "sign_kind", "rule_lane"):
         assert np.array_equal(getattr(graph, field), getattr(other, field)), field
-    for lane in range(graph.lanes):
+    for lane in range(graph.lane_count):
         assert set(graph.successors(lane).tolist()) == set(other.successors(lane).tolist())
     driving = graph.kind == 1
     assert np.array_equal((graph.junction >= 0)[driving], (other.junction >= 0)[driving])
@@ -227,7 +227,12 @@ def test_a_scenario_of_others_is_driven(tmp_path: Path, monkeypatch: pytest.Monk
     assert done.returncode == 0, done.stderr
     (found,) = read_scenarios(tmp_path / "us.yaml")
     graph = load_town("us")
-    assert (found.name, found.town, graph.lanes, float(graph.speed_limit[0])) == ("USA_Test-1_1_T-1", "us", 2, 25.0)
+    assert (found.name, found.town, graph.lane_count, float(graph.speed_limit[0])) == (
+        "USA_Test-1_1_T-1",
+        "us",
+        2,
+        25.0,
+    )
     truck, car, walker = found.actors
     assert (truck.model, truck.trajectory) == ("truck", ())
     assert (car.model, car.trajectory[-1][:3]) == ("suv", (0.8, 46.4, 0.0))

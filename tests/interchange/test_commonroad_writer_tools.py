@@ -152,7 +152,7 @@ def test_time_to_collision_is_that_of_crime_behind_a_slower_car(tmp_path: Path) 
     graph = load_town("ProvingGround")
     lane = next(
         k
-        for k in range(graph.lanes)
+        for k in range(graph.lane_count)
         if graph.kind[k] == 1
         and graph.length[k] > 140.0
         and np.ptp(graph.yaw[graph.points(k)]) < 1e-3

@@ -61,7 +61,7 @@ def test_a_logged_drive_replays_within_a_centimetre(place: str, logged: Path, fo
         scene = data.scene(SCENE)
     assert drive.known == (place == "the town it says")
     assert drive.graph.name == drive.scenario.town == ("Twinford" if drive.known else "Logged")
-    assert (drive.graph.lanes < 20) == (place == "paths")
+    assert (drive.graph.lane_count < 20) == (place == "paths")
     episode = build_episode(drive.scenario, drive.graph, seed=0)
     (trace,) = rollout(World([episode], {drive.graph.name: drive.graph}), make_system("autopilot"))
     assert trace.end == "complete"

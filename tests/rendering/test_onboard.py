@@ -303,7 +303,7 @@ def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest
 
     watcher = Watcher("CAM_BACK")
     short = replace(episodes()[0], limits=EpisodeLimits(max_steps=2))
-    monkeypatch.setattr(driving, "episode_of", lambda cell: short)
+    monkeypatch.setattr(driving, "build_requested_episode", lambda cell: short)
     monkeypatch.setattr(driving, "system_of", lambda name: watcher)
     cell = SimpleNamespace(key="a", system="watcher", spec={"scenario": {"type": short.scenario.type}})
     _, (trace,), measured = driving.drive([cell], device="cpu")

@@ -42,7 +42,7 @@ def stand(town: str, *, many: bool, key: int = 0) -> list[StreetSign]:
 
 def nearest_lane(graph: LaneGraph, xy: F64) -> tuple[float, float]:
     """Distance to the nearest driving lane's middle less half its width, and that lane's heading."""
-    lane = np.repeat(np.arange(graph.lanes), np.diff(graph.offset))
+    lane = np.repeat(np.arange(graph.lane_count), np.diff(graph.offset))
     keep = (graph.kind[lane] == LaneType.DRIVING) & (graph.junction[lane] < 0)
     away = np.hypot(*(graph.xy[keep] - xy).T) - 0.5 * graph.width[keep]
     nearest = int(away.argmin())

@@ -56,14 +56,14 @@ def import_map(
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
 ) -> None:
     """Import an OpenDRIVE map as a town. Needs the extra `carla` (Python 3.11 or 3.12)."""
-    from ssad.core.safeio import home
+    from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
     from ssad.world.roads import load_town, town_names
 
     town_name = name or file.stem
     if town_names().get(town_name) == "built-in":
         raise ConfigError(f"'{town_name}' is a built-in town; choose another name with --name")
-    path = bake(file, town_name, home())
+    path = bake(file, town_name, home_folder())
     print(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}")
 
 
@@ -74,7 +74,7 @@ def import_routes(
     name: Annotated[str | None, typer.Option(help="Name of the set.  [default: name of the folder]")] = None,
 ) -> None:
     """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite; name what is left out."""
-    from ssad.core.safeio import home
+    from ssad.core.safeio import home_folder
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.sets import BUILT_IN_SETS
@@ -87,7 +87,7 @@ def import_routes(
         raise ConfigError(f"'{set_name}' is a built-in set; choose another name with --name")
     left_out: list[str] = []
     scenarios = read(folder, left_out=left_out)
-    path = home() / "scenarios" / f"{set_name}.yaml"
+    path = home_folder() / "scenarios" / f"{set_name}.yaml"
     save_scenarios(path, scenarios)
     towns = sorted({scenario.town for scenario in scenarios})
     print(f"set {set_name}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}")

@@ -193,14 +193,14 @@ def store_town(graph: LaneGraph, town: str, *, beside: Path) -> None:
         ConfigError: A built-in town has this name.
     """
     from ssad.core.lane_graph import save_graph
-    from ssad.core.safeio import home
+    from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map, town_names
 
     if town_names().get(town) == "built-in":
         raise ConfigError(f"'{town}' is a built-in town; choose another name for {beside}")
     path = beside.with_suffix(".npz")
     save_graph(graph, path)
-    import_map(path, town, home())
+    import_map(path, town, home_folder())
 
 
 def print_counted(heading: str, lines: Sequence[str]) -> None:

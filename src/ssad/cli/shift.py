@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth
-from ssad.engine.progress import Live
+from ssad.engine.progress import LiveProgress
 from ssad.recorders.shifted.contact_sheet import parse_box, write_sheets
 from ssad.recorders.shifted.image_folder import picture_shifts, shift_pictures
 from ssad.recorders.shifted.manifest import PAGE, check_manifest, manifest_digest, read_manifest, verify
@@ -101,7 +101,7 @@ def shift_folder(
                 )
     options = Options(source, out, version, shift_names(shifts), severities(severity), scenes=scene_names, **settings)
     try:
-        with Live("shift", 1, 0, console=Console(stderr=True), unit="scenes") as display:
+        with LiveProgress("shift", 1, 0, console=Console(stderr=True), unit="scenes") as display:
             roots = materialise(options, workers=workers, ray=ray, progress=display.show)
     except KeyboardInterrupt:
         print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
@@ -157,7 +157,7 @@ def shift_picture_folder(
         raise unknown_name("subsampling", settings["subsampling"], SUBSAMPLING)
     possible_shifts, strengths = picture_shifts(shift_names(shifts)), severities(severity)
     try:
-        with Live("shift", 1, 0, console=Console(stderr=True), unit="pictures") as display:
+        with LiveProgress("shift", 1, 0, console=Console(stderr=True), unit="pictures") as display:
             folders = shift_pictures(
                 source,
                 out,

@@ -12,7 +12,7 @@ OCCLUDERS = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS)
 MIN_OCCLUDING_PROP = 0.8  # m, minimum extent of a prop in both directions to occlude
 
 
-def in_sight(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
+def is_visible(eye: F32, belief: Belief, reach: float = RANGE) -> Bool:
     """Return which objects are visible.
 
     Args:

@@ -119,7 +119,7 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
         # COCO ids may have gaps; labels count from 0 in the order of the ids.
         label_by_category = {category_id: key for key, category_id in enumerate(sorted(class_names))}
         pictures = tuple(
-            _image(record, annotations_by_image[int(record["id"])], label_by_category, folder)
+            _parse_image(record, annotations_by_image[int(record["id"])], label_by_category, folder)
             for record in content["images"]
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -127,7 +127,7 @@ def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
     return CocoSet(tuple(class_names[category_id] for category_id in sorted(class_names)), pictures)
 
 
-def _image(
+def _parse_image(
     row: Mapping[str, Any], image_annotations: Sequence[Mapping[str, Any]], label_of: Mapping[int, int], folder: Path
 ) -> CocoImage:
     """One picture with its annotations. ValueError, KeyError or TypeError: broken."""

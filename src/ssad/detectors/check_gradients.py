@@ -40,9 +40,9 @@ def check_slopes(trial: CheckCase) -> None:
             for is_silent, channel_values in zip(silent_channels, perturbed_values, strict=True)
         ]
         if all(silent_channels):
-            trial.need(not any(lost_channels), f"the gradient of {name} reaches the image, which {name} depends on")
+            trial.expect(not any(lost_channels), f"the gradient of {name} reaches the image, which {name} depends on")
             continue
-        trial.need(not any(lost_channels), f"the gradient of {name} reaches all three colour channels")
+        trial.expect(not any(lost_channels), f"the gradient of {name} reaches all three colour channels")
         ratios: list[float] = []
         for image_index in range(BATCH):
             if image_index == len(probes):
@@ -54,7 +54,7 @@ def check_slopes(trial: CheckCase) -> None:
                 break
         agrees = not ratios or 1 / ROUGHLY < ratios[-1] < ROUGHLY
         promise = f"the gradient of {name} has the sign and roughly the size of its finite differences"
-        trial.need(agrees, f"{promise} (these are {ratios[-1] if ratios else 1:.2g} times what it says)")
+        trial.expect(agrees, f"{promise} (these are {ratios[-1] if ratios else 1:.2g} times what it says)")
 
 
 class _Probe:
@@ -131,7 +131,7 @@ def check_small_changes(trial: CheckCase) -> None:
             large_response > ROUNDING * logit[0].norm()
         ):  # else hardly anything changes it, as with some fresh weights
             is_sensitive = bool(small_response > 0.02 * SMALL / LARGE * large_response)
-            trial.need(
+            trial.expect(
                 is_sensitive, "changes of half a step of 8 bits change Dense.logit: the image is not quantised inside"
             )
 
@@ -153,12 +153,12 @@ def check_loss_signs(trial: CheckCase) -> None:
     for name in case_losses[0]:
         values = [case[name] for case in case_losses]
         is_reversed = min(values) < 0 and max(values) <= 0
-        trial.need(not is_reversed, f'losses["{name}"] rises above 0 when the truth is wrong (is its sign turned?)')
+        trial.expect(not is_reversed, f'losses["{name}"] rises above 0 when the truth is wrong (is its sign turned?)')
     favoured_total, disfavoured_total = (sum(case.values()) for case in case_losses[:2])
     rises = disfavoured_total >= favoured_total - 0.005 * abs(
         favoured_total
     )  # some parts may depend on the class in another way, a little
-    trial.need(rises, "the losses are lower for the classes that Dense.logit favours than for those it does not")
+    trial.expect(rises, "the losses are lower for the classes that Dense.logit favours than for those it does not")
 
 
 def _relabelled_truth(dense: Dense, assignment: Assignment, truth: list[Truth], *, largest: bool) -> list[Truth]:

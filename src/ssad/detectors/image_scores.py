@@ -136,11 +136,11 @@ def gather_images(
         camera_indices = np.repeat(np.arange(count), [len(single.score) for single in sample_detections]).astype(
             np.int32
         )
-        labels = label_table[_joined([single.label for single in sample_detections]).astype(np.int64)]
+        labels = label_table[_join_columns([single.label for single in sample_detections]).astype(np.int64)]
         is_known = labels >= 0
         box, score = (
-            _joined([single.box for single in sample_detections], 4),
-            _joined([single.score for single in sample_detections]),
+            _join_columns([single.box for single in sample_detections], 4),
+            _join_columns([single.score for single in sample_detections]),
         )
         sample_pictures.append(
             SampleImages(
@@ -150,7 +150,7 @@ def gather_images(
     return sample_pictures
 
 
-def _joined(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
+def _join_columns(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
     empty = np.zeros((0,) if width is None else (0, width))
     return np.concatenate([empty, *(tensor.detach().cpu().double().numpy() for tensor in values)])
 

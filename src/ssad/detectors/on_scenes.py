@@ -17,7 +17,7 @@ from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES, MMDET3D_CLASSES
 from ssad.core.protocols import Detector
 from ssad.core.types import F64, U8
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.results import with_ego
+from ssad.datasets.nuscenes.results import add_ego_distance
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors.image_scores import gather_images
@@ -221,7 +221,7 @@ def box_table(detections: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable
         score=column("score"),
         ego_distance=np.full(len(attributes), np.nan),
     )
-    return with_ego(table, truth.ego)
+    return add_ego_distance(table, truth.ego)
 
 
 def match_boxes(detections: Sequence[SampleBoxes], truth: GroundTruth) -> Matches:

@@ -246,7 +246,7 @@ class Kind(ABC):
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Return cells in batches for `execute`: of one system, alike, and fewer where workers would idle."""
-        return grouped(cells, plan.suite.chunk, workers=workers, group_key=self.alike)
+        return make_batches(cells, plan.suite.chunk, workers=workers, group_key=self.alike)
 
     def alike(self, cell: Cell) -> Hashable:
         """Return a value that is equal for cells that can run as one batch; they share a system."""
@@ -348,7 +348,7 @@ def check_distinct(suite: SuiteBase, key: str, names: Sequence[object]) -> None:
     raise ConfigError(f"suite {suite.name}: {key}: a name appears twice{hint}")
 
 
-def grouped(
+def make_batches(
     cells: Sequence[Cell], chunk: int, *, workers: int, group_key: Callable[[Cell], Hashable]
 ) -> list[list[Cell]]:
     """Batches of cells with a value in common, of `chunk` at most, and smaller where cells are few for the workers."""

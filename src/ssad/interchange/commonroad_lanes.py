@@ -57,7 +57,7 @@ def write_lanes(
     for sign_index, lane, s in zip(graph.rule_sign.tolist(), graph.rule_lane.tolist(), graph.rule_s, strict=True):
         lane_signs[lane].append((float(s), sign_ids[sign_index]))
     with_heights = float(np.ptp(graph.z)) > FLAT
-    for lane in range(graph.lanes):
+    for lane in range(graph.lane_count):
         _lanelet(
             root,
             graph,
@@ -126,7 +126,7 @@ def _lanelet(  # noqa: PLR0917
             add_element(element, tag, ref=neighbour + 1)
     for tag, neighbour in (("adjacentLeft", int(graph.left[lane])), ("adjacentRight", int(graph.right[lane]))):
         if neighbour >= 0:
-            same_direction = graph.same_direction(lane, neighbour)
+            same_direction = graph.is_same_direction(lane, neighbour)
             add_element(element, tag, ref=neighbour + 1, drivingDir="same" if same_direction else "opposite")
     if stops := lights or signs:
         x, y, yaw, width = graph.at(lane, stops[0][0])

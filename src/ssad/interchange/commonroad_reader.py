@@ -295,7 +295,7 @@ def _lane_under(graph: LaneGraph, pose: Pose) -> LanePosition | None:
 
 def _same_lanes(town: LaneGraph, lanes: LaneGraph) -> bool:
     """Return True if the lanes of a file are those of a town."""
-    is_same_layout = town.lanes == lanes.lanes and np.array_equal(town.kind, lanes.kind)
+    is_same_layout = town.lane_count == lanes.lane_count and np.array_equal(town.kind, lanes.kind)
     start_points: list[F64] = (
         [graph.xy[graph.offset[:-1]].astype(np.float64) for graph in (town, lanes)] if is_same_layout else []
     )

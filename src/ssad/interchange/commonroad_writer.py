@@ -91,7 +91,7 @@ class _Writer:
         for tag, value in (("geoNameId", -999), ("gpsLatitude", 999), ("gpsLongitude", 999)):  # a made-up place
             add_element(location, tag, value)
         add_element(add_element(root, "scenarioTags"), "simulated")
-        first_free_id = self.graph.lanes + 1
+        first_free_id = self.graph.lane_count + 1
         first_id, lost = write_lanes(root, self.graph, episode.signal_override, dt=self.dt, number=first_free_id)
         self.lost += lost
         if episode.signal_override and episode.override_until < self.steps * self.dt:

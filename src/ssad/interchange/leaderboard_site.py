@@ -171,7 +171,7 @@ class Site:
             neighbour.lane
         ] in kinds:
             # Seen from an oncoming lane, the next lane further out is to its right.
-            if not self.graph.same_direction(outermost.lane, neighbour.lane):
+            if not self.graph.is_same_direction(outermost.lane, neighbour.lane):
                 neighbour_side = "right"
             outermost = neighbour
         outermost_pose = pose_at(self.graph, outermost)
@@ -183,7 +183,7 @@ class Site:
         if (
             neighbour is None
             or self.graph.kind[neighbour.lane] != LaneType.DRIVING
-            or self.graph.same_direction(self.place(index).lane, neighbour.lane)
+            or self.graph.is_same_direction(self.place(index).lane, neighbour.lane)
         ):
             raise self.fail(f"{self.item.get('type')} needs an oncoming lane to the left of the ego's")
         return neighbour

@@ -329,7 +329,7 @@ def actor_flow(site: Site, *, lanes: bool = False, back: bool = False) -> None:
     site.target_speed = max(SPEED, min(speed, float(site.route.speed_limit[site.start])))
     for side in ("left", "right") if lanes else ():
         flow_start, flow_end = beside(site.graph, start, side), beside(site.graph, end, side)
-        lane_kinds, same_direction = site.graph.kind, site.graph.same_direction
+        lane_kinds, same_direction = site.graph.kind, site.graph.is_same_direction
         if (
             flow_start
             and flow_end

@@ -227,7 +227,9 @@ class PositionReader:
                 raise self.values.fail(element, f"there is no lane {lane_count} beside the entity that it refers to")
             nearest = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[lane])),))
             match = int(np.flatnonzero(nearest[0] == lane)[0])
-            to_left ^= not self.graph.same_direction(place.lane, lane)  # what is further left is on the right of those
+            to_left ^= not self.graph.is_same_direction(
+                place.lane, lane
+            )  # what is further left is on the right of those
             place = LanePosition(lane, float(nearest[1][match]))
             pose = pose_at(self.graph, place)
         return self._turned(element, shifted(pose, 0.0, lateral_offset))

@@ -24,7 +24,7 @@ from ssad.core.generators import Base, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import describe
 from ssad.core.rotations import wrap_angle
-from ssad.core.safeio import home, make_folder, read_text, write_atomic
+from ssad.core.safeio import home_folder, make_folder, read_text, write_atomic
 from ssad.core.seeding import digest
 from ssad.core.types import F64, Actor, EpisodeLimits, LaneType, Pose, Scenario
 from ssad.interchange.ego_start import start_parameters
@@ -202,7 +202,7 @@ class ScenicSearch:
 
 def _map_file(town: str) -> Path:
     """Return the file of a town's map for Scenic, which stores its own results beside it."""
-    path = make_folder(home() / "scenic") / f"{Path(town).stem}.xodr"
+    path = make_folder(home_folder() / "scenic") / f"{Path(town).stem}.xodr"
     text = town_xodr(town)
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         write_atomic(path, text)

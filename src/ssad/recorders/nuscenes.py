@@ -22,7 +22,7 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import visibility_token
 from ssad.core.rotations import matrix_to_quaternion, upright_pose, wrap_angle
 from ssad.core.seeding import digest, generator
@@ -212,7 +212,7 @@ def _scene(recording: Recording, town: str, number: int) -> None:
     if parts.finished(name):
         return
     folder = parts.begin(name)
-    quiet_warp()
+    start_warp_quietly()
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
     graph = load_town(town)

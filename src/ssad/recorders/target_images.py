@@ -21,11 +21,11 @@ import cv2
 import numpy as np
 
 from ssad.core import safeio
-from ssad.core.boxes import UNIT_CORNERS, hulls
+from ssad.core.boxes import UNIT_CORNERS, image_rectangles
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest, generator
@@ -226,7 +226,7 @@ def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
     if parts.finished(name):
         return name
     parts.begin(name)
-    quiet_warp()
+    start_warp_quietly()
     cv2.setNumThreads(1)
     rows: dict[int, dict[str, Any]] = {}
     skipped: Counter[str] = Counter()
@@ -395,7 +395,7 @@ def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
     corners = (UNIT_CORNERS + np.array([0.0, 0.0, 0.5])) * size
     body_to_camera = np.linalg.inv(view.pose) @ pose
     camera_corners, camera = corners @ body_to_camera[:3, :3].T + body_to_camera[:3, 3], view.camera
-    box = hulls(camera_corners[None], camera.intrinsic, (camera.width, camera.height))[0]
+    box = image_rectangles(camera_corners[None], camera.intrinsic, (camera.width, camera.height))[0]
     return np.asarray(np.round(box, 2))
 
 

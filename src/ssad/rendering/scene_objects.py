@@ -393,7 +393,7 @@ def _kerb(  # noqa: PLR0917
         sidewalk = int(graph.right[lane])
         if sidewalk < 0 or graph.kind[sidewalk] != LaneType.SIDEWALK or graph.junction[lane] >= 0:
             continue
-        if graph.left[lane] >= 0 and graph.divided(int(graph.left[lane])):
+        if graph.left[lane] >= 0 and graph.is_divided(int(graph.left[lane])):
             continue  # nobody parks in a roundabout
         distance = 9.0 + float(rng.uniform(0, 3))
         while distance < float(graph.length[lane]) - 9.0:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ssad.core.frames import Camera
-from ssad.core.images import captioned
+from ssad.core.images import add_caption
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, U8, EpisodeTrace
@@ -58,8 +58,8 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
         )
         top_image = render(town.scene, [View(overhead_camera, overhead_pose, scene_objects, DAY)]).image[0]
         text = f"{step * trace.dt:.1f} s, {trace.speed[step, 0]:.1f} m/s"
-        left = captioned(np.ascontiguousarray(np.moveaxis(front_image, 0, -1)), text, width)
-        rows.append(np.hstack([left, captioned(top_image, "from above", width)]))
+        left = add_caption(np.ascontiguousarray(np.moveaxis(front_image, 0, -1)), text, width)
+        rows.append(np.hstack([left, add_caption(top_image, "from above", width)]))
     return np.vstack(rows)
 
 

@@ -145,7 +145,7 @@ def measure_adversary(
     outcomes = trials.run(proposals)
     shares = {
         "CR": [outcome.trace is not None and outcome.trace.end == "collision" for outcome in outcomes],
-        "valid": [outcome.valid for outcome in outcomes],
+        "valid": [outcome.is_valid for outcome in outcomes],
         "off": [outcome.off_road for outcome in outcomes],
         "others": [outcome.hit_others for outcome in outcomes],
     }

@@ -19,7 +19,7 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.core import errors, safeio
-from ssad.core.checkpoints import WeightsCard, hash_state, load_weights, save_weights, start_from
+from ssad.core.checkpoints import WeightsCard, copy_matching_weights, hash_state, load_weights, save_weights
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -195,7 +195,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: Share, report: 
     sources, options = _items(plan, is_3d=recipe.three)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
-        unmatched_weights = start_from(detector, load_weights(plan.weights), str(plan.weights))
+        unmatched_weights = copy_matching_weights(detector, load_weights(plan.weights), str(plan.weights))
         if unmatched_weights:
             report(
                 f"{plan.weights}: {len(unmatched_weights)} weights do not fit and start fresh: "

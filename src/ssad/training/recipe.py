@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from ssad.core.errors import unknown_name
-from ssad.core.schema import VALUES, Above, Least, Part, Whole, checked
+from ssad.core.schema import VALUES, Above, Least, Part, Whole, build_validated
 
 FromNone = Annotated[int, Field(ge=0)]
 Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -200,7 +200,7 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
-    return checked(
+    return build_validated(
         partial(replace, RECIPES[name]), changes, subject=f"recipe {name}", kind=Recipe, name_field="detector"
     )
 

@@ -22,7 +22,7 @@ from ssad.core import safeio
 from ssad.core.checkpoints import WeightsCard, read_state, save_weights
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
-from ssad.core.schema import VALUES, Above, Part, Whole, checked
+from ssad.core.schema import VALUES, Above, Part, Whole, build_validated
 from ssad.training.recipe import Decay, FromNone
 from ssad.world.actions import ACTIONS, CHOICES
 from ssad.world.policy import Policy, PolicyDriver, policy_of, tensors_of
@@ -102,7 +102,7 @@ def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str
     """
     if name not in table:
         raise unknown_name("algorithm", name, table)
-    return checked(
+    return build_validated(
         partial(replace, table[name]), changes, subject=f"training {name}", kind=Learning, name_field="algorithm"
     )
 

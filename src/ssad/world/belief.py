@@ -13,7 +13,7 @@ from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.geometry import to_local
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.rotations import wrap, wrap_angle
+from ssad.core.rotations import wrap_angle, wrap_scalar
 from ssad.core.types import F32, F64, I32, AgentKind, Bool, LaneType, SignalState
 from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
@@ -107,7 +107,9 @@ def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, 
     height = _lane_heights(pose, occupied, lanes) if belief.height is None else belief.height
     arrays["height"] = np.asarray(height, np.float32)
     arrays["waited"] = (
-        np.zeros(kind.shape, np.float32) if belief.stood is None else np.asarray(belief.stood, np.float32)
+        np.zeros(kind.shape, np.float32)
+        if belief.standing_time is None
+        else np.asarray(belief.standing_time, np.float32)
     )
     change = np.zeros((*kind.shape, 2), np.int32) if belief.change is None else np.asarray(belief.change, np.int32)
     arrays["change"] = change
@@ -190,7 +192,7 @@ class Lanes:
         self._grid = grid_of(graph, DRIVABLE)
         segments = self._grid.seg
         self._yaw = np.arctan2(segments[:, 3] - segments[:, 1], segments[:, 2] - segments[:, 0])
-        count = graph.lanes
+        count = graph.lane_count
         first_vertices, last_vertices = graph.offset[:-1], graph.offset[1:] - 1
         self._next = np.full(count, -1, np.int64)
         for lane in range(count):
@@ -198,7 +200,7 @@ class Lanes:
                 successor for successor in graph.successors(lane).tolist() if graph.kind[successor] == LaneType.DRIVING
             ]
             heading_changes = [
-                abs(wrap(float(graph.yaw[last_vertices[successor]] - graph.yaw[last_vertices[lane]])))
+                abs(wrap_scalar(float(graph.yaw[last_vertices[successor]] - graph.yaw[last_vertices[lane]])))
                 for successor in successors
             ]
             if successors:
@@ -230,7 +232,7 @@ class Lanes:
         distance, rank_ahead = np.where(in_junction, 0.0, FAR), np.where(in_junction, turn_rank, 0).astype(np.float64)
         successor = np.maximum(self._next, 0)
         enters_junction = ~in_junction & (self._next >= 0) & in_junction[successor]
-        signed = np.isin(np.arange(graph.lanes), graph.rule_lane)
+        signed = np.isin(np.arange(graph.lane_count), graph.rule_lane)
         # Each round looks one lane further ahead.
         for _ in range(HOPS):
             remaining = np.where(self._next >= 0, distance[successor], FAR)

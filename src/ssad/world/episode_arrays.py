@@ -233,7 +233,7 @@ def _beside(route: Route, graph: LaneGraph) -> F32:
                 or marking not in (Marking.NONE, Marking.BROKEN)
             ):
                 continue
-            same_direction = graph.same_direction(lane, neighbour)
+            same_direction = graph.is_same_direction(lane, neighbour)
             if column == 2 and not same_direction:
                 continue
             distance, width = _lane_left(route, points, graph, neighbour)

@@ -15,7 +15,7 @@ import warp as wp
 from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
 from ssad.world.belief import Lanes, check, complete, lanes_of, rest_times
 from ssad.world.episode_arrays import build
@@ -81,7 +81,7 @@ class World:
     ) -> None:
         if dt <= 0.0 or substeps < 1:
             raise ConfigError(f"a world needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
-        quiet_warp()
+        start_warp_quietly()
         self.episodes = tuple(episodes)
         self.graphs: Mapping[str, LaneGraph] = dict(graphs)
         self.dt = dt
@@ -475,7 +475,7 @@ class World:
             towns = [self.episodes[index].town for index in self.array("episode")]
             belief_arrays = complete(belief, lanes_of(self.graphs, towns, self._lanes), scene_mask)
             step = self.array("step")
-            if belief.stood is None:
+            if belief.standing_time is None:
                 previous = {
                     name: self.array(f"seen.{name}")[:, self.agents :] for name in ("pose", "speed", "kind", "waited")
                 }
@@ -529,7 +529,7 @@ class World:
             forecast=agent_arrays["forecast"],
             way=agent_arrays["way"],
             line_signal=agent_arrays["signal"],
-            stood=agent_arrays["waited"],
+            standing_time=agent_arrays["waited"],
             gives_way=agent_arrays["gives_way"] != 0,
             change=agent_arrays["change"],
             height=agent_arrays["height"],

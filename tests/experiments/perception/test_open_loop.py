@@ -84,7 +84,7 @@ def test_what_acts_on_scenes_is_refused_on_a_target_with_the_same_words(
 ) -> None:
     refused = perturbation(family)
     images = LightableClips(tmp_path, 1)
-    monkeypatch.setattr(open_loop, "loaded_detector", lambda *given, **options: None)
+    monkeypatch.setattr(open_loop, "cached_detector", lambda *given, **options: None)
     monkeypatch.setattr(open_loop, "_clean_sightings", lambda *given: (seen(0.0),))
     job = Job(tmp_path, "cpu", {"detectors": {}, "replicates": 0, "seed": 0, "floor": 0.0})
     for kind in (Physical, Perception):
@@ -131,7 +131,7 @@ def test_the_floor_is_the_same_and_the_clean_target_is_seen_once(
         yield seen(0.0)
 
     monkeypatch.setattr(LightableClips, "clean", lambda self: iter(["clean"]))
-    monkeypatch.setattr(open_loop, "loaded_detector", lambda *given, **options: None)
+    monkeypatch.setattr(open_loop, "cached_detector", lambda *given, **options: None)
     monkeypatch.setattr(open_loop, "sightings", sightings)
     cell = Cell("key", "cell", "one", 0, {"view": "drive"}, {})
     for kind in (Physical, Perception):

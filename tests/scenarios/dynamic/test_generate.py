@@ -119,7 +119,7 @@ def test_what_cannot_be_built_is_a_failed_outcome(bases: list[Base]) -> None:
     inside = dataclasses.replace(base.scenario, placements=(Pose(*base.trace.route[0].tolist(), 0.0),))
     failed, ran = trials().run([(base, Proposal(inside)), (base, Proposal(base.scenario))])
     assert "stands in the" in failed.failure
-    assert not failed.valid
+    assert not failed.is_valid
     assert failed.gap is None
     assert failed.danger == -100.0
     assert ran.failure == ""

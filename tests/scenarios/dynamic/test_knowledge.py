@@ -122,7 +122,7 @@ def test_parked_and_oncoming_car(crossroads: LaneGraph, routes: Any) -> None:
 
 
 def test_a_missing_left_lane_is_an_error(crossroads: LaneGraph, routes: Any) -> None:
-    graph = replace(crossroads, left=np.full(crossroads.lanes, -1, np.int32))
+    graph = replace(crossroads, left=np.full(crossroads.lane_count, -1, np.int32))
     for kind in ("LaneChanging", "VehiclePassing"):
         with pytest.raises(RouteError, match="needs a lane to the left"):
             build(scenario(kind), graph, routes.straight)

@@ -56,7 +56,7 @@ def flatten(maps: dict[str, list[Tensor]]) -> FlatMaps:
     )
 
 
-def pick(flat: FlatMaps, image: Tensor, rows: Tensor) -> FlatMaps:
+def select_rows(flat: FlatMaps, image: Tensor, rows: Tensor) -> FlatMaps:
     """Return the rows [N] of images [N]."""
     bins = None if flat.bins is None else flat.bins[image, rows]
     return FlatMaps(

@@ -13,10 +13,10 @@ from torchvision.ops import batched_nms, box_iou
 
 from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
-from ssad.core.eval_mode import evaluating
+from ssad.core.eval_mode import in_eval_mode
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.tensor_boxes import solid_corners
-from ssad.detectors.adapters.common import check_images, check_threshold, scale_of, size_inside
+from ssad.detectors.adapters.common import check_images, check_threshold, input_scale, resized_size
 from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (
@@ -24,9 +24,9 @@ from ssad.detectors.mono3d.decode import (
     flatten,
     global_yaw,
     hull,
-    pick,
     places_of,
     project,
+    select_rows,
     unproject,
     yaw_of_vectors,
 )
@@ -112,9 +112,9 @@ class Mono3D(nn.Module):
         """Return the head's maps, its input, the intrinsics [B, 3, 3] in the network's input, and the image size."""
         size, network_intrinsic = self._check(images, intrinsic)
         network_intrinsic = self._scale_intrinsic(network_intrinsic, size, self._scale(size, network_intrinsic))
-        features = self.neck(self.backbone(self._prepare(images)))
+        features = self.neck(self.backbone(self._preprocess(images)))
         return (
-            self.bbox_head(features, self._factor(network_intrinsic), self._rays(features, network_intrinsic)),
+            self.bbox_head(features, self._depth_factor(network_intrinsic), self._rays(features, network_intrinsic)),
             features,
             network_intrinsic,
             size,
@@ -129,7 +129,7 @@ class Mono3D(nn.Module):
         The score is class times centreness (times PGD's confidence of depth).
         """
         min_score = check_threshold(self.name, self.config.threshold if threshold is None else threshold)
-        with evaluating(self):
+        with in_eval_mode(self):
             maps, _, network_intrinsic, size = self._maps(images, intrinsic)  # without the boxes of all places
         return self._select_detections(maps, network_intrinsic, size, threshold=min_score, best_first=True)
 
@@ -162,7 +162,7 @@ class Mono3D(nn.Module):
             class_scores = class_scores.gather(1, top_rows[..., None].expand(-1, -1, class_scores.shape[2]))
             image, place, label = (class_scores > threshold).nonzero(as_tuple=True)
             rows, score = top_rows[image, place], class_scores[image, place, label]
-            outputs, xy = pick(flat, image, rows), places.xy[rows]
+            outputs, xy = select_rows(flat, image, rows), places.xy[rows]
             solids = centre, extent, yaw = self._solids(outputs, xy, intrinsic, image)
             image_boxes = self._boxes(outputs, xy, solids, intrinsic=intrinsic[image], size=size)
             candidates = torch.cat([centre, extent, outputs.reg[:, 7:9], outputs.direction], 1)
@@ -214,7 +214,7 @@ class Mono3D(nn.Module):
     def _depth(self, flat: FlatMaps, intrinsic: Tensor) -> Tensor:
         """Return the depth [..., P] of places, m; intrinsic [..., 3, 3], one per place or broadcast."""
         depth = flat.reg[..., 2]
-        return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._factor(intrinsic))
+        return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._depth_factor(intrinsic))
 
     def _vote(  # noqa: PLR0917
         self, values: Tensor, image_boxes: Tensor, score: Tensor, label: Tensor, image: Tensor, survivors: Tensor
@@ -324,7 +324,7 @@ class Mono3D(nn.Module):
             )
 
     @torch.no_grad()
-    def doubted(self, dense: Dense, assignment: Assignment, *, doubt: float) -> Assignment:
+    def discount_centreness(self, dense: Dense, assignment: Assignment, *, doubt: float) -> Assignment:
         """Return the assignment with centreness reduced by the error of the currently predicted depth.
 
         A centreness learned from it ranks boxes by how well they are placed, as in IoU-Net (Jiang et al., ECCV 2018).
@@ -336,7 +336,9 @@ class Mono3D(nn.Module):
         """
         image, place = (assignment.label >= 0).nonzero(as_tuple=True)
         with _full_precision(dense.logit):
-            depth = self._depth(pick(flatten(_head_maps(dense)), image, place), dense.maps["intrinsic"][0][image])
+            depth = self._depth(
+                select_rows(flatten(_head_maps(dense)), image, place), dense.maps["intrinsic"][0][image]
+            )
         depth_error = (depth - assignment.extra["reg"][image, place, 2]).abs()
         centreness = assignment.extra["centreness"].clone()
         centreness[image, place] *= torch.exp(-depth_error / doubt)
@@ -361,7 +363,7 @@ class Mono3D(nn.Module):
                 places,
                 assignment,
                 intrinsic,
-                factor=self._factor(intrinsic),
+                factor=self._depth_factor(intrinsic),
                 fuse=self.bbox_head.fuse,
                 reduction=reduction,
             )
@@ -411,14 +413,14 @@ class Mono3D(nn.Module):
         return next(self.parameters()).dtype
 
     def _scale(self, size: tuple[int, int], template: Tensor) -> Tensor:
-        return scale_of(size_inside(size, self.config.input_width), size, template)[:2]
+        return input_scale(resized_size(size, self.config.input_width), size, template)[:2]
 
     def _rows_above(self, size: tuple[int, int]) -> int:
         """Return the number of rows added above the resized image, see `Mono3DConfig.trained_width`."""
         trained = self.config.trained_width
         if trained is None or self.config.input_width == trained:
             return 0
-        heights = [size_inside(size, width)[0] for width in (trained, self.config.input_width)]
+        heights = [resized_size(size, width)[0] for width in (trained, self.config.input_width)]
         return round(self.config.horizon * (heights[0] - heights[1])) % MULTIPLE
 
     def _scale_intrinsic(self, intrinsic: Tensor, size: tuple[int, int], scale: Tensor) -> Tensor:
@@ -428,7 +430,7 @@ class Mono3D(nn.Module):
         added = intrinsic.new_tensor([[0.0, 0.0, 0.0], [0.0, 0.0, self._rows_above(size)]])
         return torch.cat([intrinsic[:, :2] * scale[:, None] + added, intrinsic[:, 2:]], 1)
 
-    def _factor(self, intrinsic: Tensor) -> Tensor | None:
+    def _depth_factor(self, intrinsic: Tensor) -> Tensor | None:
         if self.config.virtual_focal is None:
             return None
         return intrinsic[..., 0, 0] / self.config.virtual_focal
@@ -449,11 +451,11 @@ class Mono3D(nn.Module):
             level_rays.append(4.0 * torch.stack([right[:, None].expand(shape), down[:, :, None].expand(shape)], 1))
         return level_rays
 
-    def _prepare(self, images: Tensor) -> Tensor:
+    def _preprocess(self, images: Tensor) -> Tensor:
         """Normalise images as BGR in 0..255 less the mean, and pad with 0 right, below and above."""
         images = images.to(self._dtype())
         size = (images.shape[2], images.shape[3])
-        resized = size_inside(size, self.config.input_width)
+        resized = resized_size(size, self.config.input_width)
         if resized != size:
             is_downscaled = resized[0] < size[0]
             images = functional.interpolate(

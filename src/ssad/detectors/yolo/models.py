@@ -207,13 +207,13 @@ class CSPNetwork(nn.Module):
         self.stage5 = C3(c5, c5, repeats=repeats)
         self.pool = SPPF(c5, c5)
         self.lateral5 = ConvUnit(c5, c4, smooth=True)
-        self.top4 = C3(2 * c4, c4, repeats=repeats, add=False)
+        self.top4 = C3(2 * c4, c4, repeats=repeats, use_shortcut=False)
         self.lateral4 = ConvUnit(c4, c3, smooth=True)
-        self.neck3 = C3(2 * c3, c3, repeats=repeats, add=False)
+        self.neck3 = C3(2 * c3, c3, repeats=repeats, use_shortcut=False)
         self.up4 = ConvUnit(c3, c3, kernel=3, stride=2, smooth=True)
-        self.neck4 = C3(2 * c3, c4, repeats=repeats, add=False)
+        self.neck4 = C3(2 * c3, c4, repeats=repeats, use_shortcut=False)
         self.up5 = ConvUnit(c4, c4, kernel=3, stride=2, smooth=True)
-        self.neck5 = C3(2 * c4, c5, repeats=repeats, add=False)
+        self.neck5 = C3(2 * c4, c5, repeats=repeats, use_shortcut=False)
         self.heads = nn.ModuleList(nn.Conv2d(channels, outputs, 1) for channels in (c3, c4, c5))
 
     def forward(self, x: Tensor) -> tuple[Maps, Maps]:

@@ -106,14 +106,14 @@ def _town_weights(run: DrivingRun, towns: Mapping[str, str]) -> str:
 def full_table(run: DrivingRun) -> Table:
     """Return every metric for every system and group."""
     note = f"Avg. is the mean of the eight pre-crash scenarios' values. {METHODS}"
-    if not run.measures("SS"):
+    if not run.is_measured("SS"):
         note += " SS is not measured, since no town of this run has stop signs; the driving score is without them."
     return Table.listing(
         "metrics",
         "All metrics",
         run.numbers,
         rows={"System": lambda key: key[0], "Group": lambda key: run.headings[key[1]]},
-        columns={symbol: symbol for symbol in METRICS if symbol != "LC" or run.measures(symbol)},
+        columns={symbol: symbol for symbol in METRICS if symbol != "LC" or run.is_measured(symbol)},
         metric=partial(_cell, run),
         note=note,
     )
@@ -125,7 +125,7 @@ def normalised_table(run: DrivingRun) -> Table:
     def metric(key: tuple[str, str], column: str) -> TableCell:
         estimate = run.numbers[key]["OS" if column == "FREA" else column]
         if column in ("OR", "DR", "TS"):
-            return TableCell.of(_scaled(column, estimate))
+            return TableCell.of(_normalise(column, estimate))
         return TableCell.of(estimate.scaled(-1.0, 1.0) if column in ("RC", "FREA") else estimate)
 
     return Table.listing(
@@ -147,7 +147,7 @@ def normalised_table(run: DrivingRun) -> Table:
     )
 
 
-def _scaled(name: str, estimate: Estimate) -> Estimate:
+def _normalise(name: str, estimate: Estimate) -> Estimate:
     """Return a raw metric over its divisor, cut at 1."""
     scaled_values = (
         value if math.isnan(value) else normalised(name, value)

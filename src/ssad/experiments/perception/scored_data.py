@@ -107,7 +107,7 @@ def detectors_of(
             if weights_file and weights_file != "random"
             else weights_file
         )
-        detector_name = Reference.of(name).name
+        detector_name = Reference.parse(name).name
         if not path and detector_name in DETECTORS and not (SHIPPED / f"{detector_name}.json").is_file():
             raise ConfigError(
                 f"suite {suite}: no weights of {detector_name} are shipped; give a file, {detector_name}=FILE "

@@ -29,8 +29,8 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     parts, tables = [], []
     for part_settings in run.suite["parts"]:
         name = str(part_settings["name"])
-        part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_about(part_settings)}
-        part_run = _read(run.folder / name)
+        part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_describe_part(part_settings)}
+        part_run = _read_run(run.folder / name)
         if part_run is not None:
             write_report(part_run.folder)
             kind = kind_of_run(part_run)
@@ -48,11 +48,11 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     return render(TEMPLATE, run, parts=parts, limits=run.suite.get("limits", [])), tables
 
 
-def _about(part: Mapping[str, Any]) -> dict[str, Any]:
+def _describe_part(part: Mapping[str, Any]) -> dict[str, Any]:
     return {"question": part.get("question", ""), "limits": part.get("limits", "")}
 
 
-def _read(folder: Path) -> Run | None:
+def _read_run(folder: Path) -> Run | None:
     """Return the run of a part; None: it has no results."""
     try:
         return load_run(folder)

@@ -16,8 +16,8 @@ from ssad.core.boxes import TrackedBoxes
 from ssad.core.columns import concatenate
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera, Frame, SceneContext, camera_to_world
-from ssad.core.images import captioned, read_image, save_picture
-from ssad.core.machine import quiet_warp
+from ssad.core.images import add_caption, read_image, save_picture
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.scenarios.static.shifts import SEVERITIES, SHIFTS, Calibration, ShiftSpec, shift_images, viewing_direction
@@ -130,10 +130,10 @@ def contact_sheet(
     width: int = 480,
 ) -> U8:
     """The clean picture and the shifts in three columns, as in the paper's figure of all 11: [rows, columns, 3]."""
-    panels = [captioned(image, "clean", width)]
+    panels = [add_caption(image, "clean", width)]
     for name in shifts:
         spec = ShiftSpec(name, severity, seed, calibration)
-        panels.append(captioned(*_shifted(image, frame, spec, context), width))
+        panels.append(add_caption(*_shifted(image, frame, spec, context), width))
     panels += [np.full_like(panels[0], 255)] * (-len(panels) % 3)
     return np.vstack([np.hstack(panels[start : start + 3]) for start in range(0, len(panels), 3)])
 
@@ -156,7 +156,7 @@ def severity_sheet(
         captioned_cells = [
             (panel, text or f"{name} {spec.severity}") for (panel, text), spec in zip(cells, specs, strict=True)
         ]
-        rows.append(np.hstack([captioned(panel, text, width) for panel, text in captioned_cells]))
+        rows.append(np.hstack([add_caption(panel, text, width) for panel, text in captioned_cells]))
     return np.vstack(rows)
 
 
@@ -185,7 +185,7 @@ def write_sheets(
     shifts: Sequence[str] = tuple(SHIFTS),
 ) -> tuple[Path, Path]:
     """Both sheets of a picture or of a nuScenes folder: OUT, and beside it OUT with "-severities" in its name."""
-    quiet_warp()
+    start_warp_quietly()
     context: SceneContext | None = None
     if source.is_dir():
         image, frame, context = pick_frame(NuScenes(source, version), channel=channel, scene=scene, seed=seed)

@@ -19,7 +19,7 @@ import numpy as np
 from ssad.core.errors import ConfigError, SSADError, StoreError
 from ssad.core.frames import Camera, Frame
 from ssad.core.images import encode_jpeg, read_image
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.safeio import dump_json, make_folder, read_text, remove_unfinished, write_atomic
 from ssad.core.types import U8
 from ssad.engine.pool import open_pool
@@ -196,7 +196,7 @@ def _written(image_task: ShiftedImage) -> dict[str, Any]:
         if image_task.random
         else image_task.spec
     )
-    quiet_warp()
+    start_warp_quietly()
     try:
         image = read_image(image_task.path)
         frame = Frame(camera_of(image_task.path, image), scene=image_task.key, sample=image_task.key)

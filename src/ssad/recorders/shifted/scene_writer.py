@@ -15,9 +15,9 @@ import numpy as np
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
-from ssad.core.frames import Applied
+from ssad.core.frames import ShiftReport
 from ssad.core.images import encode_jpeg
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.nuscenes_names import LIDAR
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.files import points_bytes
@@ -84,7 +84,7 @@ def make_shard(shard: Shard) -> dict[str, int]:
     threads = cv2.getNumThreads()
     # Each worker has one core: threads of OpenCV would only compete with other workers.
     cv2.setNumThreads(1)
-    quiet_warp()
+    start_warp_quietly()
     try:
         records = _files(shard)
     finally:
@@ -222,7 +222,7 @@ def _idle(shifter: SceneShifter, frame: SensorFrame) -> str:
     return "no object in it" if shifter.base.family == "object" else "the shift changed nothing in it"
 
 
-def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, Applied]:
+def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
     """Return bytes of a shifted image (None: unchanged), hash of its pixels, and the application of the shift."""
     clean_image = shifter.read(frame)
     image, applied = shifter.image(frame, clean=clean_image)
@@ -232,7 +232,7 @@ def _image(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[byt
     return _encode(image, shard, frame.filename), digest_bytes(image.data), applied
 
 
-def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, Applied]:
+def _points(shard: Shard, shifter: SceneShifter, frame: SensorFrame) -> tuple[bytes | None, str, ShiftReport]:
     """Return bytes of a shifted sweep (None: unchanged), their hash, and the application of the shift."""
     points, applied = shifter.points(frame)
     if not applied.applied or np.array_equal(points, shifter.cloud(frame)):

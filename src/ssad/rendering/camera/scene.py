@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ssad.core.errors import ConfigError
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import F32, F64, I32, Bool
 from ssad.rendering.camera.kernels import matter
 from ssad.rendering.camera.kernels import shade as kernels
@@ -213,7 +213,7 @@ class RenderScene:
     """Triangles of a street (or none) and of meshes, on a device."""
 
     def __init__(self, street: Street | None, meshes: Sequence[Mesh], *, device: str = "cpu") -> None:
-        quiet_warp()
+        start_warp_quietly()
         self.street, self.device = street, device
         if street is not None:
             x, y = np.meshgrid(np.arange(street.nx), np.arange(street.ny))

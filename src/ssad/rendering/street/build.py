@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.safeio import home
+from ssad.core.safeio import home_folder
 from ssad.core.seeding import generator
 from ssad.rendering.meshes.mesh import F32
 from ssad.rendering.street.dressing import Masts, furnish, light_streets, plant, signals
@@ -111,7 +111,7 @@ def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = N
         "rule_lane",
     ):
         digest.update(getattr(graph, key).tobytes())
-    path = home() / "cache" / "streets" / f"{digest.hexdigest()[:24]}.npz"
+    path = home_folder() / "cache" / "streets" / f"{digest.hexdigest()[:24]}.npz"
     if path.exists():
         with contextlib.suppress(FormatError):  # a broken file is built again below
             return load_street(path)

@@ -138,7 +138,7 @@ def sides(graph: LaneGraph) -> list[Side]:
         kerb = float(graph.width[graph.points(lane)].min()) if is_sidewalk else 0.0
         edge = lane_edge(graph, lane, 0.0)
         if edge.s[-1] > 4.0:
-            street_sides.append(Side(edge, kerb, is_sidewalk or not graph.divided(lane)))
+            street_sides.append(Side(edge, kerb, is_sidewalk or not graph.is_divided(lane)))
     return street_sides
 
 

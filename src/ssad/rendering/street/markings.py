@@ -42,7 +42,7 @@ def paint(soup: TriangleBuilder, graph: LaneGraph, look: TownMaterials) -> None:
     for signal, lane, s in zip(
         graph.stop_signal.tolist(), graph.stop_lane.tolist(), graph.stop_s.tolist(), strict=True
     ):
-        if graph.signal_virtual[signal] and lane not in sign_lanes and graph.divided(lane):
+        if graph.signal_virtual[signal] and lane not in sign_lanes and graph.is_divided(lane):
             continue  # the ring of a roundabout, a motorway
         if graph.kind[lane] == LaneType.DRIVING:
             give_way = bool(graph.signal_virtual[signal]) and lane not in stop_sign_lanes
@@ -60,7 +60,7 @@ def _lines(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: TownMateria
         shares_line = neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING
         if marking in (Marking.NONE, Marking.CURB) or (shares_line and neighbour < lane):
             continue
-        oncoming = shares_line and not graph.same_direction(lane, neighbour)
+        oncoming = shares_line and not graph.is_same_direction(lane, neighbour)
         material = look.centre if oncoming else look.white
         edge = _between_crosswalks(graph, lane_edge(graph, lane, share))
         if edge is None:
@@ -152,7 +152,7 @@ def _stop(
     neighbours = [int(neighbour) for neighbour in (graph.left[lane], graph.right[lane]) if neighbour >= 0]
     if (
         any(
-            graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour)
+            graph.kind[neighbour] == LaneType.DRIVING and graph.is_same_direction(lane, neighbour)
             for neighbour in neighbours
         )
         and arc_length > 30.0

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError, SSADError
-from ssad.core.safeio import dotted, read_json, read_xml
+from ssad.core.safeio import format_location, read_json, read_xml
 from ssad.core.types import Pose, Scenario
 from ssad.scenarios.dynamic.catalogue import PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import problems
@@ -305,7 +305,7 @@ def _with_lane_points(road: _ImportedRoute) -> _ImportedRoute:
 
 def _check_scenario(scenario: Scenario, path: Path) -> Scenario:
     for location, message in problems(scenario):
-        raise FormatError(f"{path}: {dotted(location)}: {message}")
+        raise FormatError(f"{path}: {format_location(location)}: {message}")
     return scenario
 
 

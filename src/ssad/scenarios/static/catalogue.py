@@ -337,7 +337,7 @@ def _fields_of(value: Any) -> dict[str, Any]:
                 stacklevel=2,
             )
             return _fields_of(current)
-        reference = Reference("", {}, "") if is_path(value) else Reference.of(value)
+        reference = Reference("", {}, "") if is_path(value) else Reference.parse(value)
         name = reference.name or value
         return _fields(family_of_name(name), name, dict(reference.options), reference.label)
     if not isinstance(value, Mapping) or not value:
@@ -354,7 +354,7 @@ def _fields_of(value: Any) -> dict[str, Any]:
             other_settings.pop("name", None)
         if not isinstance(object_name, str) or not object_name:
             raise ConfigError(f"{dict(value)}: {key} is a name, a path or module:object, not {object_name!r}")
-        reference = Reference("", {}, "") if is_path(object_name) else Reference.of(object_name)
+        reference = Reference("", {}, "") if is_path(object_name) else Reference.parse(object_name)
         name, family = reference.name or object_name, SPELLINGS.get(key, key)
         if family != "own":
             _check_name(family, name)
@@ -373,7 +373,7 @@ def _fields_of(value: Any) -> dict[str, Any]:
         settings = {"severity": settings}
     if not isinstance(settings, Mapping):
         raise ConfigError(f"{dict(value)}: below a name stand severities or settings, not {settings!r}")
-    reference = Reference.of(name)
+    reference = Reference.parse(name)
     return _fields(family_of_name(reference.name), reference.name, {**reference.options, **settings}, reference.label)
 
 
@@ -534,7 +534,7 @@ def _refuse_options(name: str, options: Mapping[str, Any]) -> None:
 
 
 def _setting_text(value: Any) -> str:
-    """Return a setting as `Reference.of` reads it."""
+    """Return a setting as `Reference.parse` reads it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

@@ -157,7 +157,7 @@ def segments(graph: LaneGraph, types: Sequence[int]) -> tuple[F32, F32, I32, F32
             arc
         length at the first end, m.
     """
-    lane = np.repeat(np.arange(graph.lanes, dtype=np.int32), np.diff(graph.offset))
+    lane = np.repeat(np.arange(graph.lane_count, dtype=np.int32), np.diff(graph.offset))
     is_segment = (lane[:-1] == lane[1:]) & np.isin(graph.kind[lane[:-1]], np.asarray(types, np.uint8))
     index = np.flatnonzero(is_segment)
     endpoints = np.concatenate([graph.xy[index], graph.xy[index + 1]], axis=1)

@@ -159,7 +159,7 @@ def _beside(graph: LaneGraph, lane: int) -> list[int]:
     return [
         neighbour
         for neighbour in (int(graph.left[lane]), int(graph.right[lane]))
-        if neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING and graph.same_direction(lane, neighbour)
+        if neighbour >= 0 and graph.kind[neighbour] == LaneType.DRIVING and graph.is_same_direction(lane, neighbour)
     ]
 
 

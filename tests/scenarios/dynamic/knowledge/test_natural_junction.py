@@ -228,7 +228,7 @@ def test_speeds_are_those_of_the_parameters_and_of_the_road(crossroads: LaneGrap
     assert 8.7 < max(found) <= 9.0
     assert np.mean(found) == pytest.approx(6.0, abs=0.7)
     assert set(speeds(crossroads, 1, speed=6.0, speed_spread=0.0)) == {6.0}
-    slow = replace(crossroads, speed_limit=np.full(crossroads.lanes, 5.0, np.float32))
+    slow = replace(crossroads, speed_limit=np.full(crossroads.lane_count, 5.0, np.float32))
     assert set(speeds(slow, 1, speed=6.0, speed_spread=0.0)) == {5.0}
 
 

@@ -85,7 +85,7 @@ def test_king_finds_what_a_blind_driver_runs_into(bases: list[Base]) -> None:
     assert all(base.trace.end != "collision" for base in bases)
     rows = search(King(bases[1:], seeds=[2], budget=4), bases[1:], TRIALS, budget=4, batch=4)
     for row in rows:
-        found = [outcome for outcome in row if outcome.valid]
+        found = [outcome for outcome in row if outcome.is_valid]
         assert found
         assert found[0].trace is not None
         assert len(found[0].adversaries) == 1

@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources, SuiteBase, find_cell
-from ssad.engine.progress import Live
+from ssad.engine.progress import LiveProgress
 from ssad.experiments.perception.open_loop import CellDescription, OpenLoopKind, Sightings, TargetCondition
 from ssad.experiments.perception.physical import page
 from ssad.experiments.perception.physical.lit_images import LightableClips
@@ -121,7 +121,9 @@ class Physical(OpenLoopKind):
         specs = [TextureSpec.of_row(cell.spec) for cell in plan.cells if cell.spec["attack"]]
         surfaces = list(dict.fromkeys(spec.surface for spec in specs))
         if surfaces:
-            with Live("rendering what wears textures", 1, 0, console=resources.console, unit="parts") as progress:
+            with LiveProgress(
+                "rendering what wears textures", 1, 0, console=resources.console, unit="parts"
+            ) as progress:
                 see_all(
                     self.recordings(plan, folder),
                     plan.suite.target,

@@ -515,20 +515,20 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
     return entries
 
 
-def summary(found: Run) -> Table:
+def summary(stored_run: Run) -> Table:
     """Return the table for the terminal."""
-    return replace(main_table(PhysicalRun(found), 0), note="percent, of the target alone")
+    return replace(main_table(PhysicalRun(stored_run), 0), note="percent, of the target alone")
 
 
-def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+def section(stored_run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a physical run and its tables."""
-    run = PhysicalRun(found)
+    run = PhysicalRun(stored_run)
     main_tables = [main_table(run, number) for number in range(len(run.pairs))]
     margin_rows, others, effort = margin_table(run), others_table(run), effort_table(run)
     further_tables = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
     page = render(
         TEMPLATE,
-        found,
+        stored_run,
         verdict=verdict,
         main=main_tables,
         margins=margin_rows,
@@ -538,7 +538,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
         tiles=tiles(run),
         maps=maps(run),
         weathers=weather_maps(run),
-        pictures=pictures(found.folder),
+        pictures=pictures(stored_run.folder),
         failures=[
             (
                 line["test"],
@@ -548,7 +548,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
                 line["source"],
                 line.get("reason", ""),
             )
-            for line in found.failures
+            for line in stored_run.failures
         ],
     )
     return page, [*main_tables, margin_rows, *further_tables, others, effort]

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from ssad.core import safeio
 from ssad.core.detections import Truth
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
-from ssad.detectors import loaded_detector
+from ssad.detectors import cached_detector
 from ssad.engine.pool import open_pool, run_all
 from ssad.experiments.perception.physical.lit_images import LightableClips
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
@@ -65,7 +65,7 @@ class TargetAttacks:
 
     def detector(self, name: str) -> Detector:
         """Return a detector, loaded on first use."""
-        detector: Detector = loaded_detector(name, device=self.device)
+        detector: Detector = cached_detector(name, device=self.device)
         return detector
 
     def clips(self, recording: str, count: int, detector: str) -> LightableClips:
@@ -267,7 +267,7 @@ def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
         task: Folder of the recording, number of the part, target, `TextureSpec.surface` of each, device.
     """
     folder, part_number, target, surfaces, device = task
-    quiet_warp()
+    start_warp_quietly()
     see_clips(folder, layers_of(target, surfaces), part=part_number, device=device)
 
 

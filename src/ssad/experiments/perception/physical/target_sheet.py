@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ssad.core.detections import Truth
-from ssad.core.images import captioned
+from ssad.core.images import add_caption
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.detectors.drawing import FOUND, clear_detections
@@ -55,7 +55,7 @@ def target_sheet(
             text, text_position = f"{detector.classes[label]} {score:.2f}", (max(x0, 4), max(y0 - 6, 20))
             for colour, width in (((0, 0, 0), 5), (FOUND, 2)):
                 cv2.putText(crop, text, text_position, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
-        tiles.append(captioned(crop, title, WIDTH))
+        tiles.append(add_caption(crop, title, WIDTH))
     while len(tiles) % columns:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[start : start + columns], 1) for start in range(0, len(tiles), columns)]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.errors import RouteError
-from ssad.core.rotations import wrap
+from ssad.core.rotations import wrap_scalar
 from ssad.core.types import F64, LaneType, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._caching import remembered
 from ssad.scenarios.dynamic.knowledge._placing import (
@@ -122,7 +122,7 @@ def _search(  # noqa: PLR0917  a remembered function takes its arguments by posi
             if approach_lane in ego_lanes or abs(turn_of(graph, inside_lane)) > math.radians(35):
                 continue
             approach = pose_at(graph, LanePosition(approach_lane, float(graph.length[approach_lane])))
-            if abs(wrap(approach.yaw - heading - side)) > math.radians(40):
+            if abs(wrap_scalar(approach.yaw - heading - side)) > math.radians(40):
                 continue
             candidate = _meet(
                 graph,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.errors import RouteError
-from ssad.core.rotations import wrap
+from ssad.core.rotations import wrap_scalar
 from ssad.core.types import F64, Controller, EpisodeAgent, LaneType, Phase, PhaseTrigger, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._caching import remembered
 
@@ -35,7 +35,9 @@ class LanePosition:
 def shifted(pose: Pose, forward: float, left: float, turn: float = 0.0) -> Pose:
     """Move a pose in its own frame, then turn it."""
     cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
-    return Pose(pose.x + cosine * forward - sine * left, pose.y + sine * forward + cosine * left, wrap(pose.yaw + turn))
+    return Pose(
+        pose.x + cosine * forward - sine * left, pose.y + sine * forward + cosine * left, wrap_scalar(pose.yaw + turn)
+    )
 
 
 # ---------------------------------------------------------------- lanes
@@ -44,7 +46,7 @@ def shifted(pose: Pose, forward: float, left: float, turn: float = 0.0) -> Pose:
 def pose_at(graph: LaneGraph, place: LanePosition) -> Pose:
     """Return the pose on the centre line, heading along traffic; clamped to the lane's ends."""
     x, y, yaw, _ = graph.at(place.lane, place.s)
-    return Pose(x, y, wrap(yaw))
+    return Pose(x, y, wrap_scalar(yaw))
 
 
 def width_at(graph: LaneGraph, place: LanePosition) -> float:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.core.rotations import wrap
+from ssad.core.rotations import wrap_scalar
 from ssad.core.types import EpisodeAgent, LaneType, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
@@ -48,7 +48,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     blocker = Pose(
         origin.x + _BLOCKER * (walker.x - origin.x),
         origin.y + _BLOCKER * (walker.y - origin.y),
-        wrap(walker.yaw + math.pi),
+        wrap_scalar(walker.yaw + math.pi),
     )
     return [
         scripted("walker", "walker", walker, [go(values["walker_speed"], values["trigger_distance"])]),

@@ -128,7 +128,7 @@ class King:
                 is_hopeless = outcome.gap is None or outcome.gap > HOPELESS
                 if is_hopeless and chain.tried >= 2:
                     self._abandoned[base_index].add(chain.agent)
-                if outcome.trace is None or outcome.valid or chain.tried >= (2 if is_hopeless else PATIENCE):
+                if outcome.trace is None or outcome.is_valid or chain.tried >= (2 if is_hopeless else PATIENCE):
                     self._chains[base_index][chain_index] = self._new_chain(base_index)
                     continue
                 chain.ego = sampled(outcome.trace)[0]

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame, camera_to_world
+from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, StandingObject, SweepFrame, camera_to_world
 from ssad.core.rotations import quaternion_to_yaw, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8, Bool
@@ -220,7 +220,7 @@ def add_anomalies(
     frames: Sequence[Frame],
     specs: Sequence[ShiftSpec],
     contexts: Mapping[str, SceneContext] | None,
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply anomalies, in both calibrations."""
     pixels, records = batch.numpy().copy(), []
     for index, (frame, spec) in enumerate(zip(frames, specs, strict=True)):
@@ -239,7 +239,7 @@ def _objects_in_frame(
     return [standing_object for standing_object in objects if standing_object.level <= spec.severity]
 
 
-def _draw(image: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied:
+def _draw(image: U8, frame: Frame, objects: Sequence[StandingObject]) -> ShiftReport:
     """Draw objects into an image [H, W, 3], the farthest first, and record the visible ones."""
     camera_pose = camera_to_world(frame)
     canvas = _Canvas(image, frame)
@@ -260,7 +260,7 @@ def _draw(image: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied
             )
     coverage = canvas.finish(image)
     details = {"objects": records, "covered": coverage, "depth": "boxes" if frame.depth is None else "given"}
-    return Applied(bool(records), details)
+    return ShiftReport(bool(records), details)
 
 
 class _Canvas:
@@ -450,7 +450,7 @@ class _Canvas:
 
 def hit_by_rays(
     cloud: F32, frame: SweepFrame, spec: ShiftSpec, contexts: Mapping[str, SceneContext] | None
-) -> tuple[F32, Applied]:
+) -> tuple[F32, ShiftReport]:
     """Move the points [P, 5] behind an object to the hits of their rays.
 
     A ray without a return is not in the cloud, so an object before the sky gets no points.
@@ -477,7 +477,7 @@ def hit_by_rays(
     is_hit = hit_shares < 1.0
     cloud[is_hit, :3] *= hit_shares[is_hit, None].astype(np.float32)
     cloud[is_hit, 3] = intensities[is_hit]
-    return cloud, Applied(bool(is_hit.any()), {"moved": int(is_hit.sum())})
+    return cloud, ShiftReport(bool(is_hit.any()), {"moved": int(is_hit.sum())})
 
 
 @lru_cache(maxsize=64)

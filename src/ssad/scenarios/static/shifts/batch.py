@@ -12,7 +12,7 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Frame
-from ssad.core.machine import quiet_warp
+from ssad.core.machine import start_warp_quietly
 from ssad.core.types import U8
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
@@ -89,7 +89,7 @@ def to_batch(images: Any, device: str | None = None) -> Batch:
     """
     if isinstance(images, Batch):
         return images
-    quiet_warp()
+    start_warp_quietly()
     # Not imported: without torch loaded, no image can be a tensor, and shifts work without it.
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(images, torch.Tensor):

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
-from ssad.core.frames import Applied, Frame, camera_to_world
+from ssad.core.frames import Frame, ShiftReport, camera_to_world
 from ssad.core.nuscenes_names import VISIBILITY
 from ssad.core.rotations import quaternion_product, quaternion_to_matrix, yaw_to_quaternion
 from ssad.core.types import F64
@@ -171,7 +171,7 @@ def _pixels(corners: F64, intrinsic: F64) -> F64:
     )
 
 
-def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Applied:
+def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> ShiftReport:
     """Plan the boxes of one image, the farthest first."""
     boxes, intrinsic = frame.boxes, frame.camera.intrinsic
     width, height = frame.camera.width, frame.camera.height
@@ -231,7 +231,7 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
                 size=(width, height),
             )
     plan.first.append(len(plan.items))
-    return Applied(painted_count > 0, {"objects": painted_count}, dict(skipped))
+    return ShiftReport(painted_count > 0, {"objects": painted_count}, dict(skipped))
 
 
 def _streaks(
@@ -325,7 +325,7 @@ def _stamp(batch: Batch, plan: _Plan) -> tuple[Any, Any, Any, Any]:
     return items, points, offsets, owner_ranks
 
 
-def owners(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Any, list[Applied]]:
+def owners(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Any, list[ShiftReport]]:
     """Return the rank of the nearest box at each pixel, int16 [B, H, W], 0 for none; boxes of the paper."""
     plan = _Plan()
     records = [
@@ -337,7 +337,7 @@ def owners(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) ->
     return _stamp(batch, plan)[3], records
 
 
-def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
+def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Apply scale, shear or rotation, or the motion blur of the physical calibration."""
     plan = _Plan()
     records = [

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import FormatError
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame
+from ssad.core.frames import Camera, Frame, SceneContext, ShiftReport, StandingObject, SweepFrame
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import LIDAR, VISIBILITY
 from ssad.core.safeio import read_bytes
@@ -303,7 +303,7 @@ class SceneShifter:
 
     def images(
         self, frames: Sequence[SensorFrame], *, clean: Sequence[U8] | None = None, device: str | None = None
-    ) -> tuple[list[U8], list[Applied]]:
+    ) -> tuple[list[U8], list[ShiftReport]]:
         """Return the shifted images of camera frames of one size.
 
         Args:
@@ -328,7 +328,7 @@ class SceneShifter:
         shifted, reports = shift_images(np.stack(clean_images), views, specs, contexts=self._contexts, device=device)
         return list(shifted), reports
 
-    def image(self, frame: SensorFrame, *, clean: U8 | None = None) -> tuple[U8, Applied]:
+    def image(self, frame: SensorFrame, *, clean: U8 | None = None) -> tuple[U8, ShiftReport]:
         """Return one shifted image, and a report.
 
         Raises:
@@ -354,7 +354,7 @@ class SceneShifter:
         boxes = [boxes_of(self.scene.annotations(sample.token))[0] for sample in self.scene.samples]
         return place_objects(self.base, self.scene.record.token, poses.reshape(-1, 4, 4), boxes)
 
-    def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
+    def points(self, frame: SensorFrame) -> tuple[F32, ShiftReport]:
         """Return the shifted points [P, 5] of a LiDAR frame, and a report.
 
         Raises:

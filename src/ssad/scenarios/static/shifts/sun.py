@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Frame, SceneContext, ShiftReport, camera_to_world
 from ssad.core.types import F32, F64, U8
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, to_device
@@ -121,23 +121,23 @@ def visible_sun_share(frame: Frame, depth: F32 | None, direction: F64) -> float:
 
 def add_sun(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply sunlight: add glare and lower the exposure with it; nothing by night or with a hidden sun."""
     local_directions = np.zeros((batch.count, 3))
     sun_pixels = np.zeros((batch.count, 3))
     strength, gain = np.zeros(batch.count), np.ones(batch.count)
-    records: list[Applied] = []
+    records: list[ShiftReport] = []
 
     for index, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
         if context.light < NIGHT:
-            records.append(Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
+            records.append(ShiftReport(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
             continue
         direction = sun_direction(spec, context)
         local_directions[index] = camera_to_world(frame)[:3, :3].T @ direction
         angle = sun_angle(frame, direction)
         if angle > FACING:
             records.append(
-                Applied(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1})
+                ShiftReport(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1})
             )
             continue
         x, y = _sun_pixel(frame, direction)
@@ -150,13 +150,13 @@ def add_sun(
         details: dict[str, Any] = {"angle_deg": round(angle, 1), "in_view": in_image, "free": round(visible_share, 2)}
         details["direction"] = [round(float(coordinate), 6) for coordinate in direction]
         if not visible_share:
-            records.append(Applied(False, details, {HIDDEN: 1}))
+            records.append(ShiftReport(False, details, {HIDDEN: 1}))
             continue
         strength[index] = table.SUN_STRENGTH[spec.severity - 1] * visible_share
         # the camera adapts its exposure: the nearer the sun is to the image, the darker the rest
         outside = max(0.0, -x / batch.width, x / batch.width - 1, -y / batch.height, y / batch.height - 1)
         gain[index] = 1 - 0.06 * spec.severity * visible_share * max(0.0, 1 - 2 * outside)
-        records.append(Applied(True, details))
+        records.append(ShiftReport(True, details))
     rows, columns = grid_size(batch)
     glare = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
     rays = [

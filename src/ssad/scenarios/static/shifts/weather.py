@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Frame, SceneContext, ShiftReport, camera_to_world
 from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, structs, to_device
@@ -97,7 +97,7 @@ def _view_through_air(
 
 def add_fog(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply fog in linear light (Koschmieder 1924).
 
     image * exp(-beta * range) + airlight * (1 - exp(-beta * range))
@@ -117,7 +117,7 @@ def add_fog(
     ]
     batch.launch(veil.blend_air, (batch.count, batch.height), inputs, result.words())
     records = [
-        Applied(True, {"range_m": table.FOG_RANGE[spec.severity - 1], "depth": source})
+        ShiftReport(True, {"range_m": table.FOG_RANGE[spec.severity - 1], "depth": source})
         for spec, source in zip(specs, sources, strict=True)
     ]
     return result, records
@@ -183,7 +183,7 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
 
 def add_precipitation(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[Batch, list[Applied]]:
+) -> tuple[Batch, list[ShiftReport]]:
     """Apply rain or snow: a veil over the distance and streaks nearby; rain also wets the ground."""
     weathers, transmittance, depth, sources = _view_through_air(batch, frames, specs, contexts)
     if specs[0].name == "rain":
@@ -232,7 +232,9 @@ def add_precipitation(
         )
     rates = [(table.SNOW_RATE if spec.name == "snow" else table.RAIN_RATE)[spec.severity - 1] for spec in specs]
     records = [
-        Applied(True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _lens_drop_count(spec), "depth": source})
+        ShiftReport(
+            True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _lens_drop_count(spec), "depth": source}
+        )
         for rate, air, source, spec in zip(rates, air_rows, sources, specs, strict=True)
     ]
     return result, records
