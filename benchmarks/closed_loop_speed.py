@@ -93,7 +93,7 @@ def measured(name: str, *, device: str, seconds: float, warm: int, width: int, s
     episodes = [build_episode(scenarios[k % len(scenarios)], town, seed=k) for k in range(scenes)]
     onboard = Onboard(device=device, resident=True)
     world = World(episodes, {town.name: town}, device=device)
-    loop = Loop(world, {0: driver}, sensors=onboard.together(cameras), policies=make_system)
+    loop = Loop(world, {0: driver}, sensors=onboard.group_cameras(cameras), policies=make_system)
     loop.reset()
     watch = Stopwatch(torch.cuda.synchronize if cuda else lambda: None)
     watch.around("views", onboard, "view")

@@ -24,9 +24,9 @@ from ssad.core.safeio import write_atomic
 from ssad.core.types import F64, LaneType, Pose, Scenario, TrafficPlan
 from ssad.scenarios.dynamic.catalogue import PRECRASH
 from ssad.scenarios.dynamic.episode import build_episode
-from ssad.scenarios.dynamic.knowledge._caching import remembered
+from ssad.scenarios.dynamic.knowledge._caching import cached_by_identity
 from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap_scalar
-from ssad.scenarios.dynamic.knowledge.natural_junction import candidates
+from ssad.scenarios.dynamic.knowledge.natural_junction import spawn_candidates
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.scenarios.dynamic.yamlio import scenario_text
 from ssad.world.roads import load_town
@@ -235,14 +235,14 @@ def precrash(graph: LaneGraph, routes: int = 4, *, prefix: str = "", least: int 
     return result
 
 
-@remembered(16)
+@cached_by_identity(16)
 def junction_routes(graph: LaneGraph, routes: int) -> tuple[Stretch, ...]:
     """Routes through junctions, turns in rotation, on which traffic has room."""
     from ssad.world.roads import route_along
 
     def works(stretch: Stretch) -> bool:
         try:
-            found = candidates(graph, route_along(graph, stretch.points))
+            found = spawn_candidates(graph, route_along(graph, stretch.points))
         except RouteError:
             return False
         return len(found) >= 4

@@ -25,7 +25,7 @@ from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.lit_images import LightableClips, LitClip
 from ssad.experiments.perception.physical.target_views import drive_of
 from ssad.metrics.target_attacks import sightings, target_scores
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.photometry import per_lux
 from ssad.rendering.camera.render import render
@@ -94,7 +94,7 @@ def main() -> None:
     torch.set_num_threads(1)
     home = given.home / TOWN
     if not (home / "annotations").is_dir():
-        record_clips(
+        record_target_images(
             TargetRecording(home, ((TOWN, given.pictures),), (), target=TargetCar(), device=given.device), workers=0
         )
     detector = make_detector("yolov5n", device=given.device)

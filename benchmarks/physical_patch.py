@@ -29,7 +29,7 @@ from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.metrics.target_attacks import sightings, target_scores
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.texture import to_linear
 from ssad.rendering.target import TargetCar
@@ -106,7 +106,9 @@ ORDER = {name: number for number, name in enumerate(VARIANTS)}
 def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: str) -> TargetClips:
     """Pictures of a town, recorded if they are not there."""
     if not (home / town / "annotations").is_dir():
-        record_clips(TargetRecording(home / town, ((town, count),), (), target=TargetCar(), device=device), workers=0)
+        record_target_images(
+            TargetRecording(home / town, ((town, count),), (), target=TargetCar(), device=device), workers=0
+        )
     return TargetClips(home / town, count, classes, device)
 
 

@@ -20,7 +20,7 @@ from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_sheet import target_sheet
 from ssad.experiments.perception.physical.target_views import TargetClips
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.physical import albedo_of, control, make_carrier
@@ -44,7 +44,7 @@ def main() -> None:
     start_warp_quietly()
     detector, target = make_detector(DETECTOR), TargetCar()
     with tempfile.TemporaryDirectory() as folder:
-        record_clips(TargetRecording(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
+        record_target_images(TargetRecording(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
         clips = TargetClips(Path(folder), 1, tuple(detector.classes))
         ((_, clean, truth),) = clips.clean()
         shown = []

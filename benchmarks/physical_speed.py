@@ -26,7 +26,7 @@ import torch
 from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_views import TargetClips
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Situation, make_objective
@@ -85,7 +85,9 @@ def measure(count: int, device: str) -> dict[str, Any]:
     target = TargetCar()
     surface = Camouflage().on(target.mesh())
     with tempfile.TemporaryDirectory() as folder:
-        record_clips(TargetRecording(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0)
+        record_target_images(
+            TargetRecording(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0
+        )
         detector = make_detector("yolov5n", device=device)
         clips = TargetClips(Path(folder), count, tuple(detector.classes), device)
         views = [view for _, view in clips.wearing(surface)]

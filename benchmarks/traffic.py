@@ -35,7 +35,7 @@ from ssad.core.types import (
     Scenario,
     SignalState,
 )
-from ssad.scenarios.dynamic.knowledge.natural_junction import fits
+from ssad.scenarios.dynamic.knowledge.natural_junction import fits_route
 from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
 from ssad.world.roads import load_town, random_route
@@ -98,7 +98,7 @@ def traffic(graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: in
         if any(math.hypot(a.pose.x - x, a.pose.y - y) < APART for a in agents):
             continue
         body = str(draws.choice(list(BODIES), p=list(BODIES.values())))
-        body = body if fits(body, route) else "compact"
+        body = body if fits_route(body, route) else "compact"
         wish = float(draws.uniform(0.75, 1.05)) * float(route.speed_limit.max())
         start = 0.6 * min(wish, float(route.speed_limit[0]))
         pose = Pose(x, y, float(route.yaw[0]))

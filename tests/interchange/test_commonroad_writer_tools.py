@@ -67,7 +67,7 @@ def test_files_are_valid_and_collide_where_bodies_do(every: int, tmp_path: Path)
     for path, trace in driven(scenarios, tmp_path):
         assert schema.validate(etree.parse(path)), schema.error_log
         checker = create_collision_checker(opened(path))
-        boxes = criticality.boxes(trace)
+        boxes = criticality.trace_boxes(trace)
         gap = obb_distance(boxes[:, :1], boxes[:, 1:])
         gap = np.where(trace.active[:, 1:], gap, np.inf).min(1)
         for step, (x, y, yaw, length, width) in enumerate(boxes[:, 0].tolist()):
@@ -181,5 +181,5 @@ def test_time_to_collision_is_that_of_crime_behind_a_slower_car(tmp_path: Path) 
         theirs = measures.TTC(config).compute(other, step, verbose=False)
         assert theirs == pytest.approx(ours[step], abs=0.02), step
         headway = measures.HW(config).compute(other, step, verbose=False)
-        bodies = criticality.boxes(trace)[step]
+        bodies = criticality.trace_boxes(trace)[step]
         assert headway == pytest.approx(float(obb_distance(bodies[0], bodies[1])), abs=0.02)

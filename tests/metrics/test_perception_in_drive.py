@@ -20,8 +20,8 @@ from ssad.metrics.perception_in_drive import (
     hard_braking,
     impact_speed,
     in_view,
-    object_that_matters,
     phantom_stop,
+    relevant_agent,
     sign_metrics,
     track_metrics,
 )
@@ -180,10 +180,10 @@ def test_impact_speed_hard_braking_and_the_object_that_matters() -> None:
     accel[[3, 4, 9]] = -5.0
     accel[20] = -3.0
     assert hard_braking(make_trace(STEPS, accel=accel)) == 2
-    assert object_that_matters(trace) == 1
+    assert relevant_agent(trace) == 1
     bodies = ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0), (0.0, 9.0, 0.0, 0.0))
-    assert object_that_matters(make_trace(STEPS, bodies)) == 2
-    assert object_that_matters(make_trace(STEPS)) is None
+    assert relevant_agent(make_trace(STEPS, bodies)) == 2
+    assert relevant_agent(make_trace(STEPS)) is None
 
 
 def test_who_stands_before_nothing_stands_before_a_phantom() -> None:
@@ -241,8 +241,8 @@ def test_who_is_touched_matters_more_than_who_is_near() -> None:
     bodies = ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0), (5.0, 0.0, 0.0, 0.0))
     touched = np.full(STEPS, -1)
     touched[-3:] = 1
-    assert object_that_matters(make_trace(STEPS, bodies, contact_agent=touched)) == 1
-    assert object_that_matters(make_trace(STEPS, bodies)) == 2
+    assert relevant_agent(make_trace(STEPS, bodies, contact_agent=touched)) == 1
+    assert relevant_agent(make_trace(STEPS, bodies)) == 2
 
 
 def test_the_nearest_agent_is_that_whose_end_is_nearest() -> None:
@@ -250,11 +250,11 @@ def test_the_nearest_agent_is_that_whose_end_is_nearest() -> None:
     bodies = ((0.0, 0.0, 0.0, 0.0), (11.0, 0.0, 0.0, 0.0), (8.0, 0.0, 0.0, 0.0), (14.0, 0.0, 0.0, 0.0))
     trace = make_trace(STEPS, bodies)
     trace.length[:] = [4.5, 12.0, 4.5, 15.0]
-    assert object_that_matters(trace) == 1
+    assert relevant_agent(trace) == 1
     trace.active[:, 1] = False
-    assert object_that_matters(trace) == 2
+    assert relevant_agent(trace) == 2
     trace.active[:, 1:] = False
-    assert object_that_matters(trace) is None
+    assert relevant_agent(trace) is None
 
 
 def test_bands_of_distance_join_and_reach_as_far_as_objects_count() -> None:

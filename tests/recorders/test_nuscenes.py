@@ -31,8 +31,8 @@ from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.recorders.drives import MIX, drive_street, make_drive, thin_shares
-from ssad.recorders.nuscenes import AHEAD, Recording, drive, record_nuscenes
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.nuscenes import AHEAD, Recording, drive_with_autopilot, record_nuscenes
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.bodies import make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
@@ -150,7 +150,7 @@ def test_a_cast_has_every_class_and_nobody_stands_in_another() -> None:
     kinds: Counter[str] = Counter()
     for town in ("Larkhill", "Twinford"):
         graph, street = load_town(town), cached_street(town)
-        trace = drive(make_drive(graph, key=(3, town), seconds=6.0), graph)
+        trace = drive_with_autopilot(make_drive(graph, key=(3, town), seconds=6.0), graph)
         with plain_bodies():
             cast = place_objects(trace, graph, street, key=(5, town))
         kinds.update(body.kind for body in cast.bodies)
@@ -267,7 +267,7 @@ def test_long_vehicles_stand_at_the_kerb() -> None:
     found: Counter[str] = Counter()
     for number in range(4):
         graph = load_town("Twinford")
-        trace = drive(make_drive(graph, key=("long", number), seconds=1.0), graph)
+        trace = drive_with_autopilot(make_drive(graph, key=("long", number), seconds=1.0), graph)
         with plain_bodies():
             cast = place_objects(trace, graph, cached_street(graph), key=("long", number))
         parked = [body for body in cast.bodies if body.parked]
@@ -294,7 +294,7 @@ def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
         record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=0)
     assert "\n" not in str(error.value)
     with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
-        record_clips(TargetRecording(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
+        record_target_images(TargetRecording(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
     assert "\n" not in str(error.value)
     with np.load(town) as stored:
         arrays = dict(stored)

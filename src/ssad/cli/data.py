@@ -200,7 +200,7 @@ def record(
     unit = "parts" if clips is not None else "scenes"
     with LiveProgress("record", 1, 0, console=Console(stderr=True), unit=unit) as progress:
         if clips is not None:
-            from ssad.recorders.target_images import record_clips
+            from ssad.recorders.target_images import record_target_images
             from ssad.recorders.target_recording import TargetRecording, pair_images
             from ssad.rendering.target import parse_target
 
@@ -215,7 +215,7 @@ def record(
                 device=pick_device(device),
                 streets=streets,
             )
-            record_clips(target_recording, workers=workers, ray=ray, progress=progress.show)
+            record_target_images(target_recording, workers=workers, ray=ray, progress=progress.show)
             message = (
                 f"{out}: {sum(image_count for _, image_count in images_per_town)} images, "
                 f"annotations train.json, test.json and all.json"

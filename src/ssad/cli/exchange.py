@@ -86,7 +86,7 @@ def import_routes(
     if set_name in BUILT_IN_SETS:
         raise ConfigError(f"'{set_name}' is a built-in set; choose another name with --name")
     left_out: list[str] = []
-    scenarios = read(folder, left_out=left_out)
+    scenarios = read(folder, omissions=left_out)
     path = home_folder() / "scenarios" / f"{set_name}.yaml"
     save_scenarios(path, scenarios)
     towns = sorted({scenario.town for scenario in scenarios})
@@ -121,10 +121,10 @@ def import_drive(
     with NuScenes(root, version) as data:
         imported_drive = scenario_of_drive(data, scene, town=out.stem, map_name=on)
     town = imported_drive.scenario.town
-    if not imported_drive.known:
+    if not imported_drive.is_known_town:
         store_town(imported_drive.graph, town, beside=out)
     save_scenarios(out, imported_drive.scenario)
-    omissions = ", ".join(f"{count} {category}" for category, count in sorted(imported_drive.left_out.items()))
+    omissions = ", ".join(f"{count} {category}" for category, count in sorted(imported_drive.omissions.items()))
     print(
         f"scenario {imported_drive.scenario.name}: {len(imported_drive.scenario.actors)} actors in {town}"
         f"{f'; left out: {omissions}' if omissions else ''}; written to {out}"

@@ -18,7 +18,7 @@ from ssad.recorders.shifted.contact_sheet import parse_box, write_sheets
 from ssad.recorders.shifted.image_folder import picture_shifts, shift_pictures
 from ssad.recorders.shifted.manifest import PAGE, check_manifest, manifest_digest, read_manifest, verify
 from ssad.recorders.shifted.options import SUBSAMPLING, Options, Strength
-from ssad.recorders.shifted.write import materialise
+from ssad.recorders.shifted.write import write_shifted_roots
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
 
 
@@ -102,7 +102,7 @@ def shift_folder(
     options = Options(source, out, version, shift_names(shifts), severities(severity), scenes=scene_names, **settings)
     try:
         with LiveProgress("shift", 1, 0, console=Console(stderr=True), unit="scenes") as display:
-            roots = materialise(options, workers=workers, ray=ray, progress=display.show)
+            roots = write_shifted_roots(options, workers=workers, ray=ray, progress=display.show)
     except KeyboardInterrupt:
         print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
         return 130

@@ -98,10 +98,10 @@ class _Writer:
             self.lost.append(f"signals are forced only until {episode.override_until:g} s: here they stay")
         others = list(enumerate(episode.agents[1:], first_id))  # ids in the order of the agents
         for obstacle_id, agent in others:
-            if self._stands(agent):
+            if self._is_static(agent):
                 self._static(root, obstacle_id, agent)
         for obstacle_id, agent in others:
-            if not self._stands(agent):
+            if not self._is_static(agent):
                 self._dynamic(root, obstacle_id, agent)
         if len(episode.agents) > 1:
             self.lost.append("names of actors: obstacles have numbers")
@@ -111,7 +111,7 @@ class _Writer:
         return text, tuple(self.lost)
 
     @staticmethod
-    def _stands(agent: EpisodeAgent) -> bool:
+    def _is_static(agent: EpisodeAgent) -> bool:
         """Return whether an agent is a static obstacle: a parked vehicle or a prop."""
         return not agent.trajectory and model(agent.model).kind not in (AgentKind.WALKER, AgentKind.BICYCLE)
 
@@ -129,7 +129,7 @@ class _Writer:
         _state(add_element(obstacle, "initialState"), 0, agent.pose, 0.0)
 
     def _dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
-        first_step, rows = self._rows(agent)
+        first_step, rows = self._motion_rows(agent)
         if len(rows) < 2:
             self.lost.append(f"{agent.name}, who is there for less than two steps")
             return
@@ -149,7 +149,7 @@ class _Writer:
         for state in states[1:]:
             _state(add_element(trajectory, "state"), *state)
 
-    def _rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
+    def _motion_rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
         """Return the first step, and x, y, yaw [T, 3] at each step at which an agent exists."""
         if not agent.trajectory:
             return 0, np.tile([agent.pose.x, agent.pose.y, agent.pose.yaw], (self.steps + 1, 1))
@@ -181,9 +181,9 @@ class _Writer:
         add_element(centre, "x", goal_pose.x)
         add_element(centre, "y", goal_pose.y)
         _interval(add_element(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
-        self._check_way(ego, goal_pose)
+        self._check_route(ego, goal_pose)
 
-    def _check_way(self, ego: EpisodeAgent, end: Pose) -> None:
+    def _check_route(self, ego: EpisodeAgent, end: Pose) -> None:
         """Say what is lost where the shortest way to the goal is not the ego's route."""
         assert ego.route is not None
         try:

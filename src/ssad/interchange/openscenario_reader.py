@@ -2,7 +2,7 @@
 
 An event that changes a speed becomes a phase, its trigger the phase's condition; a trajectory with times becomes an
 actor's own; one without times, a route, or a lane change becomes its path. The ego is left to the system under test.
-Features without a counterpart are listed in `Imported.lost`.
+Features without a counterpart are listed in `ImportedScenario.omissions`.
 
 CARLA's ScenarioRunner writes world positions in CARLA's left-handed frame, which a description that begins with
 "CARLA:" indicates, and gives positions of bodies' centres (srunner/tools/openscenario_parser.py of ScenarioRunner).
@@ -24,11 +24,11 @@ from ssad.core.safeio import MIB, read_xml
 from ssad.core.types import Actor, EpisodeLimits, Phase, PhaseTrigger, Pose, Route, Scenario, SignalPlan, SignalState
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_entities import Entity, read_entities
-from ssad.interchange.openscenario_places import PositionReader, Values
-from ssad.interchange.openscenario_triggers import Triggers
+from ssad.interchange.openscenario_places import AttributeReader, PositionReader
+from ssad.interchange.openscenario_triggers import TriggerReader
 from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.knowledge._placing import lane_path, shifted
+from ssad.scenarios.dynamic.knowledge._placing import lane_path, move_pose
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.models import MODELS
 from ssad.world.roads import is_town, load_town, route_along, town_signals
@@ -43,19 +43,19 @@ _CHANGE = 25.0  # m, length of a lane change if the file gives no distance
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedScenario:
     """A scenario from another format.
 
     Attributes:
         scenario: The scenario.
-        lost: Features of the file that are not carried over, one line each.
+        omissions: Features of the file that are not carried over, one line each.
     """
 
     scenario: Scenario
-    lost: tuple[str, ...]
+    omissions: tuple[str, ...]
 
 
-def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
+def read_openscenario(path: Path, *, map_name: str | None = None) -> ImportedScenario:
     """Read the scenario of a file.
 
     Args:
@@ -75,7 +75,7 @@ def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
         logic = root.find("RoadNetwork/LogicFile")
         if logic is None or not logic.get("filepath"):
             raise FormatError(f"{path}: RoadNetwork: names no LogicFile; say which town it is with --map")
-        map_path = Values(str(path), root).text(logic, "filepath")
+        map_path = AttributeReader(str(path), root).text(logic, "filepath")
         town = Path(map_path.replace("\\", "/")).stem
         if not is_town(town):
             raise FormatError(
@@ -88,13 +88,13 @@ def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
 class _Reader:
     def __init__(self, location: str, root: Element, graph: LaneGraph, town: str) -> None:
         self.root, self.graph, self.town = root, graph, town
-        self.values = Values(location, root)
+        self.values = AttributeReader(location, root)
         self.lost: Counter[str] = Counter()
         header = root.find("FileHeader")
         if header is None:
-            raise self.values.fail("OpenSCENARIO", "FileHeader is missing")
+            raise self.values.error("OpenSCENARIO", "FileHeader is missing")
         if self.values.text(header, "revMajor") != "1":
-            raise self.values.fail(header, f"revision {header.get('revMajor')} is not read, only 1")
+            raise self.values.error(header, f"revision {header.get('revMajor')} is not read, only 1")
         self.about = self.values.text(header, "description", "")
         self.own = {
             property_element.get("name", "")[5:]: property_element.get("value", "")
@@ -110,18 +110,18 @@ class _Reader:
             position = action.find("AddEntityAction/Position")
             if position is not None:
                 starts.setdefault(action.get("entityRef", ""), position)
-        self.places = PositionReader(self.values, graph, mirrored=is_carla, lost=self.lost, starts=starts)
+        self.places = PositionReader(self.values, graph, mirrored=is_carla, omissions=self.lost, starts=starts)
         self.entities = read_entities(root, self.values, self.lost, centred=is_carla)
         for entity in self.entities.values():
             entity.placed = entity.name in starts
             if not entity.placed and not entity.ego:
                 self.lost[f"'{entity.name}': it has no position at the start"] += 1
-        self.triggers = Triggers(self.places, self.entities, self.lost)
+        self.triggers = TriggerReader(self.places, self.entities, self.lost)
         self.ego = self.triggers.ego
 
     # ------------------------------------------------------------ the document
 
-    def read(self, stem: str) -> Imported:
+    def read(self, stem: str) -> ImportedScenario:
         """Return the scenario, checked, and the features that are not carried over."""
         forced_signals = self._start()
         for maneuvers in self.root.iterfind("Storyboard/Story/Act/ManeuverGroup"):
@@ -150,13 +150,13 @@ class _Reader:
         )
         scenario = replace(scenario, actors=tuple(self._actors(limits)), signals=self._plan(ego_route, forced_signals))
         build_episode(scenario, self.graph, seed=0)  # reports any remaining error of the scenario
-        return Imported(
+        return ImportedScenario(
             scenario,
             tuple(f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in self.lost.items()),
         )
 
     def _centre(self, entity: Entity, pose: Pose) -> Pose:
-        return shifted(pose, *entity.centre) if any(entity.centre) else pose
+        return move_pose(pose, *entity.centre) if any(entity.centre) else pose
 
     # ------------------------------------------------------------ the start
 
@@ -169,7 +169,7 @@ class _Reader:
             if element is not None:
                 forced_signals[self.values.text(element, "name")] = self.values.text(element, "state")
             else:
-                self._lose("at the start", action)
+                self._record_omission("at the start", action)
         for agent_actions in self.root.iterfind("Storyboard/Init/Actions/Private"):
             entity = self.triggers.referenced_entity(agent_actions)
             for action in agent_actions:
@@ -181,7 +181,7 @@ class _Reader:
                 elif element.find("SpeedAction") is not None:
                     entity.speed = self._speed(entity, element)
                 elif element.tag != "TeleportAction":
-                    self._lose(f"at the start of '{entity.name}'", action)
+                    self._record_omission(f"at the start of '{entity.name}'", action)
         return forced_signals
 
     def _driver(self, entity: Entity, action: Element) -> None:
@@ -200,7 +200,7 @@ class _Reader:
         if action.find(".//CatalogReference") is not None:
             self.lost[f"controller of '{entity.name}' in a catalogue"] += 1
 
-    def _lose(self, context: str, action: Element) -> None:
+    def _record_omission(self, context: str, action: Element) -> None:
         """Name an action that has no counterpart: the innermost element whose name says what it does."""
         action_tags = [element.tag for element in action.iter() if element.tag.endswith("Action")]
         self.lost[f"{(action_tags or [action.tag])[-1]} {context}"] += 1
@@ -212,7 +212,7 @@ class _Reader:
         else:
             relative = action.find("SpeedAction/SpeedActionTarget/RelativeTargetSpeed")
             if relative is None:
-                raise self.values.fail("SpeedAction", "SpeedActionTarget is missing")
+                raise self.values.error("SpeedAction", "SpeedActionTarget is missing")
             other, value = self.triggers.referenced_entity(relative), self.values.number(relative, "value")
             is_delta = self.values.text(relative, "speedTargetValueType") == "delta"
             speed = other.speed + value if is_delta else other.speed * value
@@ -234,23 +234,23 @@ class _Reader:
         inner = action[0] if len(action) else action
         if inner.tag == "AcquirePositionAction":
             position = inner.find("Position")
-            if self.places.reads(position):
+            if self.places.is_supported(position):
                 entity.route = (self.places.pose(position, within=inner),)
                 return
         elif inner.tag == "AssignRouteAction" and inner.find("Route") is not None:
             points = [waypoint.find("Position") for waypoint in inner.iterfind("Route/Waypoint")]
-            if all(self.places.reads(point) for point in points):
+            if all(self.places.is_supported(point) for point in points):
                 entity.route = _with_headings(points, tuple(self.places.pose(point, within=inner) for point in points))
                 return
         elif inner.tag == "FollowTrajectoryAction" and not entity.ego:
             self._trajectory(entity, inner, begins)
             return
-        self._lose(f"of '{entity.name}'", action)
+        self._record_omission(f"of '{entity.name}'", action)
 
     def _trajectory(self, entity: Entity, action: Element, begins: float | None) -> None:
         vertices = action.findall(".//Shape/Polyline/Vertex")
         points = [vertex.find("Position") for vertex in vertices]
-        if len(vertices) < 2 or not all(self.places.reads(point) for point in points):
+        if len(vertices) < 2 or not all(self.places.is_supported(point) for point in points):
             self.lost[f"a trajectory of '{entity.name}' that is no polyline of places that are read"] += 1
             return
         read_poses = tuple(self.places.pose(point, within=action) for point in points)
@@ -290,10 +290,10 @@ class _Reader:
     def _global(self, action: Element, event: Element, label: str) -> None:
         entity_action = action.find("EntityAction")
         if entity_action is None:
-            self._lose(f"in event '{label}'", action)
+            self._record_omission(f"in event '{label}'", action)
             return
         entity = self.triggers.referenced_entity(entity_action)
-        condition = self._when(event, entity, label)
+        condition = self._start_condition(event, entity, label)
         if entity_action.find("AddEntityAction") is not None:
             if not entity.rows and (condition is None or condition.kind != "always"):
                 self.lost[f"'{entity.name}' is there from the start, not from event '{label}' on"] += 1
@@ -321,18 +321,18 @@ class _Reader:
             entity.phases = (*entity.phases, *waiting_phases, Phase(self._speed(entity, inner), final_condition))
             entity.event = label
         elif inner.tag == "RoutingAction":
-            condition = self._when(event, entity, label)
+            condition = self._start_condition(event, entity, label)
             start_times = {"always": 0.0, "time": condition.value if condition else 0.0}
             start_time = start_times.get(condition.kind) if condition else None
             if start_time is None and inner.find("FollowTrajectoryAction//Timing") is None:
                 self.lost[f"the trigger of event '{label}': '{entity.name}' keeps that path from the start"] += 1
             self._routing(entity, inner, start_time)
         elif inner.find("LaneChangeAction") is not None:
-            self._lane_change(entity, inner, self._when(event, entity, label), label)
+            self._lane_change(entity, inner, self._start_condition(event, entity, label), label)
         else:
-            self._lose(f"in event '{label}'", action)
+            self._record_omission(f"in event '{label}'", action)
 
-    def _when(self, event: Element, entity: Entity, label: str) -> PhaseTrigger | None:
+    def _start_condition(self, event: Element, entity: Entity, label: str) -> PhaseTrigger | None:
         """Return the single condition of a trigger; None also if it is a sequence."""
         conditions = self.triggers.conditions(event, entity, label)
         return conditions[0] if conditions is not None and len(conditions) == 1 else None
@@ -508,7 +508,7 @@ class _Reader:
             try:
                 end_time = float(self.own["signals_until"])
             except ValueError:
-                raise self.values.fail("Property", "ssad.signals_until is not a number") from None
+                raise self.values.error("Property", "ssad.signals_until is not a number") from None
         plan = plan_of(self.graph, line, forced_states, end_time)
         if plan is None:
             self.lost[f"the states of {len(forced_states)} signals, which no signal plan here gives"] += 1

@@ -19,11 +19,11 @@ _GREATER, _LESS = ("greaterThan", "greaterOrEqual"), ("lessThan", "lessOrEqual")
 _OUTER: Final = ("Condition", "ByEntityCondition", "ByValueCondition", "EntityCondition")
 
 
-class Triggers:
+class TriggerReader:
     """The triggers of a document; triggers without a counterpart are counted in `lost`."""
 
-    def __init__(self, places: PositionReader, entities: Mapping[str, Entity], lost: Counter[str]) -> None:
-        self.values, self.places, self.entities, self.lost = places.values, places, entities, lost
+    def __init__(self, places: PositionReader, entities: Mapping[str, Entity], omissions: Counter[str]) -> None:
+        self.values, self.places, self.entities, self.lost = places.values, places, entities, omissions
         self.ego = next(entity for entity in entities.values() if entity.ego)
         self._order = [
             name for name, candidate in entities.items() if not candidate.ego and candidate.placed
@@ -33,7 +33,7 @@ class Triggers:
         """Return the entity that an element refers to. FormatError if there is none of that name."""
         name = self.values.text(element, "entityRef")
         if name not in self.entities:
-            raise self.values.fail(element, f"there is no entity '{name}'")
+            raise self.values.error(element, f"there is no entity '{name}'")
         return self.entities[name]
 
     def conditions(self, event: Element, entity: Entity, label: str) -> tuple[PhaseTrigger, ...] | None:
@@ -55,7 +55,7 @@ class Triggers:
                 None,
             )
             if condition_type is None:
-                raise self.values.fail(condition, f"the condition of '{label}' is empty")
+                raise self.values.error(condition, f"the condition of '{label}' is empty")
             delay = max(self.values.number(condition, "delay", 0.0), 0.0)
             if condition_type.tag == "StoryboardElementStateCondition":
                 state = self.values.text(condition_type, "state")
@@ -122,7 +122,13 @@ class Triggers:
             condition_type.tag == "DistanceCondition" and rule in _LESS
         )
         position = condition_type.find("Position")
-        if is_reach and triggering == [self.ego] and entity.placed and not entity.ego and self.places.reads(position):
+        if (
+            is_reach
+            and triggering == [self.ego]
+            and entity.placed
+            and not entity.ego
+            and self.places.is_supported(position)
+        ):
             # a waiting actor stands still, so the place is a distance from it
             target, start = (
                 self.places.pose(position, within=condition_type),

@@ -160,7 +160,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
     infractions = counts | {"red_lights": int(trace.red_light.sum())}
     stop_sign_count = int(trace.stop_sign.sum()) if stop_signs else None
     return EpisodeMetrics(
-        collision=collided(trace),
+        collision=has_collision(trace),
         collision_events=int(events.sum()),
         off_road=off_road_metres,
         off_road_fraction=off_road_fraction,
@@ -183,7 +183,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
     )
 
 
-def collided(trace: EpisodeTrace) -> bool:
+def has_collision(trace: EpisodeTrace) -> bool:
     """Return whether the ego hit anything.
 
     SafeBench reads its last record, whose collision flag stays set once raised.
@@ -293,7 +293,7 @@ def driving_score(completion: float, infractions: Mapping[str, int], off_road_fr
     return 100.0 * completion * factor * (1.0 - off_road_fraction)
 
 
-def normalised(name: str, value: float) -> float:
+def normalise_metric(name: str, value: float) -> float:
     """Return a metric of `DIVISORS` scaled to [0, 1], 1 the worst."""
     return min(value / DIVISORS[name], 1.0)
 

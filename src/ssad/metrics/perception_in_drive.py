@@ -72,7 +72,7 @@ def _steps(trace: EpisodeTrace, records: Sequence[tuple[float, Any]]) -> list[in
     return [min(round(time / trace.dt), len(trace.x) - 1) for time, _ in records]
 
 
-def object_that_matters(trace: EpisodeTrace) -> int | None:
+def relevant_agent(trace: EpisodeTrace) -> int | None:
     """The agent that the ego touches first, or else the one that it comes nearest to; None: there is nobody else."""
     struck_agents = trace.contact_agent[trace.contact_agent > 0]
     if len(struck_agents):
@@ -103,7 +103,7 @@ def component_metrics(
         that are not there. believed: share of the steps with the object that matters in view in which it is believed
         where it is. switches: changes of its track. HOTA, MOTA and IDF1: see `track_metrics`.
     """
-    critical = object_that_matters(trace)
+    critical = relevant_agent(trace)
     critical_looks: list[tuple[float, bool, float]] = []  # distance, found, error of the distance
     hit_count, visible_count, phantom_count, look_count = 0, 0, 0, 0
     look_tables: list[tuple[F64, Bool, Objects | None]] = []
@@ -150,7 +150,7 @@ def component_metrics(
     metrics: dict[str, float | None] = {
         "AP": average_precision(look_tables),
         "recall": hit_count / visible_count if visible_count else None,
-        "missed_burst": _burst(missed_agents),
+        "missed_burst": _mean_miss_streak(missed_agents),
         "distance_share": float(np.sqrt(np.mean(np.concatenate(distance_errors) ** 2))) if distance_errors else None,
         "target_recall": _mean(rows[:, 1]),
         "distance_error": _mean(rows[np.isfinite(rows[:, 2]), 2]),
@@ -163,7 +163,7 @@ def component_metrics(
     return metrics | _belief_metrics(trace, perceived, critical) | track_metrics(trace, perceived)
 
 
-def _burst(missed_by_look: Sequence[Bool]) -> float | None:
+def _mean_miss_streak(missed_by_look: Sequence[Bool]) -> float | None:
     """Return the mean number of successive looks that miss an object; `missed_by_look` has [A] for each look."""
     missed_table = np.array(missed_by_look, bool)
     if not missed_table.any():

@@ -33,25 +33,25 @@ from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
 from ssad.engine.pool import open_pool, run_all
 from ssad.recorders.drives import drive_street, make_drive
-from ssad.recorders.nuscenes import draw_weather, drive
-from ssad.recorders.parts import TIME_LIMIT, same_request
+from ssad.recorders.nuscenes import draw_weather, drive_with_autopilot
+from ssad.recorders.parts import TIME_LIMIT, is_same_request
 from ssad.recorders.target_recording import BEHIND, FOCAL, SMALL, TargetRecording
 from ssad.recorders.viewpoints import (
     AIM,
     Place,
     Viewpoint,
-    follow,
-    free_sight,
+    following_viewpoints,
+    has_free_sight,
     has_room,
     near_share,
-    orbit,
-    orbit_sign,
-    turn_of,
+    orbiting_viewpoints,
+    shuffled_cells,
+    sign_viewpoints,
     weather_name,
 )
 from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES, PLAIN_CLASSES, class_of
-from ssad.rendering.camera.labels import label_picture
+from ssad.rendering.camera.labels import label_image
 from ssad.rendering.camera.lamps import NOSE, own_lamps
 from ssad.rendering.camera.render import Rendering, SceneWeather, View, render
 from ssad.rendering.camera.scene import RenderScene, SceneObject, TextureDecal, TextureLayer
@@ -82,7 +82,7 @@ MAX_NEAR_SHARE: Final = 0.2  # largest share of the picture that something right
 
 
 @dataclass(frozen=True, slots=True)
-class _StageSet:
+class _TargetDrive:
     """A drive to take images of.
 
     Attributes:
@@ -104,10 +104,10 @@ class _StageSet:
     places: tuple[Place, ...] = ()
 
 
-def _prepare(clips: TargetRecording, town: str, key: tuple[object, ...]) -> _StageSet:
+def _prepare(clips: TargetRecording, town: str, key: tuple[object, ...]) -> _TargetDrive:
     graph = load_town(town)
     street = drive_street(graph, clips.streets, key=("clips", *key))
-    trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
+    trace = drive_with_autopilot(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
     population = place_objects(trace, graph, street, key=key, many_signs=clips.streets == "any")
     places: tuple[Place, ...] = ()
     if isinstance(clips.target, TargetSign):
@@ -124,7 +124,7 @@ def _prepare(clips: TargetRecording, town: str, key: tuple[object, ...]) -> _Sta
         targets = tuple(
             _draw_target(population, generator("clips target", *key, index)) for index in range(target_count)
         )
-    return _StageSet(
+    return _TargetDrive(
         clips, key, trace, population, RenderScene(street, population.meshes, device=clips.device), targets, places
     )
 
@@ -166,8 +166,8 @@ def batch_size(device: str) -> int:
     return 1 if device == "cpu" else 32
 
 
-def _rounds(
-    stage_set: _StageSet, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
+def _viewpoint_rounds(
+    stage_set: _TargetDrive, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
 ) -> Iterator[list[tuple[int, Viewpoint]]]:
     """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
     recording, key = stage_set.clips, stage_set.key
@@ -175,7 +175,7 @@ def _rounds(
     if recording.mode == "drive":
         weather = draw_weather(("clips", *key))
         remaining = iter(
-            follow(
+            following_viewpoints(
                 stage_set.trace, weather, behind=recording.behind, height=recording.height, count=len(slots), rng=rng
             )
         )
@@ -185,7 +185,7 @@ def _rounds(
     if isinstance(recording.target, TargetSign) and not stage_set.places:
         return
     grid = list(product(recording.distances, recording.azimuths, recording.elevations, recording.weathers or ("",)))
-    cell_indices = turn_of(slots, len(grid), key=(recording.seed, town))
+    cell_indices = shuffled_cells(slots, len(grid), key=(recording.seed, town))
     if attempt >= 3:
         # Some cells have no free view in a town; random cells keep the recording from stalling.
         cell_indices = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
@@ -198,11 +198,11 @@ def _rounds(
             weather = draw_weather(("clips", *key, turn, index), weather_kind)
             if isinstance(recording.target, TargetSign):
                 seconds = (len(stage_set.trace.x) - 1) * stage_set.trace.dt
-                views = orbit_sign(stage_set.places, seconds, weather, (cell[0], cell[1]), rng)
+                views = sign_viewpoints(stage_set.places, seconds, weather, (cell[0], cell[1]), rng)
             else:
-                views = orbit(stage_set.trace, weather, (cell[0], cell[1], cell[2]), rng)
+                views = orbiting_viewpoints(stage_set.trace, weather, (cell[0], cell[1], cell[2]), rng)
             proposals += [(index, viewpoint) for viewpoint in islice(views, attempts)]
-        sight_free = free_sight(
+        sight_free = has_free_sight(
             stage_set.stage,
             [viewpoint for _, viewpoint in proposals],
             batch=batch_size(recording.device),
@@ -223,7 +223,7 @@ def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
     """
     recording, town, number, count, name = task
     parts = recording.parts
-    if parts.finished(name):
+    if parts.is_finished(name):
         return name
     parts.begin(name)
     start_warp_quietly()
@@ -237,7 +237,7 @@ def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
 
     for attempt in range(MAX_DRIVES):
         stage_set = _prepare(recording, town, (recording.seed, recording.mode, town, number, attempt))
-        for viewpoints in _rounds(stage_set, town, slots, attempt, missing):
+        for viewpoints in _viewpoint_rounds(stage_set, town, slots, attempt, missing):
             for image_index, row, image in _accept_views(stage_set, viewpoints, skipped):
                 file = f"{name}-{image_index:03d}.jpg"
                 safeio.write_atomic(recording.out / "images" / file, encode_jpeg(image, recording.quality, "420"))
@@ -264,7 +264,7 @@ def _part(task: tuple[TargetRecording, str, int, int, str]) -> str:
 
 
 def _accept_views(
-    stage_set: _StageSet, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
+    stage_set: _TargetDrive, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
 ) -> Iterator[tuple[int, dict[str, Any], U8]]:
     """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
     recording = stage_set.clips
@@ -311,7 +311,7 @@ def label_of(kind: str) -> int | None:
     return CLASSES.index(class_of(kind)) if kind in BODY_CATEGORIES else None
 
 
-def faces(sign: F64, viewer: F64) -> bool:
+def is_facing(sign: F64, viewer: F64) -> bool:
     """Return whether the front of a sign of pose [4, 4] can be read from a position [3]: not from behind or aside."""
     forward, left, _ = sign[:3, :3].T @ (viewer - sign[:3, 3])
     return bool(abs(np.degrees(np.arctan2(left, forward))) < BEHIND)
@@ -323,7 +323,7 @@ def _camera(size: int) -> Camera:
 
 
 def _view(
-    stage_set: _StageSet, n: int, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject], camera: Camera
+    stage_set: _TargetDrive, n: int, viewpoint: Viewpoint, nearby_objects: Sequence[PlacedObject], camera: Camera
 ) -> View:
     """View `n` of a part: the target first, then who else is there."""
     target = stage_set.targets[n % len(stage_set.targets)]
@@ -347,7 +347,7 @@ def _annotate(
     stage: RenderScene, view: View, picture: Rendering, index: int, nearby_objects: Sequence[PlacedObject]
 ) -> tuple[list[dict[str, Any]], str]:
     """Return the annotation of an image, and the reason why the image is of no use ("" if it is of use)."""
-    labels = label_picture(stage, view, picture, index)
+    labels = label_image(stage, view, picture, index)
     placed_by_tag = {placed.body.tag: placed for placed in nearby_objects}
     is_target = labels.tag == TARGET
     extents = labels.box[:, 2:] - labels.box[:, :2]
@@ -370,10 +370,10 @@ def _annotate(
         if label is not None:
             centre_height = placed_object.body.size[2] / 2
             if placed_object.body.kind in PLAIN_CLASSES:
-                is_crowd[row] |= not faces(placed_object.pose, view.pose[:3, 3])
+                is_crowd[row] |= not is_facing(placed_object.pose, view.pose[:3, 3])
                 centre_height = plate_height(placed_object.body)
             middle = placed_object.pose[:3, 3] + [0.0, 0.0, centre_height]
-            x1, y1, x2, y2 = _hull(view, placed_object.pose, placed_object.body.size).tolist()
+            x1, y1, x2, y2 = _image_rectangle(view, placed_object.pose, placed_object.body.size).tolist()
             objects.append(
                 {
                     "label": label,
@@ -389,7 +389,7 @@ def _annotate(
     return objects, ""
 
 
-def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
+def _image_rectangle(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
     """Return x1, y1, x2, y2 (px) around the whole 3D box of a body, visible or not."""
     # The pose of a body is that of the middle of its base.
     corners = (UNIT_CORNERS + np.array([0.0, 0.0, 0.5])) * size
@@ -399,8 +399,8 @@ def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
     return np.asarray(np.round(box, 2))
 
 
-def record_clips(
-    clips: TargetRecording,
+def record_target_images(
+    recording: TargetRecording,
     *,
     workers: int | None = None,
     ray: str | None = None,
@@ -411,7 +411,7 @@ def record_clips(
     Each file's `info` says what was recorded, how many objects there are of each class, and how many pictures were
     taken elsewhere instead, and why. StoreError, ConfigError.
     """
-    return record_all([clips], workers=workers, ray=ray, progress=progress)[0]
+    return record_all([recording], workers=workers, ray=ray, progress=progress)[0]
 
 
 def record_all(
@@ -421,18 +421,18 @@ def record_all(
     ray: str | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Path]:
-    """Record several recordings, as `record_clips` does, with all their parts side by side.
+    """Record several recordings, as `record_target_images` does, with all their parts side by side.
 
     Returns:
         Their folders.
 
     Raises:
-        StoreError: See `record_clips`.
-        ConfigError: See `record_clips`.
+        StoreError: See `record_target_images`.
+        ConfigError: See `record_target_images`.
     """
     tasks: list[list[tuple[TargetRecording, str, int, int, str]]] = []
     for recording in recordings:
-        _check_other(recording)
+        _check_same_recording(recording)
         tasks.append(
             [
                 (recording, town, number, min(EACH, count - start), f"{recording.mode}-{town.lower()}-{number:03d}")
@@ -443,7 +443,7 @@ def record_all(
     all_tasks = [task for recording_tasks in tasks for task in recording_tasks]
     with ExitStack() as locks:
         for recording in recordings:
-            locks.enter_context(recording.parts.held("ssad record"))
+            locks.enter_context(recording.parts.lock("ssad record"))
             safeio.remove_unfinished(recording.out / "images")
         pool = open_pool(len(all_tasks), workers=workers, ray=ray, device=recordings[0].device)
         run_all(pool, _part, all_tasks, timeout_s=TIME_LIMIT, progress=progress)
@@ -452,13 +452,13 @@ def record_all(
     return [recording.out for recording in recordings]
 
 
-def _check_other(clips: TargetRecording) -> None:
+def _check_same_recording(clips: TargetRecording) -> None:
     """StoreError: the folder holds another recording."""
     annotations_file = clips.out / "annotations" / "all.json"
-    if annotations_file.is_file() and not clips.parts.claimed:
+    if annotations_file.is_file() and not clips.parts.is_claimed:
         data = safeio.read_json(annotations_file)
         info = data.get("info") if isinstance(data, dict) else None
-        if not isinstance(info, dict) or not same_request(info.get("recording"), clips.identity()):
+        if not isinstance(info, dict) or not is_same_request(info.get("recording"), clips.identity()):
             raise StoreError(f"{clips.out}: holds another recording; choose another folder")
 
 
@@ -491,7 +491,7 @@ def _write_pages(clips: TargetRecording, tasks: Sequence[tuple[TargetRecording, 
 
 
 @dataclass(frozen=True, slots=True)
-class ClipView:
+class RecordedView:
     """A recorded picture and what it shows, ready to be rendered again.
 
     Attributes:
@@ -509,7 +509,7 @@ class ClipView:
     view: View
     objects: tuple[Mapping[str, Any], ...]
 
-    def wearing(self, *edits: TextureLayer | TextureDecal) -> View:
+    def with_layers(self, *edits: TextureLayer | TextureDecal) -> View:
         """The view with layers on the target, and with decals, given in the target's frame, around it."""
         target, *other_objects = self.view.objects
         layers = tuple(layer for layer in edits if isinstance(layer, TextureLayer))
@@ -523,7 +523,7 @@ class ClipView:
 Row = Mapping[str, Any]
 
 
-def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ...]]]:
+def image_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ...]]]:
     """Return the images of a recording in order, each with its annotations.
 
     Args:
@@ -557,7 +557,7 @@ def recording_of(folder: Path, split: str = "all") -> dict[str, Any]:
         raise _unknown(path, error) from None
 
 
-def clip_views(
+def recorded_views(
     folder: Path,
     *,
     split: str = "all",
@@ -565,13 +565,13 @@ def clip_views(
     selected_keys: Collection[str] | None = None,
     hour: Callable[[SceneWeather, float], SceneWeather] = lambda weather, heading: weather,
     stages: dict[Any, Any] | None = None,
-) -> Iterator[ClipView]:
+) -> Iterator[RecordedView]:
     """The pictures of a recording with their scenes, in order.
 
     Rendering a view gives the recorded picture (before JPEG) again. Pictures of one drive share a scene.
 
     Args:
-        folder: What `record_clips` wrote.
+        folder: What `record_target_images` wrote.
         split: train, test or all.
         device: Where to render.
         selected_keys: Names of the files that are wanted; None for all.
@@ -582,10 +582,10 @@ def clip_views(
         FormatError: No recording of this version.
     """
     path = folder / "annotations" / f"{split}.json"
-    rows = clip_rows(folder, split)
+    rows = image_rows(folder, split)
     try:
-        recording = _clips_of(recording_of(folder, split), folder, device)
-        prepared_drives: dict[tuple[object, ...], _StageSet] = {} if stages is None else stages
+        recording = _recording_from_description(recording_of(folder, split), folder, device)
+        prepared_drives: dict[tuple[object, ...], _TargetDrive] = {} if stages is None else stages
         for row, objects in rows:
             if selected_keys is not None and row["file_name"] not in selected_keys:
                 continue
@@ -604,7 +604,7 @@ def clip_views(
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
             surrounding = stage_set.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
             view = _view(stage_set, row["slot"], viewpoint, surrounding, _camera(recording.size))
-            yield ClipView(row["file_name"], row, stage_set.stage, view, objects)
+            yield RecordedView(row["file_name"], row, stage_set.stage, view, objects)
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
 
@@ -614,7 +614,7 @@ def _unknown(path: Path, error: Exception) -> FormatError:
     return FormatError(f"{path}: not the clips of this version {error_text}; record them again")
 
 
-def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> TargetRecording:
+def _recording_from_description(about: Mapping[str, Any], folder: Path, device: str) -> TargetRecording:
     """The recording that `TargetRecording.identity` describes."""
     settings: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in about.items() if name != "clips"

@@ -16,7 +16,7 @@ from ssad.rendering.episode_scene import agent_poses
 from ssad.rendering.onboard import DAY, Onboard
 
 
-def above(pose: F64, height: float, width: int, image_height: int) -> tuple[Camera, F64]:
+def make_overhead_camera(pose: F64, height: float, width: int, image_height: int) -> tuple[Camera, F64]:
     """A camera over a place, looking straight down, the driving direction up."""
     focal = 1.2 * image_height
     camera = Camera(width, image_height, np.array([[focal, 0, width / 2], [0, focal, image_height / 2], [0, 0, 1]]))
@@ -51,7 +51,7 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
     rows = []
     for step, front_image in zip(steps, front_images, strict=True):
         pose = upright_pose(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
-        overhead_camera, overhead_pose = above(pose, 42.0, camera_model.width, camera_model.height)
+        overhead_camera, overhead_pose = make_overhead_camera(pose, 42.0, camera_model.width, camera_model.height)
         scene_objects = (
             *town.objects(appearance, all_moments[step]),
             *town.lights(appearance, all_moments[step], pose[:2, 3]),

@@ -108,7 +108,7 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         self.loop.step(controls)
         state = world.state()
         if self._hindsight is not None:
-            self._hindsight.note(state)
+            self._hindsight.record(state)
         reward = np.zeros(self.num_envs)
         rewards: F64 = self._reward(state, agents, before_step)
         reward[active_scenes] = self._scale * rewards
@@ -148,7 +148,7 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
         assert self._hindsight is not None
         avoidable = hit_ego(state, agents)
         if avoidable.any():
-            avoidable[avoidable] = self._hindsight.avoided(state, agents[avoidable])
+            avoidable[avoidable] = self._hindsight.is_avoidable(state, agents[avoidable])
         return feasible(state, agents, previous_cost, avoidable, off_road=off_road)
 
     def _draw(self, count: int) -> I32:

@@ -32,7 +32,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, config=VALUES)
-class Learning:
+class PolicyRecipe:
     """Settings of a policy training: all that decides the result but the scenarios.
 
     Attributes:
@@ -85,15 +85,15 @@ class Learning:
     seed: FromNone = 0
 
 
-LEARNINGS: dict[str, Learning] = {
-    "ppo": Learning("ppo", 1_000_000),
-    "sac": Learning("sac", 256_000, batch=256, lr=7e-4, validate=64_000),
-    "td3": Learning("td3", 320_000, batch=128, lr=3e-4, gamma=0.97, validate=64_000, noise=0.15),
+POLICY_RECIPES: dict[str, PolicyRecipe] = {
+    "ppo": PolicyRecipe("ppo", 1_000_000),
+    "sac": PolicyRecipe("sac", 256_000, batch=256, lr=7e-4, validate=64_000),
+    "td3": PolicyRecipe("td3", 320_000, batch=128, lr=3e-4, gamma=0.97, validate=64_000, noise=0.15),
 }
 """How drivers are trained."""
 
 
-def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str, Any]) -> Learning:
+def find_policy_recipe(table: Mapping[str, PolicyRecipe], name: str, changes: Mapping[str, Any]) -> PolicyRecipe:
     """Return a recipe of a table by name, with changed values.
 
     Raises:
@@ -103,11 +103,11 @@ def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str
     if name not in table:
         raise unknown_name("algorithm", name, table)
     return build_validated(
-        partial(replace, table[name]), changes, subject=f"training {name}", kind=Learning, name_field="algorithm"
+        partial(replace, table[name]), changes, subject=f"training {name}", kind=PolicyRecipe, name_field="algorithm"
     )
 
 
-def require() -> Any:
+def import_sb3() -> Any:
     """Import stable-baselines3. ConfigError if it is not installed."""
     try:
         import stable_baselines3
@@ -116,7 +116,7 @@ def require() -> Any:
     return stable_baselines3
 
 
-def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
+def make_model(learning: PolicyRecipe, env: Any, *, device: str = "cpu") -> Any:
     """Make a new stable-baselines3 model on a `VecEnv`.
 
     Args:
@@ -124,7 +124,7 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
         env: The vector environment.
         device: Device of the networks.
     """
-    sb3 = require()
+    sb3 = import_sb3()
     initial_rate, final_rate = learning.lr, learning.lr / 20.0
 
     def rate_schedule(left: float) -> float:
@@ -176,7 +176,7 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
     return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **off_policy_options, **common_options)
 
 
-def begin_with(model: Any, learning: Learning, folder: Path) -> str:
+def load_start_networks(model: Any, learning: PolicyRecipe, folder: Path) -> str:
     """Load the networks of the last checkpoint of an earlier training into a new model.
 
     Args:
@@ -205,7 +205,7 @@ def begin_with(model: Any, learning: Learning, folder: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()
 
 
-def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def export(model: Any, learning: PolicyRecipe) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Export the policy of a model: its tensors in the format of `ssad.world.policy`, and its config.
 
     Returns:
@@ -224,15 +224,15 @@ def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dic
     return tensors_of(layers), policy_config
 
 
-def policy_now(model: Any, learning: Learning) -> Policy:
+def current_policy(model: Any, learning: PolicyRecipe) -> Policy:
     """Return the current policy of a model."""
     tensors, policy_config = export(model, learning)
     return policy_of(WeightsCard("", "", learning.seed, (), config=policy_config), tensors, "training")
 
 
-def learn(
+def train_policy(
     model: Any,
-    learning: Learning,
+    learning: PolicyRecipe,
     out: Path,
     *,
     validate: Callable[[Policy], dict[str, float]] | None = None,
@@ -263,14 +263,16 @@ def learn(
         FormatError: last.pt is of another recipe, of other scenarios, or broken.
         StoreError: A file cannot be written.
     """
-    require()
+    import_sb3()
     key = safeio.dump_json({"learning": asdict(learning), "about": about})
     state = _read_last(out / LAST_CHECKPOINT, key)
     if state is not None:
         _restore(model, state, out / LAST_CHECKPOINT)
     if model.num_timesteps >= learning.steps and state is not None:
         return state
-    callback = _keeper(model, learning, out, key=key, state=state, validate=validate, say=report, seconds=seconds)
+    callback = _checkpoint_callback(
+        model, learning, out, key=key, state=state, validate=validate, say=report, seconds=seconds
+    )
     try:
         model.learn(learning.steps - model.num_timesteps, callback=callback, reset_num_timesteps=False)
     except ValueError as error:  # torch's distributions reject NaN
@@ -282,7 +284,7 @@ def learn(
     return final_state
 
 
-def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
+def _checkpoint_callback(model: Any, learning: PolicyRecipe, out: Path, **options: Any) -> Any:
     """Return the callback that validates and writes checkpoints; its base class is imported late."""
     from stable_baselines3.common.callbacks import BaseCallback
 
@@ -329,7 +331,8 @@ def _keeper(model: Any, learning: Learning, out: Path, **options: Any) -> Any:
                 row["return"] = round(float(np.mean(recent_returns)) / learning.reward_scale, 3)
             if options["validate"] is not None:
                 row |= {
-                    name: round(value, 5) for name, value in options["validate"](policy_now(model, learning)).items()
+                    name: round(value, 5)
+                    for name, value in options["validate"](current_policy(model, learning)).items()
                 }
             best_row = self.state["best_row"]
             if self.state["best"] is None or row.get("score", 0.0) >= best_row.get("score", 0.0):
@@ -442,7 +445,7 @@ def draw_curves(out: Path) -> None:
 
 def finish(
     path: Path,
-    learning: Learning,
+    learning: PolicyRecipe,
     model: Any,
     *,
     state: Mapping[str, Any],

@@ -73,8 +73,8 @@ def check(belief: Belief, batch: int, signals: int, scenes: Bool) -> None:
                 raise ConfigError(f"belief: {name} must lie between -1 and {limit - 1}")
 
 
-def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of `Seen` [B, K, ...] for a validated belief.
+def complete_belief(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of `PerceivedAgents` [B, K, ...] for a validated belief.
 
     Args:
         belief: The belief [B, K].

@@ -13,7 +13,7 @@ from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
-from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
+from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, PhaseCondition, Roads, TurnRank, array_types
 from ssad.world.kernels.shared import BRIDGE
 from ssad.world.roads.query import CELL, DRIVABLE, grid_of
 
@@ -329,7 +329,11 @@ def _put_agent(  # noqa: PLR0917
     a["track"][e, i] = track
     a["phase_count"][e, i] = len(agent.phases)
     for phase_index, phase in enumerate(agent.phases):
-        a["phase_when"][e, i, phase_index] = When[phase.when.kind.upper()], phase.when.value, phase.when.actor + 1
+        a["phase_when"][e, i, phase_index] = (
+            PhaseCondition[phase.when.kind.upper()],
+            phase.when.value,
+            phase.when.actor + 1,
+        )
         a["phase_speed"][e, i, phase_index] = phase.speed
 
 

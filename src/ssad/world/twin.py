@@ -166,8 +166,8 @@ def box_gap(first: Tensor, second: Tensor) -> Tensor:
     """
     first, second = _broadcast(first, second)
     first_corners, second_corners = _corners(first), _corners(second)
-    outside_one, depth_one = _beside(_to_local(first, second_corners), 0.5 * first[..., None, 3:5])
-    outside_two, depth_two = _beside(_to_local(second, first_corners), 0.5 * second[..., None, 3:5])
+    outside_one, depth_one = _signed_distance_from_box(_to_local(first, second_corners), 0.5 * first[..., None, 3:5])
+    outside_two, depth_two = _signed_distance_from_box(_to_local(second, first_corners), 0.5 * second[..., None, 3:5])
     depth = torch.maximum(depth_one, depth_two)
     return torch.where(depth > 0.0, torch.minimum(outside_one, outside_two), depth)
 
@@ -353,7 +353,7 @@ def _to_local(boxes: Tensor, points: Tensor) -> Tensor:
     return rotate(points - boxes[..., None, :2], -boxes[..., 2:3])
 
 
-def _beside(points: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+def _signed_distance_from_box(points: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
     """Return how far points [..., n, 2] are from a box of half extents [..., 1, 2] at the origin.
 
     Returns:

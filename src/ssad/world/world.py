@@ -17,24 +17,24 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.machine import start_warp_quietly
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
-from ssad.world.belief import Lanes, check, complete, lanes_of, rest_times
+from ssad.world.belief import Lanes, check, complete_belief, lanes_of, rest_times
 from ssad.world.episode_arrays import build
-from ssad.world.kernels.belief import see
-from ssad.world.kernels.data import BLOCK, HORIZON, Ego, Presence, Seen, State, Work, array_types
+from ssad.world.kernels.belief import fill_all_rows
+from ssad.world.kernels.data import BLOCK, HORIZON, Ego, PerceivedAgents, Presence, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
-from ssad.world.kernels.noise import calm, chance
+from ssad.world.kernels.noise import advance_noise, reset_noise
 from ssad.world.kernels.overtake import change_lanes
 from ssad.world.kernels.record import contact, record, restart, restart_record
-from ssad.world.kernels.traffic import meet, sight
+from ssad.world.kernels.traffic import react_to_agents, scan_all_agents
 from ssad.world.models import MODELS
 from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
 
 VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
-_STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
-# The remaining arrays of `Seen` have one row per object, so a growing belief resizes them.
-_OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `Seen` that have no rows of objects
+_STATE, _SEEN, _EGO = array_types(State), array_types(PerceivedAgents), array_types(Ego)
+# The remaining arrays of `PerceivedAgents` have one row per object, so a growing belief resizes them.
+_OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `PerceivedAgents` that have no rows of objects
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class World:
         shape = (self.batch, self.agents, HORIZON)
         for name, array_type in _STATE.items():
             setattr(self.arrays, name, wp.zeros(shape[: array_type.ndim], dtype=array_type.dtype, device=device))
-        self.seen = Seen()
+        self.seen = PerceivedAgents()
         self._lanes: dict[str, Lanes] = {}
         self.ego = Ego()
         for name, array_type in _EGO.items():
@@ -157,7 +157,7 @@ class World:
             noise_reset = []
             if self.chance is not None:
                 noise_inputs = [state, self.noise, self._mask, ended_too, self.agents, self.chance.stretches]
-                noise_reset = [self.launch(calm, self.batch, noise_inputs)]
+                noise_reset = [self.launch(reset_noise, self.batch, noise_inputs)]
             return [
                 *noise_reset,
                 self.launch(
@@ -169,17 +169,21 @@ class World:
             ]
 
         self._restart = restarts(0)
-        self._see = self.launch(see, launch_shape, [bank, roads, state, perceived, self.agents, agent_threads, dt])
+        self._see = self.launch(
+            fill_all_rows, launch_shape, [bank, roads, state, perceived, self.agents, agent_threads, dt]
+        )
         self._plan = [
             *(restarts(1) if autoreset else []),
             self._see,
             self.launch(
-                sight,
+                scan_all_agents,
                 launch_shape,
                 [bank, roads, state, perceived, self.work, self.agents, row_count, agent_threads, dt],
             ),
             self.launch(
-                meet, pair_threads, [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt]
+                react_to_agents,
+                pair_threads,
+                [bank, roads, state, perceived, self.work, self.agents, row_count, pair_threads, dt],
             ),
             self.launch(
                 change_lanes,
@@ -192,7 +196,7 @@ class World:
         ]
         if self.chance is not None:
             noise_inputs = [bank, roads, state, self.chance.rule(dt), self.noise, self.agents, agent_threads]
-            self._plan.append(self.launch(chance, launch_shape, noise_inputs))
+            self._plan.append(self.launch(advance_noise, launch_shape, noise_inputs))
         self._advance = [
             self.launch(
                 move,
@@ -216,7 +220,7 @@ class World:
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """Record a launch, so that its arguments are packed only once."""
         # `meet` is faster in blocks of 256, the default; `sight` is in the same module, which is compiled for one size
-        block_size = None if self.device == "cpu" or kernel in (sight, meet) else BLOCK
+        block_size = None if self.device == "cpu" or kernel in (scan_all_agents, react_to_agents) else BLOCK
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_size, record_cmd=True)
 
     def _assign(self, order: npt.NDArray[np.int32]) -> None:
@@ -473,7 +477,7 @@ class World:
             current_signals = self.array("seen.light")
             check(belief, self.batch, current_signals.shape[1], scene_mask)
             towns = [self.episodes[index].town for index in self.array("episode")]
-            belief_arrays = complete(belief, lanes_of(self.graphs, towns, self._lanes), scene_mask)
+            belief_arrays = complete_belief(belief, lanes_of(self.graphs, towns, self._lanes), scene_mask)
             step = self.array("step")
             if belief.standing_time is None:
                 previous = {

@@ -17,7 +17,7 @@ from ssad.core.seeding import generator
 from ssad.rendering.bodies import make_body
 from ssad.rendering.camera.lamps import SceneLamp, lamp_strength, lit_circle, nearby_lights, own_lamps
 from ssad.rendering.camera.render import PLAIN, RenderQuality, SceneWeather, View, render, scene_light
-from ssad.rendering.camera.scene import RenderScene, SceneObject, collect
+from ssad.rendering.camera.scene import RenderScene, SceneObject, collect_objects
 from ssad.rendering.camera.texture import retexture, texture_taps
 from ssad.rendering.meshes import mesh as meshes
 from ssad.rendering.meshes.mesh import Material, build
@@ -200,7 +200,7 @@ def test_the_surface_explains_the_picture(scene: RenderScene) -> None:
 
 def lit_lamps(scene: RenderScene, view: View) -> Any:
     """The lamps of a view as the kernels get them."""
-    near = nearby_lights(scene, [view], collect([view.objects]))
+    near = nearby_lights(scene, [view], collect_objects([view.objects]))
     return near.lamps.numpy()[: len(set(near.lamp_list.numpy()))] if near.lamp_start.numpy()[-1] else []
 
 

@@ -20,7 +20,7 @@ from ssad.core.types import Controller, EpisodeLimits
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
 from ssad.experiments.perception.physical.lit_images import LightableClips
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering import onboard
 from ssad.rendering.episode_scene import EpisodeScene
@@ -158,7 +158,7 @@ def targets(shared: Shared) -> dict[str, Path]:
             parsed = parse_target(target)
             mode = "drive" if isinstance(parsed, TargetCar) else "orbit"
             folder = out / target.replace(":", "-")
-            record_clips(
+            record_target_images(
                 TargetRecording(
                     folder, (("Twinford", 1),), (), size=320, behind=8.0, target=parsed, mode=mode, distances=(6.0,)
                 ),

@@ -16,7 +16,7 @@ from ssad.core import safeio
 from ssad.core.generators import Outcome
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, AgentKind, EpisodeTrace
-from ssad.metrics.realism import motion_features, pooled, realism, wasserstein
+from ssad.metrics.realism import motion_features, pool_motions, realism, wasserstein
 from ssad.world.roads.edge import edge_distances
 from ssad.world.roads.query import LaneQuery
 
@@ -100,8 +100,14 @@ def motions(trace: EpisodeTrace, graph: LaneGraph, agents: Sequence[int]) -> lis
 
 def realism_scores(row: Sequence[Outcome], graph: LaneGraph, reference_motions: Mapping[str, F64]) -> dict[str, float]:
     """Realism score and distances of the adversaries that have collided with the ego; NaN if none has."""
-    collided = [outcome for outcome in row if outcome.is_valid and outcome.trace is not None]
-    features = pooled([motion for outcome in collided for motion in motions(outcome.trace, graph, outcome.adversaries)])  # type: ignore[arg-type]
+    features = pool_motions(
+        [
+            motion
+            for outcome in row
+            if outcome.is_valid and outcome.trace is not None
+            for motion in motions(outcome.trace, graph, outcome.adversaries)
+        ]
+    )
     feature_distances = wasserstein(features, reference_motions)
     return {
         "realism": realism(features, reference_motions),
@@ -130,4 +136,4 @@ def _natural_motions(device: str) -> dict[str, F64]:
     features = []
     for base in trials.bases([(scenario, load_town(scenario.town), 0) for scenario in selected]):
         features += motions(base.trace, base.graph, range(1, len(base.trace.names)))
-    return pooled(features)
+    return pool_motions(features)

@@ -10,7 +10,7 @@ from itertools import product
 
 from ssad.experiments.driving.episodes import DrivingRun
 from ssad.metrics import FAMILIES, METRICS, Estimate
-from ssad.metrics.driving import DIVISORS, normalised
+from ssad.metrics.driving import DIVISORS, normalise_metric
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS, SOURCE
 from ssad.report.tables import METHODS, Table, TableCell, TableRow
 
@@ -150,7 +150,7 @@ def normalised_table(run: DrivingRun) -> Table:
 def _normalise(name: str, estimate: Estimate) -> Estimate:
     """Return a raw metric over its divisor, cut at 1."""
     scaled_values = (
-        value if math.isnan(value) else normalised(name, value)
+        value if math.isnan(value) else normalise_metric(name, value)
         for value in (estimate.mean, estimate.low, estimate.high)
     )
     mean, lower, upper = scaled_values

@@ -489,7 +489,7 @@ def _cycle_extent(style: str, height: float, swing: float, spread: float) -> tup
     return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
 
 
-def _dress(appearance: PersonAppearance, style: str, share: float) -> PersonAppearance:
+def _dress_for_style(appearance: PersonAppearance, style: str, share: float) -> PersonAppearance:
     """The clothes that belong to a style; `share` in [0, 1) is drawn for the person."""
     if style == "elderly":
         shade = 0.30 + 0.35 * share
@@ -537,7 +537,7 @@ def pedestrian(
     length, width, height = size
     look = draw_appearance(generator)
     random_phase, variation = float(generator.uniform(0.0, 2.0 * np.pi)), float(generator.random())
-    look = _dress(look, style, variation)
+    look = _dress_for_style(look, style, variation)
     is_child, is_still = style == "child", style == "standing" or (style == "worker" and length < 0.32 * height)
     swing = float(np.arcsin(np.clip((length - 0.16 * height) / height, 0.06, 0.16 if is_still else 0.6)))
     spread = float(np.arcsin(np.clip((0.5 * width - 0.145 * height) / (0.27 * height), 0.03, 0.5)))

@@ -187,7 +187,7 @@ def charts(shell: Shell, size: Point) -> list[Chart]:
     return panel_charts
 
 
-def skin(shell: Shell, size: Point, *, detail: int) -> Mesh:
+def shell_mesh(shell: Shell, size: Point, *, detail: int) -> Mesh:
     """Return the shell as one closed mesh with materials and panels; wheel arches are open at detail 1 and 2."""
     t = stations(shell, size, detail=detail)
     point_indices = POINTS[detail]

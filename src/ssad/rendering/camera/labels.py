@@ -51,7 +51,7 @@ class Labels:
         return len(self.tag)
 
 
-def label_picture(stage: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2) -> Labels:
+def label_image(stage: RenderScene, view: View, rendering: Rendering, index: int = 0, *, scale: int = 2) -> Labels:
     """Labels of a picture. Things with tags below 1 get none; things that share a tag count as one.
 
     Args:
@@ -65,7 +65,7 @@ def label_picture(stage: RenderScene, view: View, rendering: Rendering, index: i
         ConfigError: The picture shows another view.
     """
     tags, boxes, pixels = extents(_tags(view, rendering, index))
-    unoccluded, inside = _amodal(stage, view, tags, scale=scale)
+    unoccluded, inside = _unoccluded_areas(stage, view, tags, scale=scale)
     shares = np.clip(pixels / np.maximum(unoccluded, 1e-9), 0.0, 1.0)
     return Labels(tags, boxes, pixels, shares, inside)
 
@@ -76,16 +76,16 @@ def visible_share(
     """Visible share (0 to 1) of each thing of a view, by its tag (1 and above); 0 for what is not seen.
 
     Args:
-        stage: See `label_picture`.
-        view: See `label_picture`.
-        rendering: See `label_picture`.
-        index: See `label_picture`.
-        scale: See `label_picture`.
+        stage: See `label_image`.
+        view: See `label_image`.
+        rendering: See `label_image`.
+        index: See `label_image`.
+        scale: See `label_image`.
 
     Raises:
         ConfigError: The picture shows another view.
     """
-    labels = label_picture(stage, view, rendering, index, scale=scale)
+    labels = label_image(stage, view, rendering, index, scale=scale)
     shares = dict.fromkeys(sorted({entry.tag for entry in view.objects if entry.tag > 0}), 0.0)
     return shares | dict(zip(labels.tag.tolist(), labels.share.tolist(), strict=True))
 
@@ -156,7 +156,7 @@ def _projected(stage: RenderScene, view: View, objects: Sequence[SceneObject], i
     return np.concatenate([lower, upper], 1)
 
 
-def _amodal(stage: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
+def _unoccluded_areas(stage: RenderScene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
     """Return the unoccluded pixels of each tag in the image [N], and the share of its area inside the image [N]."""
     if not len(tags):
         return np.zeros(0), np.zeros(0)

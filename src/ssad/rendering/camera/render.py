@@ -32,7 +32,7 @@ from ssad.rendering.camera.scene import (
     SceneObject,
     TextureDecal,
     TextureLayer,
-    collect,
+    collect_objects,
 )
 from ssad.rendering.camera.sensor import (
     BRIGHTEST,
@@ -253,7 +253,7 @@ class _VisibilityPass:
     ) -> None:
         device = stage.device
         face_count = int(draws.counts.sum())
-        draw_table = shade.Drawn()
+        draw_table = shade.DrawRanges()
         starts = wp.array(np.concatenate([[0], np.cumsum(draws.counts)]).astype(np.int32), dtype=int, device=device)
         firsts = wp.array(draws.firsts, dtype=int, device=device)
         draw_table.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
@@ -343,10 +343,10 @@ def render(
         lights.append(view_light)
         exposures.append(exposure)
     poses = np.array([entry.pose for entry in views], np.float64)
-    bodies = collect([entry.objects for entry in views])
+    bodies = collect_objects([entry.objects for entry in views])
     # Beyond six extinction lengths fog hides everything.
     far_limits = np.array([min(FAR, 6.0 / entry.weather.fog) if entry.weather.fog > 0 else FAR for entry in views])
-    draws = stage.gather(
+    draws = stage.gather_draw_calls(
         np.asarray(np.linalg.inv(poses), np.float64),
         bodies,
         eyes=poses[:, :3, 3],
@@ -475,7 +475,7 @@ def _sun_map(  # noqa: PLR0917
     intrinsics = np.tile(np.array([1 / texel, 1 / texel, image_centre, image_centre], np.float32), (len(middles), 1))
     # Far enough for everything that can cast a shadow into the map; small street objects only near its middle.
     far_limit = 1.4 * reach + 11.0
-    draws = stage.gather(
+    draws = stage.gather_draw_calls(
         to_light,
         bodies,
         eyes=middles,
@@ -544,8 +544,8 @@ def _near(stage: RenderScene, views: Sequence[View], bodies: ObjectTable, qualit
         near_light.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
         return near_light
     poses = np.array([lamp.pose for _, lamp in shadow_lamps], np.float64)
-    bodies_of_lamps = collect([view.objects for view, _ in shadow_lamps])
-    draws = stage.gather(
+    bodies_of_lamps = collect_objects([view.objects for view, _ in shadow_lamps])
+    draws = stage.gather_draw_calls(
         np.asarray(np.linalg.inv(poses), np.float64),
         bodies_of_lamps,
         eyes=poses[:, :3, 3],

@@ -177,7 +177,7 @@ class ObjectTable:
     hidden: Bool
 
 
-def collect(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectTable:
+def collect_objects(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectTable:
     """The things of B views in arrays.
 
     Args:
@@ -277,7 +277,7 @@ class RenderScene:
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
             setattr(self.geometry, name, getattr(self, name))
 
-    def cached(self, key: Any, make: Callable[[], Any]) -> Any:
+    def compute_once(self, key: Any, make: Callable[[], Any]) -> Any:
         """Return a value that is computed once for this scene, under a key."""
         if key not in self._cache:
             self._cache[key] = make()
@@ -301,7 +301,7 @@ class RenderScene:
             found[name] = (weight @ middles / max(total, 1e-12), total)
         return found
 
-    def standing(self, mesh: int) -> tuple[F64, F64, float, float]:
+    def ground_cover(self, mesh: int) -> tuple[F64, F64, float, float]:
         """Return the ground that a mesh covers.
 
         The faces that look down from at most half its height determine the covered share of the bounding rectangle,
@@ -314,7 +314,7 @@ class RenderScene:
             Middle [2]; half length and half width of the covered area [2]; height of its underside; and height of
             its top, all in the object frame, m.
         """
-        return self.cached(("standing", mesh), lambda: _standing(self.meshes[mesh]))  # type: ignore[no-any-return]
+        return self.compute_once(("standing", mesh), lambda: _ground_cover(self.meshes[mesh]))  # type: ignore[no-any-return]
 
     def tiles(
         self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
@@ -360,7 +360,7 @@ class RenderScene:
             view_index[has_faces].astype(np.int32),
         )
 
-    def gather(
+    def gather_draw_calls(
         self,
         inverses: F64,
         bodies: ObjectTable,
@@ -437,8 +437,8 @@ def surface(material: Material) -> tuple[Any, ...]:
     )
 
 
-def _standing(body: Mesh) -> tuple[F64, F64, float, float]:
-    """See `RenderScene.standing`."""
+def _ground_cover(body: Mesh) -> tuple[F64, F64, float, float]:
+    """See `RenderScene.ground_cover`."""
     lower, upper = body.bounds()
     corners = body.corners()
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -17,7 +17,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import names, resolve
 from ssad.core.types import AgentKind, Bool, Controller, Episode, EpisodeTrace, Scenario
 from ssad.scenarios.dynamic.episode import build_episode
-from ssad.scenarios.dynamic.frozen import frozen
+from ssad.scenarios.dynamic.frozen import freeze_episode
 from ssad.scenarios.dynamic.outcome import measure
 
 _SEARCH = "ssad.scenarios.dynamic.search"
@@ -272,6 +272,6 @@ def scenario_of(outcome: Outcome, base: Base, *, name: str) -> Scenario:
         raise ConfigError(f"{name}: a proposal that failed is no scenario: {outcome.failure}")
     episode = build_episode(outcome.proposal.scenario, base.graph, seed=base.episode.seed)
     if outcome.proposal.drivers or episode.scenario.traffic is not None:
-        return frozen(episode, outcome.trace, name=name)
+        return freeze_episode(episode, outcome.trace, name=name)
     source = f"{base.scenario.name}, seed {base.episode.seed}"
     return replace(outcome.proposal.scenario, name=name, source=source)

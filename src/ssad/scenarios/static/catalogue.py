@@ -123,7 +123,7 @@ class PerturbationEntry(Schema):
         return self.model_copy(update={"name": str(folder / path)})
 
     @model_serializer
-    def _as_written(self) -> str | dict[str, Any]:
+    def _shortest_form(self) -> str | dict[str, Any]:
         """Return the shortest form that `parse_perturbation` reads."""
         fields = {**self.settings, **({"label": self.label} if self.label else {})}
         if self.severities is not None:
@@ -145,16 +145,16 @@ class ShiftEntry(PerturbationEntry):
     @property
     def has_severities(self) -> bool:
         """True, but for a class without an argument `severity`."""
-        return not is_own(self.name) or _takes_severity("shift", self.name)
+        return not is_user_defined(self.name) or _takes_severity("shift", self.name)
 
     def make(self, severity: int) -> Perturbation:
         """Return the shift at a severity."""
-        from ssad.scenarios.static.shifts.perturbation import OwnShift, Shift
+        from ssad.scenarios.static.shifts.perturbation import Shift, UserShift
 
-        if not is_own(self.name):
+        if not is_user_defined(self.name):
             _refuse_options(self.name, self.options)
             return Shift(self.name, severity, label=self.label)
-        return OwnShift(self.title, _make_object("shift", self.name, self.options, severity, ("shift",)), severity)
+        return UserShift(self.title, _make_object("shift", self.name, self.options, severity, ("shift",)), severity)
 
 
 class DigitalEntry(PerturbationEntry):
@@ -248,19 +248,19 @@ class FaultEntry(PerturbationEntry):
     @property
     def has_severities(self) -> bool:
         """True, but for a class without an argument `severity`."""
-        return not is_own(self.name) or _takes_severity("fault", self.name)
+        return not is_user_defined(self.name) or _takes_severity("fault", self.name)
 
     def make(self, severity: int) -> Perturbation:
         """Return the fault at a severity."""
         from ssad.scenarios.static.faults.perturbation import Fault
 
-        if not is_own(self.name):
+        if not is_user_defined(self.name):
             _refuse_options(self.name, self.options)
             return Fault.of_camera(self.name, severity, label=self.label)
         return Fault(self.title, lambda: _make_object("fault", self.name, self.options, severity, ()), severity)
 
 
-class OwnEntry(PerturbationEntry):
+class UserEntry(PerturbationEntry):
     """Object of the user's own that derives from `Perturbation`, of any family."""
 
     family: Literal["own"]
@@ -291,7 +291,7 @@ def _parse(value: Any) -> Any:
 
 Entry = Annotated[
     Annotated[
-        ShiftEntry | DigitalEntry | TextureEntry | LightEntry | FaultEntry | OwnEntry, Field(discriminator="family")
+        ShiftEntry | DigitalEntry | TextureEntry | LightEntry | FaultEntry | UserEntry, Field(discriminator="family")
     ],
     BeforeValidator(_parse),
 ]
@@ -489,7 +489,7 @@ def _family_of_object(name: str) -> str:
     )
 
 
-def is_own(name: str) -> bool:
+def is_user_defined(name: str) -> bool:
     """Return True for an object of a package or of the user: not a name that SSAD registers."""
     from ssad.scenarios.static.faults.camera import FAULTS
     from ssad.scenarios.static.shifts.spec import KNOWN

@@ -143,7 +143,7 @@ def _candidates(graph: LaneGraph, k: int, point: Pose | tuple[float, float], *, 
     if inner:
         used_lanes = {spot.lane for spot in spots}
         for spot in spots[:2]:
-            for neighbour in _beside(graph, spot.lane):
+            for neighbour in _adjacent_lanes(graph, spot.lane):
                 if neighbour not in used_lanes:
                     used_lanes.add(neighbour)
                     spots.append(
@@ -152,7 +152,7 @@ def _candidates(graph: LaneGraph, k: int, point: Pose | tuple[float, float], *, 
     return spots
 
 
-def _beside(graph: LaneGraph, lane: int) -> list[int]:
+def _adjacent_lanes(graph: LaneGraph, lane: int) -> list[int]:
     """Return the driving lanes for a lane change: neighbours of the same direction, outside junctions."""
     if graph.junction[lane] >= 0:
         return []
@@ -232,7 +232,7 @@ def _search(graph: LaneGraph, starts: list[tuple[float, _Spot]], goal: _Spot) ->
         lane_end = float(graph.length[lane])
         for successor in _successors(graph, lane):
             push(lane_end - s, successor, 0.0, _Leg(((lane, s, lane_end),)))
-        for neighbour in _beside(graph, lane):
+        for neighbour in _adjacent_lanes(graph, lane):
             parts = _ahead(graph, neighbour, _level_position(graph, lane, s, neighbour), CHANGE)
             available = 0.0
             for part_index, (target, part_start, part_end) in enumerate(parts):

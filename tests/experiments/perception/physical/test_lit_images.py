@@ -13,7 +13,7 @@ from helpers.bodies import plain_bodies
 from ssad.core.errors import UnknownNameError
 from ssad.core.images import read_image
 from ssad.experiments.perception.physical.lit_images import LitClip, at_hour, lit_clips
-from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.render import SceneWeather
 from ssad.rendering.hours import HOURS
@@ -25,7 +25,7 @@ from ssad.scenarios.static.physical.lights.light import value_tensors
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, LitClip]]]:
     out = tmp_path_factory.mktemp("lit") / "clips"
     with plain_bodies():
-        record_clips(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+        record_target_images(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
         yield out, {hour: next(lit_clips(out, hour)) for hour in ("recorded", "low_sun", "night")}
 
 

@@ -19,7 +19,7 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
 from ssad.experiments.perception.physical.textured_images import KEPT, Wearing, textured_clips
 from ssad.recorders.nuscenes import SENSOR
-from ssad.recorders.target_images import TARGET, clip_views, record_clips
+from ssad.recorders.target_images import TARGET, record_target_images, recorded_views
 from ssad.recorders.target_recording import TargetRecording
 from ssad.recorders.viewpoints import look_at
 from ssad.rendering.camera.render import Rendering, render
@@ -45,7 +45,7 @@ def others_are_boxes() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("textured") / "clips"
-    record_clips(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+    record_target_images(TargetRecording(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
     return out
 
 
@@ -57,8 +57,8 @@ def colours() -> dict[int, torch.Tensor]:
 def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
     """In the whole part that changes; elsewhere the recorded picture stands."""
     textures = colours()
-    for clip, seen in zip(textured_clips(folder, LAYERS), clip_views(folder), strict=True):
-        picture = render(seen.scene, [seen.wearing(*LAYERS)])
+    for clip, seen in zip(textured_clips(folder, LAYERS), recorded_views(folder), strict=True):
+        picture = render(seen.scene, [seen.with_layers(*LAYERS)])
         radiance = torch.tensor(picture.radiance)
         for number, size in SIZES.items():
             radiance = retexture(texture_taps(picture, size, texture=number), textures[number], radiance)
@@ -78,13 +78,13 @@ def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
 def same_metal(tmp_path_factory: pytest.TempPathFactory) -> list[Rendering]:
     """A named car in each of two towns, from the same places: behind its right, and before its left from above."""
     out = tmp_path_factory.mktemp("towns") / "clips"
-    record_clips(
+    record_target_images(
         TargetRecording(out, (("Twinford", 1), ("Oldmarket", 1)), (), size=160, behind=8.0, target=CAR), workers=0
     )
     eyes = (np.array([-6.0, -2.5, 1.8]), np.array([5.0, 3.5, 3.0]))
     found = []
-    for seen in clip_views(out):
-        worn = seen.wearing(TextureLayer(0))
+    for seen in recorded_views(out):
+        worn = seen.with_layers(TextureLayer(0))
         at = worn.objects[0].pose
         own = [replace(worn, pose=at @ look_at(eye, np.array([0.0, 0.0, 0.7])), focus=None) for eye in eyes]
         found.append(render(seen.scene, own))
@@ -143,7 +143,7 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
         assert not selected_keys, "rendered again"
         yield from ()
 
-    monkeypatch.setattr(module, "clip_views", rendered)
+    monkeypatch.setattr(module, "recorded_views", rendered)
     for a, b in zip(first, textured_clips(folder, LAYERS), strict=True):
         assert a.file == b.file
         assert np.array_equal(a.radiance, b.radiance)
@@ -223,7 +223,7 @@ def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path
     ready = clip.prepare({0: surface.size})
     black, white = (ready.show({0: torch.full((3, *surface.size), value)}) for value in (0.05, 0.9))
     brighter = ((white - black).amax(1)[0] > 0.1).numpy()
-    (seen,) = clip_views(folder)
+    (seen,) = recorded_views(folder)
     picture = render(seen.scene, [seen.view])
     assert (picture.tag[0][brighter] == 0).mean() > 0.9, "on the street"
     x, y, w, h = next(o["bbox"] for o in seen.objects if o["target"])
@@ -231,7 +231,7 @@ def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path
     assert brighter.sum() > 0.1 * w * h
     assert rows.mean() > y + h - 2, "nearer than the car"
     assert x < columns.mean() < x + w
-    anew = render(seen.scene, [seen.wearing(surface.layer)])
+    anew = render(seen.scene, [seen.with_layers(surface.layer)])
     radiance = retexture(
         texture_taps(anew, surface.size), torch.full((3, *surface.size), 0.9), torch.tensor(anew.radiance)
     )

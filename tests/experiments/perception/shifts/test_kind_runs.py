@@ -41,7 +41,7 @@ from ssad.metrics.detection import match
 from ssad.report.load import load_run
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import SHIFTS as KNOWN
-from ssad.scenarios.static.shifts import ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import ShiftSpec, deal_severities
 
 ORACLE = "helpers.oracle3d:build"
 
@@ -111,11 +111,11 @@ def test_random_is_put_together_from_the_severities(folder: Path, root: Path) ->
     record = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
     drawn = {Path(p).name for p in record["artefacts"]["detections"]}
     tokens = [s["token"] for s in json.loads((root / "v1.0-mini" / "scene.json").read_text())]
-    assert drawn == {f"fog-{severity}" for severity in dealt_severities(ShiftSpec("fog"), tokens).values()}
+    assert drawn == {f"fog-{severity}" for severity in deal_severities(ShiftSpec("fog"), tokens).values()}
     assert len(drawn) == len(tokens)
     boxes = {Path(p).name: {f.stem for f in (folder / p).glob("*.npz")} for p in record["artefacts"]["detections"]}
     with NuScenes(root) as data:
-        dealt = dealt_severities(ShiftSpec("fog"), tokens)
+        dealt = deal_severities(ShiftSpec("fog"), tokens)
         assert all(scene.name in boxes[f"fog-{dealt[scene.token]}"] for scene in data.scenes())
 
 

@@ -13,7 +13,7 @@ from ssad.drivers import make_system
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials
 from ssad.scenarios.dynamic.transition import cat as cat_module
-from ssad.scenarios.dynamic.transition.cat import Cat, traffic
+from ssad.scenarios.dynamic.transition.cat import Cat, traffic_motions
 from ssad.world.roads import load_town
 from ssad.world.roads.query import LaneQuery
 
@@ -28,7 +28,7 @@ def base() -> Base:
 def untouched(base: Base) -> Cat:
     patch = pytest.MonkeyPatch()
     patch.setattr(cat_module, "EPISODES", 4)
-    traffic.cache_clear()
+    traffic_motions.cache_clear()
     made = Cat([base], seeds=[1], budget=8)
     patch.undo()
     return made
@@ -43,7 +43,7 @@ def cat(untouched: Cat) -> Cat:
 
 
 def test_recorded_motions_start_at_the_origin_and_can_be_driven(cat: Cat) -> None:
-    motions, speeds = traffic()
+    motions, speeds = traffic_motions()
     assert len(motions) == len(speeds) > 50
     assert np.abs(motions[:, 0]).max() < 1e-9
     assert motions[:, 4, 0].min() > -0.5  # nobody drives backwards

@@ -17,7 +17,7 @@ from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.experiments.perception.physical.target_views import TargetClips, drive_of, target_truth
 from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturedClip, seen_part
-from ssad.recorders.target_images import TARGET, ClipView, clip_rows, clip_views
+from ssad.recorders.target_images import TARGET, RecordedView, image_rows, recorded_views
 from ssad.rendering.camera.render import SceneWeather, render
 from ssad.rendering.camera.scene import RenderScene
 from ssad.rendering.camera.scene_edit import NO_EDIT, SceneEdit, render_with
@@ -38,7 +38,7 @@ class LitClip:
         cards: Index of `BLIND` in the scene.
     """
 
-    clip: ClipView
+    clip: RecordedView
     scene: RenderScene
     cards: int
 
@@ -53,7 +53,7 @@ class LitClip:
         scene, first_card = self.scene, self.cards + 1
         if edit.cards:
             key = ("cards", *((card.away, card.outline.tobytes()) for card in edit.cards))
-            scene = self.scene.cached(
+            scene = self.scene.compute_once(
                 key,
                 lambda: RenderScene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device),
             )
@@ -85,7 +85,7 @@ class LitClip:
         return render_lit_image(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
 
 
-def _part(clip: ClipView) -> tuple[slice, slice]:
+def _part(clip: RecordedView) -> tuple[slice, slice]:
     """The rows and columns around the target that light on it can change: its box, and half as much to each side."""
     (x, y, box_width, box_height) = next(annotation["bbox"] for annotation in clip.objects if annotation["target"])
     height, width = clip.view.camera.height, clip.view.camera.width
@@ -109,12 +109,12 @@ def lit_clips(
     """The pictures of a recording at an hour, in order.
 
     Args:
-        folder: What `record_clips` wrote.
+        folder: What `record_target_images` wrote.
         hour: See `HOURS`.
         device: Where to render.
         count: How many; None for all.
         split: train, test or all.
-        stages: See `clip_views`.
+        stages: See `recorded_views`.
 
     Raises:
         FormatError: No recording of this version.
@@ -122,9 +122,9 @@ def lit_clips(
     """
     # Reject an unknown hour before any scene is built.
     at_hour(SceneWeather(), hour)
-    file_names = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
+    file_names = {row["file_name"] for row, _ in image_rows(folder, split)[:count]}
     scene_pair: tuple[RenderScene, RenderScene] | None = None
-    for recorded in clip_views(
+    for recorded in recorded_views(
         folder,
         split=split,
         device=device,

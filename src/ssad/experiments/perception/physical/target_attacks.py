@@ -29,7 +29,7 @@ from ssad.rendering.camera.scene_edit import SceneEdit
 from ssad.rendering.target import TargetCar, parse_target
 from ssad.scenarios.static.perturbation import Perturbation, TargetImages
 from ssad.scenarios.static.physical import TextureSpec, TextureSurface, TextureView, albedo_of, make_carrier
-from ssad.scenarios.static.physical.lights import LitView, TargetSize
+from ssad.scenarios.static.physical.lights import SearchView, TargetSize
 from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec
 from ssad.scenarios.static.physical.textures.carrier import covered_colour
 from ssad.scenarios.static.physical.textures.folder import TextureFolder
@@ -234,9 +234,9 @@ class SearchedLight(Perturbation):
                 for clip in images.clips_at(spec.hour)
             ]
 
-        def views() -> list[LitView]:
+        def views() -> list[SearchView]:
             images = training_images()
-            return [LitView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.clips_at(spec.hour)]
+            return [SearchView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.clips_at(spec.hour)]
 
         return attacks.lights.edit(
             spec,

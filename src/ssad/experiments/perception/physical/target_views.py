@@ -18,7 +18,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import NO_ATTRIBUTE
 from ssad.experiments.perception.physical.textured_images import textured_clips
-from ssad.recorders.target_images import CLASSES, clip_rows
+from ssad.recorders.target_images import CLASSES, image_rows
 from ssad.scenarios.static.physical import TextureSurface, TextureView
 
 
@@ -27,7 +27,7 @@ class TargetClips:
     """The first images of a recording, for a detector.
 
     Attributes:
-        folder: Folder that `record_clips` wrote.
+        folder: Folder that `record_target_images` wrote.
         count: Number of images.
         classes: Names of the detector's classes, in its order.
         device: Device that renders and shows them.
@@ -46,7 +46,7 @@ class TargetClips:
         Raises:
             FormatError: The folder holds no recording of this version.
         """
-        return [row for row, _ in clip_rows(self.folder)[: self.count]]
+        return [row for row, _ in image_rows(self.folder)[: self.count]]
 
     def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
         """Yield drive, image [1, 3, H, W] in 0 to 1 and truth, as recorded.
@@ -54,7 +54,7 @@ class TargetClips:
         Raises:
             FormatError: See `rows`.
         """
-        for row, objects in clip_rows(self.folder)[: self.count]:
+        for row, objects in image_rows(self.folder)[: self.count]:
             tensor = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
             yield (
                 drive_of(row),

@@ -24,12 +24,12 @@ from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
-from ssad.recorders.target_images import ClipView, clip_rows, clip_views, recording_of
+from ssad.recorders.target_images import RecordedView, image_rows, recorded_views, recording_of
 from ssad.rendering.camera.render import Rendering, render
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.sensor import SENSOR, SensorModel
 from ssad.rendering.camera.texture import Taps, combine_taps, retexture, texture_taps
-from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, large_draws
+from ssad.rendering.camera.torch_sensor import ChangedWindow, Rectangle, generators_on_device
 
 KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
@@ -43,7 +43,7 @@ class TexturedClip:
     Attributes:
         file: Its name in the folder `images`.
         row: What the annotation file says of it.
-        objects: What is annotated in it (see `ClipView`).
+        objects: What is annotated in it (see `RecordedView`).
         image: As recorded, uint8 RGB [H, W, 3].
         corner: Row and column at which `radiance` begins in it.
         radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
@@ -192,7 +192,7 @@ class Wearing:
         if noise is not None:
             mosaic = window.sensor.mosaic
             noise_sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
-            generators = large_draws(noise, radiance.device)
+            generators = generators_on_device(noise, radiance.device)
             for image_noise, prepared, read_rectangle, rng in zip(
                 noise_sample, pictures, window.read, generators, strict=True
             ):
@@ -249,7 +249,7 @@ def textured_clips(
     """Yield the images of a recording whose targets have layers, in order; each is rendered once and then stored.
 
     Args:
-        folder: Folder that `record_clips` wrote; results are stored in its folder `.seen`.
+        folder: Folder that `record_target_images` wrote; results are stored in its folder `.seen`.
         layers: Layers and decals of the targets.
         split: train, test or all.
         device: Device that renders.
@@ -259,9 +259,9 @@ def textured_clips(
         StoreError: The folder cannot be written to.
     """
     cache_folder = _kept_in(folder, layers, split)
-    rows = clip_rows(folder, split)
+    rows = image_rows(folder, split)
     missing_files = {row["file_name"] for row, _ in rows if not (cache_folder / f"{row['file_name']}.npz").is_file()}
-    missing_views = clip_views(folder, split=split, device=device, selected_keys=missing_files)
+    missing_views = recorded_views(folder, split=split, device=device, selected_keys=missing_files)
     for row, objects in rows:
         file = row["file_name"]
         if file in missing_files:
@@ -285,7 +285,7 @@ def unseen_parts(folder: Path, variants: Sequence[Sequence[TextureLayer | Textur
     cached_names = [{path.name for path in cache_folder.glob("*.npz")} for cache_folder in cache_folders]
     missing_parts = (
         row["part"]
-        for row, _ in clip_rows(folder)
+        for row, _ in image_rows(folder)
         if any(f"{row['file_name']}.npz" not in names for names in cached_names)
     )
     return list(dict.fromkeys(missing_parts))
@@ -297,7 +297,7 @@ def see_clips(
     """Render what a part of a recording shows of each of several sets of layers, for `textured_clips`.
 
     Args:
-        folder: What `record_clips` wrote.
+        folder: What `record_target_images` wrote.
         variants: What the targets wear, one set after the other.
         part: Whose pictures.
         device: Where to render.
@@ -309,8 +309,8 @@ def see_clips(
     cache_folders = [_kept_in(folder, layers, "all") for layers in variants]
     for cache_folder in cache_folders:
         safeio.make_folder(cache_folder)
-    file_names = {row["file_name"] for row, _ in clip_rows(folder) if row["part"] == part}
-    for recorded in clip_views(folder, device=device, selected_keys=file_names):
+    file_names = {row["file_name"] for row, _ in image_rows(folder) if row["part"] == part}
+    for recorded in recorded_views(folder, device=device, selected_keys=file_names):
         # All sets of layers in one pass: building the scene of a view costs more than rendering it.
         for cache_folder, layers in zip(cache_folders, variants, strict=True):
             if not (cache_folder / f"{recorded.file}.npz").is_file():
@@ -339,8 +339,8 @@ def seen_part(picture: Rendering) -> dict[str, Any]:
     }
 
 
-def _kept(clip: ClipView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
-    return seen_part(render(clip.scene, [clip.wearing(*layers)]))
+def _kept(clip: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
+    return seen_part(render(clip.scene, [clip.with_layers(*layers)]))
 
 
 def _span(places: Any, most: int) -> tuple[int, int]:

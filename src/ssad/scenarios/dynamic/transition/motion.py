@@ -18,8 +18,8 @@ import numpy as np
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.seeding import seed32
 from ssad.core.types import F64, EpisodeTrace
-from ssad.scenarios.dynamic.frozen import frozen, with_motion
-from ssad.scenarios.dynamic.transition.king import King, adversaries
+from ssad.scenarios.dynamic.frozen import freeze_episode, with_motion
+from ssad.scenarios.dynamic.transition.king import King, adversary_candidates
 
 KNOTS: Final = 8
 POPULATION: Final = 8
@@ -83,9 +83,9 @@ class TimedPath:
         return np.stack([self.time, x, y, yaw + turn], 1)
 
 
-def movers(base: Base) -> list[int]:
+def moving_candidates(base: Base) -> list[int]:
     """Return the candidates for the adversary that move, or all candidates if none does."""
-    candidates = adversaries(base)
+    candidates = adversary_candidates(base)
     trace = base.trace
     moving = [agent for agent in candidates if np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent])) > MOVES]
     return moving or candidates
@@ -101,8 +101,8 @@ class MotionSearch(ABC):
         from cmaes import CMA
 
         self.bases = list(bases)
-        self._frozen = [frozen(base.episode, base.trace) for base in bases]
-        self._agents = [movers(base) for base in bases]
+        self._frozen = [freeze_episode(base.episode, base.trace) for base in bases]
+        self._agents = [moving_candidates(base) for base in bases]
         self._ways = [
             {candidate: TimedPath.of(base.trace, candidate) for candidate in candidates}
             for base, candidates in zip(bases, self._agents, strict=True)

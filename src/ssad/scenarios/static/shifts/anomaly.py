@@ -61,7 +61,7 @@ def place_objects(spec: ShiftSpec, scene: str, poses: F64, boxes: Sequence[Track
     driven_length = stations[-2]
     piece_count = max(1, round((driven_length + table.ANOMALY_AHEAD) / table.ANOMALY_EVERY))
     piece_length = (driven_length + table.ANOMALY_AHEAD) / piece_count
-    occupied_parts = [_swept_ground(candidate) for candidate in boxes if len(candidate)]
+    occupied_parts = [_swept_rectangles(candidate) for candidate in boxes if len(candidate)]
     ego_centres = poses[:, :2, 3] + EGO[2] * poses[:, :2, 0]
     heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     ego_size = np.broadcast_to(EGO[:2], (len(poses), 2))
@@ -125,7 +125,7 @@ def _rectangles(centre: F64, yaw: F64, size: F64) -> F64:
     return np.asarray(corners + left * (corner_signs[:, 1] * size[:, 1:])[..., None])
 
 
-def _swept_ground(boxes: TrackedBoxes) -> F64:
+def _swept_rectangles(boxes: TrackedBoxes) -> F64:
     """Return the ground [N, 4, 2] under boxes, extended by their motion between samples."""
     speed = np.nan_to_num(np.linalg.norm(boxes.velocity[:, :2], axis=1))
     size = boxes.size_lwh[:, :2] + np.stack([MOVES * speed, np.zeros(len(boxes))], 1)

@@ -64,14 +64,14 @@ def shift_images(
     if not shifted_indices:
         return images, [ShiftReport(True, {"severity": 0}) for _ in specs]
     if len(shifted_indices) < batch.count:
-        return _shift_some(
+        return _shift_selected(
             images, batch, frames=list(frames), specs=specs, shifted_indices=shifted_indices, contexts=contexts
         )
     result, records = _dispatch(batch, frames, specs, contexts)
     return like_input(result, images), records
 
 
-def _shift_some(
+def _shift_selected(
     images: Any,
     batch: Batch,
     *,
@@ -129,7 +129,7 @@ def _dispatch(
 def _context(batch: Batch, index: int, frame: Frame, contexts: Mapping[str, SceneContext] | None) -> SceneContext:
     if contexts is not None and frame.scene in contexts:
         return contexts[frame.scene]
-    return SceneContext(frame.scene, sky_light([batch.picture(index)], [frame.depth]), viewing_direction(frame))
+    return SceneContext(frame.scene, sky_light([batch.image(index)], [frame.depth]), viewing_direction(frame))
 
 
 def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night: bool = False) -> float:

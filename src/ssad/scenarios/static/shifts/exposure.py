@@ -38,7 +38,7 @@ def exposure_table(stops: float) -> U8:
 def overexpose(batch: Batch, specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Apply overexposure, in both calibrations."""
     stops = [OVEREXPOSURE[spec.severity - 1] for spec in specs]
-    result = batch.like()
+    result = batch.empty_like()
     thread_shape, word_count, chunk_size = batch.chunks()
     tables = to_device(batch, np.stack([exposure_table(value) for value in stops]), wp.uint8)
     batch.launch(recode, thread_shape, [batch.words(), tables, word_count, chunk_size], result.words())

@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import SceneContext, ShiftReport, SweepFrame
 from ssad.core.types import F32, F64, Bool
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.objects import affine, deformed
+from ssad.scenarios.static.shifts.objects import box_maps, deformed_box_maps
 from ssad.scenarios.static.shifts.spec import CAMERA_ONLY, ShiftSpec
 from ssad.scenarios.static.shifts.sun import AT_NIGHT, NIGHT, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
@@ -111,8 +111,8 @@ def _move_objects(
         return cloud, ShiftReport(False, {"objects": 0})
     pose = frame.ego_to_world @ frame.to_ego
     world_to_sensor, sensor_position = pose[:3, :3].T, pose[:3, 3]
-    old_maps, old_centres = affine(boxes)
-    new_maps, new_centres = deformed(spec, boxes, scene=frame.scene, sample=frame.sample, lidar=True)
+    old_maps, old_centres = box_maps(boxes)
+    new_maps, new_centres = deformed_box_maps(spec, boxes, scene=frame.scene, sample=frame.sample, lidar=True)
     old_maps, new_maps = world_to_sensor @ old_maps, world_to_sensor @ new_maps
     old_centres, new_centres = (
         (old_centres - sensor_position) @ world_to_sensor.T,

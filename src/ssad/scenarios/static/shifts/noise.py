@@ -42,7 +42,7 @@ def noise_table(name: str, severity: int, calibration: str) -> npt.NDArray[np.in
 
 def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Add `uniform` or `gaussian` noise."""
-    result = batch.like()
+    result = batch.empty_like()
     thread_shape, word_count, chunk_size = batch.chunks()
     keys = file_keys(batch, specs, frames, "noise")
     tables = np.stack([noise_table(spec.name, spec.severity, spec.calibration) for spec in specs])
@@ -56,7 +56,7 @@ def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec])
 
 def add_impulses(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[ShiftReport]]:
     """Add impulse noise; in the physical calibration a fifth of it is stuck at fixed sites of a camera."""
-    result = batch.like()
+    result = batch.empty_like()
     thread_shape, word_count, chunk_size = batch.chunks()
     total_shares = [IMPULSE[spec.severity - 1] for spec in specs]
     stuck_shares = [

@@ -75,13 +75,15 @@ def deformations(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: st
     return np.array(instance_deformations).reshape(-1, 3, 3)
 
 
-def affine(boxes: TrackedBoxes) -> tuple[F64, F64]:
+def box_maps(boxes: TrackedBoxes) -> tuple[F64, F64]:
     """Return the maps from the unit cube to each box in the world: matrices [N, 3, 3] and centres [N, 3]."""
     return boxes.axes() * boxes.size_lwh[:, None], boxes.centre
 
 
-def deformed(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False) -> tuple[F64, F64]:
-    """Return the maps of `affine` after the shift.
+def deformed_box_maps(
+    spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False
+) -> tuple[F64, F64]:
+    """Return the maps of `box_maps` after the shift.
 
     The deformation is about the centre of the base; for the paper's cameras, about the centre.
     """
@@ -113,7 +115,7 @@ def transformed_boxes(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sampl
     """
     if spec.family != "object" or spec.name == "motion_blur" or spec.severity == 0 or not len(boxes):
         return boxes
-    matrix, centre = deformed(spec, boxes, scene=scene, sample=sample)
+    matrix, centre = deformed_box_maps(spec, boxes, scene=scene, sample=sample)
     direction = matrix[:, :, 0] / np.linalg.norm(matrix[:, :, 0], axis=1, keepdims=True)
     rotation = boxes.axes()
     forward, lateral = (np.einsum("ni,ni->n", direction, rotation[:, :, axis]) for axis in (0, 1))
@@ -180,8 +182,8 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Shift
     if len(boxes):
         pose = camera_to_world(frame)
         world_to_camera, camera_position = pose[:3, :3].T, pose[:3, 3]
-        old_maps, old_centres = affine(boxes)
-        new_maps, new_centres = deformed(spec, boxes, scene=frame.scene, sample=frame.sample)
+        old_maps, old_centres = box_maps(boxes)
+        new_maps, new_centres = deformed_box_maps(spec, boxes, scene=frame.scene, sample=frame.sample)
         old_maps, new_maps = world_to_camera @ old_maps, world_to_camera @ new_maps
         old_centres, new_centres = (
             (old_centres - camera_position) @ world_to_camera.T,

@@ -106,7 +106,7 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     ]
     batch.launch(falling.streaks, half_shape, inputs, streak_layer.flatten())
     thread_shape = (batch.count, batch.height)
-    result, highest = batch.like(), wp.empty(thread_shape, dtype=int, device=batch.device)
+    result, highest = batch.empty_like(), wp.empty(thread_shape, dtype=int, device=batch.device)
     inputs = [
         batch.words(),
         streak_layer.flatten(),
@@ -176,7 +176,7 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         _samples_per_side(scale),
     ]
     batch.launch(falling.curtain, thread_shape, inputs, opacity)
-    result, highest = batch.like(), wp.empty(thread_shape, dtype=int, device=batch.device)
+    result, highest = batch.empty_like(), wp.empty(thread_shape, dtype=int, device=batch.device)
     size = batch.count * batch.stride // 12
     opacity_words = wp.array(ptr=opacity.ptr, dtype=wp.uint32, shape=size, device=batch.device)
     opacity_words._keep = opacity  # the memory belongs to the bytes
@@ -224,7 +224,7 @@ def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
     inputs = [batch.words(), batch.width * 3 // 4, batch.stride // 4]
     batch.launch(layers.brightest, thread_shape, inputs, highest)
     brightest = highest.numpy().max(1) / 255
-    result = batch.like()
+    result = batch.empty_like()
     cloud_parameters = [to_device(batch, values) for values in (lowest, span, amounts, brightest, grey_shares)]
     inputs = [batch.data, clouds, *cloud_parameters, WIDTH / batch.width / 4, batch.width, batch.stride]
     batch.launch(layers.blend_clouds, thread_shape, inputs, result.data)

@@ -136,7 +136,7 @@ class SceneShifter:
             basis_fields["sun"] = self._sun(frame.sample_token)[0]
         return basis_fields
 
-    def outdated(self, frame: SensorFrame, basis: Mapping[str, object]) -> bool:
+    def is_outdated(self, frame: SensorFrame, basis: Mapping[str, object]) -> bool:
         """Return True if a frame made on this basis would now have a better one."""
         sample_order = {sample.token: index for index, sample in enumerate(self.scene.samples)}
         used_index = sample_order.get(str(basis["context"]), len(sample_order)) if "context" in basis else 0
@@ -281,7 +281,7 @@ class SceneShifter:
             return self._frame(frame, boxes)
         return self._frame(frame, boxes, self._points(frame), self._depth(frame))
 
-    def described(self, frame: SensorFrame) -> Frame:
+    def describe_frame(self, frame: SensorFrame) -> Frame:
         """Return the description of an image with all that is known of it: boxes, depth, LiDAR returns."""
         return self._frame(
             frame, boxes_of(self.scene.annotations_of(frame))[0], self._points(frame), self._depth(frame)
@@ -411,11 +411,11 @@ def _has_lens(frame: SensorFrame) -> bool:
 def _count_points(cloud: F32, sweep: SensorFrame, boxes: TrackedBoxes) -> npt.NDArray[np.int32]:
     """Count the points in each box."""
     from ssad.scenarios.static.shifts.lidar import is_inside_box
-    from ssad.scenarios.static.shifts.objects import affine
+    from ssad.scenarios.static.shifts.objects import box_maps
 
     pose = sweep.ego_to_world @ sweep.sensor_to_ego
     world_points = np.asarray(cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3])
-    matrix, centre = affine(boxes)
+    matrix, centre = box_maps(boxes)
     counts = [
         int(is_inside_box(world_points, matrix[box_index], centre[box_index]).sum()) for box_index in range(len(boxes))
     ]

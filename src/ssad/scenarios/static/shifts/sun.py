@@ -29,7 +29,7 @@ def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
 
     It is the context's, or else drawn 2 to 12 degrees high, within 15 degrees of the ego's initial heading.
     """
-    return np.array(next(_draws(spec, context)) if context.sun is None else context.sun)
+    return np.array(next(_draw_directions(spec, context)) if context.sun is None else context.sun)
 
 
 def choose_sun(
@@ -47,7 +47,7 @@ def choose_sun(
     Returns:
         Unit vector, world: the first direction in which the sun is visible; the first of all if it is always hidden.
     """
-    candidates = list(islice(_draws(spec, context), 16))
+    candidates = list(islice(_draw_directions(spec, context), 16))
     depths: dict[int, F32 | None] = {}
     for candidate in candidates:
         direction = np.array(candidate)
@@ -61,7 +61,7 @@ def choose_sun(
     return candidates[0]
 
 
-def _draws(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, float, float]]:
+def _draw_directions(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, float, float]]:
     """Yield unit vectors towards the sun, world, without end."""
     draws = spec.generator("sun", context.scene)
     for attempt in count():
@@ -145,7 +145,7 @@ def add_sun(
         in_image, visible_share = sun_in_image(frame, direction), frame.sun
         if visible_share is None:
             visible_share = (
-                visible_sun_share(frame, sun_depth(frame, batch.picture(index)), direction) if in_image else 1.0
+                visible_sun_share(frame, sun_depth(frame, batch.image(index)), direction) if in_image else 1.0
             )
         details: dict[str, Any] = {"angle_deg": round(angle, 1), "in_view": in_image, "free": round(visible_share, 2)}
         details["direction"] = [round(float(coordinate), 6) for coordinate in direction]
@@ -171,7 +171,7 @@ def add_sun(
     batch.launch(
         veil.glare, (batch.count, rows), [*camera_inputs, to_device(batch, strength), to_device(batch, rays)], glare
     )
-    result = batch.like()
+    result = batch.empty_like()
     tint = to_device(batch, np.tile([1.0, 0.97, 0.9], (batch.count, 1)), wp.vec3)
     inputs = [batch.words(), glare, tint, to_device(batch, gain), batch.width, batch.stride // 4]
     batch.launch(veil.blend_glare, (batch.count, batch.height), inputs, result.words())

@@ -106,7 +106,7 @@ def add_fog(
     airlight = np.stack(
         [to_linear(weather.colour * context.light * 245) for weather, context in zip(weathers, contexts, strict=True)]
     )
-    result = batch.like()
+    result = batch.empty_like()
     inputs = [
         batch.words(),
         transmittance,
@@ -205,7 +205,7 @@ def add_precipitation(
     batch.launch(particles.splat, (batch.count, max_particles), inputs, layer)
     sky_colour = np.stack([weather.colour * context.light for weather, context in zip(weathers, contexts, strict=True)])
     grey_levels = np.array([255.0 if spec.name == "snow" else 235.0 for spec in specs])[:, None]
-    result, thread_shape = batch.like(), (batch.count, batch.height)
+    result, thread_shape = batch.empty_like(), (batch.count, batch.height)
     veil_light, particle_light = (
         to_device(batch, to_linear(sky_colour * 235), wp.vec3),
         to_device(batch, to_linear(sky_colour * grey_levels), wp.vec3),

@@ -15,8 +15,8 @@ from ssad.scenarios.static.physical.lights.lit_image import LitImage
 from ssad.scenarios.static.physical.lights.projector import Projector
 from ssad.scenarios.static.physical.lights.search import (
     LightSearchResult,
-    LitView,
     SearchBudget,
+    SearchView,
     random_settings,
     search_light,
 )
@@ -55,9 +55,9 @@ __all__ = [
     "LightAttack",
     "LightSearchResult",
     "LitImage",
-    "LitView",
     "Projector",
     "SearchBudget",
+    "SearchView",
     "Shadow",
     "TargetSize",
     "make_light",

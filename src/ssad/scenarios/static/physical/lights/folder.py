@@ -25,7 +25,7 @@ from ssad.scenarios.static.physical.lights import (
     random_settings,
     search_light,
 )
-from ssad.scenarios.static.physical.lights.search import LitView
+from ssad.scenarios.static.physical.lights.search import SearchView
 from ssad.scenarios.static.physical.textures.controls import control, texture_picture
 from ssad.scenarios.static.physical.textures.optimise import TextureView, train_texture
 
@@ -103,7 +103,7 @@ class LightFolder:
         spec: LightSpec,
         target: TargetSize,
         *,
-        views: Callable[[], Sequence[LitView]],
+        views: Callable[[], Sequence[SearchView]],
         projected_views: Callable[[SceneEdit], Sequence[TextureView]],
         detector: Callable[[], Detector],
     ) -> SceneEdit:
