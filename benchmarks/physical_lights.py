@@ -22,7 +22,7 @@ import torch
 
 from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
-from ssad.experiments.perception.physical.lit_images import LightableClips, LitClip
+from ssad.experiments.perception.physical.lit_images import RelightableImage, RelightableTargetImages
 from ssad.experiments.perception.physical.target_views import drive_of
 from ssad.metrics.target_attacks import sightings, target_scores
 from ssad.recorders.target_images import record_target_images
@@ -39,7 +39,7 @@ TOWN, HOURS = "Oldmarket", ("noon", "low_sun", "sun_behind", "night")
 SUNLIT = 0.2  # share of the sun in the light on the rear, from which on a shadow could be seen
 
 
-def rear(clip: LitClip) -> tuple[float, float]:
+def rear(clip: RelightableImage) -> tuple[float, float]:
     """Share of the sun in the light on the target's rear, and lux there; medians over its pixels."""
     picture = clip.lit()
     back = -0.5 * clip.target.length
@@ -53,7 +53,7 @@ def rear(clip: LitClip) -> tuple[float, float]:
     return float(sun.median()), float(np.median(light)) / per_lux(clip.clip.view.weather)
 
 
-def flood(clip: LitClip) -> SceneEdit:
+def flood(clip: RelightableImage) -> SceneEdit:
     """The brightest lamp on the whole rear, white."""
     values = {
         "lumens": 3000.0,
@@ -70,7 +70,9 @@ def flood(clip: LitClip) -> SceneEdit:
     return Flashlight().edit(values, clip.target)
 
 
-def scores(pictures: LightableClips, clips: list[LitClip], detector: Any, edit: Any) -> dict[str, float | None]:
+def scores(
+    pictures: RelightableTargetImages, clips: list[RelightableImage], detector: Any, edit: Any
+) -> dict[str, float | None]:
     """AP50 and mean score of the target under an edit of each picture."""
 
     def shown() -> Any:
@@ -100,8 +102,8 @@ def main() -> None:
     detector = make_detector("yolov5n", device=given.device)
     rows = []
     for hour in HOURS:
-        pictures = LightableClips(home, given.pictures, tuple(detector.classes), given.device)
-        clips = list(pictures.clips_at(hour))[:: given.every]
+        pictures = RelightableTargetImages(home, given.pictures, tuple(detector.classes), given.device)
+        clips = list(pictures.images_at(hour))[:: given.every]
         sun, lux = np.array([rear(clip) for clip in clips]).T
         none = SceneEdit(cards=(BLIND,))
         row: dict[str, Any] = {

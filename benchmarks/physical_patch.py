@@ -27,7 +27,7 @@ from torch import Tensor
 from ssad.core.detections import Truth
 from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
-from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.experiments.perception.physical.target_views import RecordedTargetImages
 from ssad.metrics.target_attacks import sightings, target_scores
 from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
@@ -103,13 +103,13 @@ VARIANTS = {
 ORDER = {name: number for number, name in enumerate(VARIANTS)}
 
 
-def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: str) -> TargetClips:
+def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: str) -> RecordedTargetImages:
     """Pictures of a town, recorded if they are not there."""
     if not (home / town / "annotations").is_dir():
         record_target_images(
             TargetRecording(home / town, ((town, count),), (), target=TargetCar(), device=device), workers=0
         )
-    return TargetClips(home / town, count, classes, device)
+    return RecordedTargetImages(home / town, count, classes, device)
 
 
 def shown(

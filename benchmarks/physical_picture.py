@@ -19,7 +19,7 @@ from ssad.core.images import save_picture
 from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
 from ssad.experiments.perception.physical.target_sheet import target_sheet
-from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.experiments.perception.physical.target_views import RecordedTargetImages
 from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
@@ -45,7 +45,7 @@ def main() -> None:
     detector, target = make_detector(DETECTOR), TargetCar()
     with tempfile.TemporaryDirectory() as folder:
         record_target_images(TargetRecording(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
-        clips = TargetClips(Path(folder), 1, tuple(detector.classes))
+        clips = RecordedTargetImages(Path(folder), 1, tuple(detector.classes))
         ((_, clean, truth),) = clips.clean()
         shown = []
         for title, texture in PANELS.items():

@@ -25,7 +25,7 @@ import torch
 
 from ssad.core.machine import start_warp_quietly
 from ssad.detectors import make_detector
-from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.experiments.perception.physical.target_views import RecordedTargetImages
 from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import TargetCar
@@ -89,7 +89,7 @@ def measure(count: int, device: str) -> dict[str, Any]:
             TargetRecording(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0
         )
         detector = make_detector("yolov5n", device=device)
-        clips = TargetClips(Path(folder), count, tuple(detector.classes), device)
+        clips = RecordedTargetImages(Path(folder), count, tuple(detector.classes), device)
         views = [view for _, view in clips.wearing(surface)]
     colour = control("random", surface.size).to(device).requires_grad_()
     batch = 1 if device == "cpu" else BATCH

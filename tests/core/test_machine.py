@@ -172,7 +172,7 @@ def test_gpus_are_shared_by_as_many_as_their_memory_takes(
 HELD = """
 import ctypes
 import numpy as np
-from ssad.core.machine import keep_memory
+from ssad.core.machine import retain_freed_memory
 
 class Mallinfo(ctypes.Structure):  # struct mallinfo2 of <malloc.h>
     _fields_ = [(name, ctypes.c_size_t) for name in (
@@ -190,7 +190,7 @@ def hold():
 
 
 hold()
-keep_memory()
+retain_freed_memory()
 hold()
 """
 

@@ -175,7 +175,7 @@ class FakeWorker:
         self.cannot_send = False
         self.made.append(self)
 
-    def give(self, task: Task) -> TaskOutcome | None:
+    def start_task(self, task: Task) -> TaskOutcome | None:
         assert self.ready
         assert self.task is None
         self.task = task
@@ -184,7 +184,7 @@ class FakeWorker:
     def answer(self, what: str) -> None:
         self.theirs.send(what)
 
-    def hear(self) -> TaskOutcome | None:
+    def read_answer(self) -> TaskOutcome | None:
         answer = self.answers.recv()
         if answer == "ready":
             self.ready = True
@@ -196,13 +196,13 @@ class FakeWorker:
         task, self.task = self.task, None
         return TaskOutcome(task, status, None, reason)
 
-    def overdue(self) -> TaskOutcome:
+    def time_out(self) -> TaskOutcome:
         return self.outcome("timeout")
 
-    def memory(self) -> int:
+    def resident_bytes(self) -> int:
         return self.held
 
-    def end(self) -> None:
+    def kill(self) -> None:
         assert not self.ended
         self.ended = True
         self.answers.close()

@@ -25,10 +25,10 @@ def export_texture(
     dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
 ) -> None:
     """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
-    from ssad.experiments.perception.physical.kind import shown_by
+    from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_texture
 
-    attacks, attack_cell = shown_by(folder, cell)
+    attacks, attack_cell = attacks_and_cell(folder, cell)
     for path in export_shown_texture(attacks, attack_cell.spec, out, name=attack_cell.name, dots=dots):
         print(path)
 
@@ -41,10 +41,10 @@ def export_light(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
     """Write the settings of a light attack, and the picture that a projector shows."""
-    from ssad.experiments.perception.physical.kind import shown_by
+    from ssad.experiments.perception.physical.kind import attacks_and_cell
     from ssad.experiments.perception.physical.target_export import export_shown_light
 
-    attacks, attack_cell = shown_by(folder, cell)
+    attacks, attack_cell = attacks_and_cell(folder, cell)
     for path in export_shown_light(attacks, attack_cell.spec, out, name=attack_cell.name):
         print(path)
 

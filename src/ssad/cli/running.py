@@ -248,7 +248,7 @@ def replay(
             stem.with_suffix(".mcap"),
             replayed.trace,
             replayed.graph,
-            recorded_drive=replayed.seen,
+            recorded_drive=replayed.perception,
             top_views=top_view_frames,
         )
         print(f"mcap: {path}")

@@ -161,8 +161,8 @@ def _check_gradient(trial: CheckCase) -> None:
         (gradient,) = torch.autograd.grad((value.double() ** 2).mean(), images)
         trial.expect(bool(gradient.isfinite().all()), f"the gradient of Dense.{name} is finite")
         limit = torch.tensor(dense.size[::-1], device=value.device)
-        inside = ((dense.box[0, :, :2] > 0) & (dense.box[0, :, 2:] < limit)).any()  # all may be cut at the border
-        reaches_image = bool(gradient[0].any()) or (name == "box" and not bool(inside))
+        inner_pixels = ((dense.box[0, :, :2] > 0) & (dense.box[0, :, 2:] < limit)).any()  # all may be cut at the border
+        reaches_image = bool(gradient[0].any()) or (name == "box" and not bool(inner_pixels))
         trial.expect(reaches_image, f"the gradient of Dense.{name} reaches the image")
         trial.expect(not bool(gradient[1].any()), f"Dense.{name} of an image does not depend on the others")
 

@@ -104,11 +104,13 @@ class _Probe:
         slope = float((gradient * direction).sum())
         measured_ratio = math.nan
         for step in STEPS:
-            ahead, behind = (float(self.at(self.images + sign * step * direction)[name]) for sign in (1, -1))
+            value_ahead, value_behind = (
+                float(self.at(self.images + sign * step * direction)[name]) for sign in (1, -1)
+            )
             # The expected difference would drown in float32 rounding.
-            if 2 * step * slope < ROUNDING * (abs(ahead) + abs(behind)) / 2:
+            if 2 * step * slope < ROUNDING * (abs(value_ahead) + abs(value_behind)) / 2:
                 continue
-            measured_ratio = (ahead - behind) / (2 * step * slope)
+            measured_ratio = (value_ahead - value_behind) / (2 * step * slope)
             if 1 / ROUGHLY < measured_ratio < ROUGHLY:
                 break
         return measured_ratio

@@ -219,13 +219,13 @@ def match_images(detections: Sequence[SampleImages], truth: ImageTruth, classes:
         np.concatenate([np.zeros(0), *(sample_boxes.score for sample_boxes in boxes_by_sample)]),
     )
     class_count, sample_count = len(MMDET3D_CLASSES), len(truth.samples)
-    matched = match_2d(truth_boxes, detected_boxes, labels=class_count)
-    assert matched.row is not None
+    matched_rows = match_2d(truth_boxes, detected_boxes, labels=class_count)
+    assert matched_rows.row is not None
     truth_counts = np.bincount(
         truth_boxes.label.astype(np.int64) * sample_count + truth_boxes.image // CAMERAS,
         minlength=class_count * sample_count,
     )
-    return ImageMatches(matched, sample_numbers[matched.row], truth_counts.reshape(class_count, sample_count))
+    return ImageMatches(matched_rows, sample_numbers[matched_rows.row], truth_counts.reshape(class_count, sample_count))
 
 
 def image_figures(scores: ImageScores, *, is_summary: bool = False) -> dict[str, float]:

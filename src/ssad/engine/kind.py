@@ -146,7 +146,7 @@ class Replay:
         compared: Compared results, in words.
         picture: Makes a picture of the system's input and output, clean and under the cell's condition.
         film: Frames [H, W, 3] of the driver's camera, with the seconds between two of them; None: there are none.
-        seen: Perception of the driver: input, detections, belief; None: it does not perceive.
+        perception: Perception of the driver: input, detections, belief; None: it does not perceive.
     """
 
     cell: Cell
@@ -156,7 +156,7 @@ class Replay:
     compared: str = ""
     picture: Callable[[], U8] | None = None
     film: tuple[Iterator[U8], float] | None = None
-    seen: Any = None
+    perception: Any = None
 
 
 class CellError(SSADError):

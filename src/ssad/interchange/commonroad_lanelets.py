@@ -92,7 +92,7 @@ class _LaneletReader:
         lane_of: dict[int, int],
         kinds: list[list[str]],
     ) -> None:
-        self.texts, self.lost, self.lanes, self.lane_of, self.kinds = texts, omissions, lanes, lane_of, kinds
+        self.texts, self.omissions, self.lanes, self.lane_of, self.kinds = texts, omissions, lanes, lane_of, kinds
 
     def read(self, root: Element, name: str, walks: list[Element]) -> ImportedLanes:
         shapes = self.shapes = [self._shape(element) for element in self.lanes]
@@ -149,7 +149,7 @@ class _LaneletReader:
         if min(len(side) for side in sides) < 2:
             raise self.texts.error(element, "a bound has fewer than two points")
         if len(sides[0]) != len(sides[1]):
-            self.lost["lanelets whose bounds have different numbers of points are resampled"] += 1
+            self.omissions["lanelets whose bounds have different numbers of points are resampled"] += 1
             sides = [_resample(side, max(map(len, sides))) for side in sides]
         middle = 0.5 * (sides[0] + sides[1])
         spacing = np.hypot(*np.diff(middle[:, :2], axis=0).T)
@@ -290,7 +290,7 @@ class _LaneletReader:
             )
             unsupported = sorted(set(sign_names) - {xml.STOP, xml.YIELD, xml.TOP_SPEED, "R1-1", "R1-2", "R2-1"})
             for name in unsupported:
-                self.lost[f"traffic sign {name[:20]}"] += 1
+                self.omissions[f"traffic sign {name[:20]}"] += 1
             if kind is None or not lanes:
                 continue
             end = shapes[lanes[0][0]][-1]
@@ -320,7 +320,7 @@ class _LaneletReader:
             lanes = lanes_by_light.get(self.texts.whole(light.get("id"), light, "id"), [])
             cycle = self._cycle(light)
             if not lanes:
-                self.lost["traffic lights that no lanelet refers to"] += 1
+                self.omissions["traffic lights that no lanelet refers to"] += 1
                 continue
             signal_number = len(signal_rows)
             if len({state for _, state in cycle[:-1]}) == 1:

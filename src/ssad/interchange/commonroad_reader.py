@@ -89,12 +89,12 @@ def read_commonroad(path: Path, *, town: str | None = None, map_name: str | None
 class _Reader:
     def __init__(self, location: str, root: Element) -> None:
         self.root, self.texts = root, TextReader(location)
-        self.lost: Counter[str] = Counter()
-        self.own = own_values(root.get("source", ""))
+        self.omissions: Counter[str] = Counter()
+        self.own_values = own_values(root.get("source", ""))
         self.dt = self.texts.number(root.get("timeStepSize"), root, "timeStepSize")
         if not 0.0 < self.dt <= 10.0:
             raise self.texts.error(root, f"timeStepSize is {self.dt:g} s")
-        self.obstacles = ObstacleReader(self.texts, self.lost, self.dt)
+        self.obstacles = ObstacleReader(self.texts, self.omissions, self.dt)
 
     def read(self, stem: str, town: str, map_name: str | None) -> ImportedCommonRoad:
         """Return the scenario, checked, and the features that are not carried over."""
@@ -103,7 +103,7 @@ class _Reader:
         start, speed = self._start(problem)
         limits, goal, target_speed = self._goal(problem, lanes, speed)
         route, ego_route = self._route(graph, start, goal)
-        stored_name = scenario_name(self.own.get("name", "")) or scenario_name(self.root.get("benchmarkID", ""))
+        stored_name = scenario_name(self.own_values.get("name", "")) or scenario_name(self.root.get("benchmarkID", ""))
         scenario = Scenario(
             name=stored_name or scenario_name(stem) or "imported",
             type="Custom",
@@ -112,18 +112,18 @@ class _Reader:
             parameters=start_parameters(ego_route, start, speed, digits=6),
             limits=limits,
             target_speed=target_speed,
-            group=self.own.get("group", ""),
+            group=self.own_values.get("group", ""),
             actors=self.obstacles.read(self.root, start, limits),
             signals=self._signals(lanes, graph, ego_route, limits),
             source=f"CommonRoad {Path(self.texts.location).name}",
         )
         for tag in ("phantomObstacle", "environmentObstacle", "location/environment"):
             if count := len(self.root.findall(tag)):
-                self.lost[tag] += count
+                self.omissions[tag] += count
         build_episode(scenario, graph, seed=0)  # reports any remaining error of the scenario
         lost = tuple(
             f"{message}{f' ({occurrences} times)' if occurrences > 1 else ''}"
-            for message, occurrences in self.lost.items()
+            for message, occurrences in self.omissions.items()
         )
         return ImportedCommonRoad(scenario, graph, is_known, lost)
 
@@ -131,13 +131,13 @@ class _Reader:
 
     def _town(self, town: str, map_name: str | None) -> tuple[ImportedLanes, LaneGraph, bool, str]:
         """Return the file's lanes, the town, whether the town can be loaded by name, and its name."""
-        lanes = read_lanes(self.root, self.texts, town, self.lost)
+        lanes = read_lanes(self.root, self.texts, town, self.omissions)
         if map_name is not None:
             is_known = is_town(map_name)
             graph = load_town(map_name)
             return lanes, (graph if is_known else replace(graph, name=town)), is_known, (map_name if is_known else town)
-        if is_town(self.own.get("town", "")):
-            graph = load_town(self.own["town"])
+        if is_town(self.own_values.get("town", "")):
+            graph = load_town(self.own_values["town"])
             if _same_lanes(graph, lanes.graph):
                 return lanes, graph, True, graph.name
         label = self.root.get("benchmarkID", "").partition("_")[2].partition("-")[0]
@@ -145,7 +145,7 @@ class _Reader:
             if benchmark_map(name) == label and _same_lanes(load_town(name), lanes.graph):
                 return lanes, load_town(name), True, name
         if lanes.cycles:
-            self.lost[f"the cycles of {lanes.cycles} traffic lights: they run this program's own"] += 1
+            self.omissions[f"the cycles of {lanes.cycles} traffic lights: they run this program's own"] += 1
         return lanes, lanes.graph, False, town
 
     def _signals(self, lanes: ImportedLanes, graph: LaneGraph, line: Route, limits: EpisodeLimits) -> SignalPlan:
@@ -161,11 +161,11 @@ class _Reader:
             if lanes_by_signal.get(signal) in signal_by_lanes
         }
         end_time = max(60.0, limits.max_time)
-        if "signals_until" in self.own:
-            end_time = self.texts.number(self.own["signals_until"], self.root, "source: signals_until")
+        if "signals_until" in self.own_values:
+            end_time = self.texts.number(self.own_values["signals_until"], self.root, "source: signals_until")
         plan = plan_of(graph, line, forced_states, end_time) if len(forced_states) == len(lanes.states) else None
         if plan is None:
-            self.lost[f"the states of {len(lanes.states)} signals, which no signal plan here gives"] += 1
+            self.omissions[f"the states of {len(lanes.states)} signals, which no signal plan here gives"] += 1
         return plan or SignalPlan()
 
     # ------------------------------------------------------------ the ego
@@ -175,7 +175,7 @@ class _Reader:
         if not problems:
             raise self.texts.error("commonRoad", "it has no planningProblem: nothing says where the ego goes")
         if len(problems) > 1:
-            self.lost[f"{len(problems) - 1} more planning problems: the first is driven"] += 1
+            self.omissions[f"{len(problems) - 1} more planning problems: the first is driven"] += 1
         return problems[0]
 
     def _start(self, problem: Element) -> tuple[Pose, float]:
@@ -187,7 +187,7 @@ class _Reader:
         if speed < 0.0:
             raise self.texts.error(problem, f"it starts with {speed:g} m/s")
         if self.obstacles.middle(state, "time", problem, 0.0) != 0.0:
-            self.lost["the step at which the planning problem begins: it is step 0"] += 1
+            self.omissions["the step at which the planning problem begins: it is step 0"] += 1
         return pose, min(speed, MAX_SPEED)
 
     def _goal(self, problem: Element, lanes: ImportedLanes, speed: float) -> tuple[EpisodeLimits, Pose | None, float]:
@@ -196,32 +196,32 @@ class _Reader:
         if not goals:
             raise self.texts.error(problem, "goalState is missing")
         if len(goals) > 1:
-            self.lost[f"{len(goals) - 1} more goal states: the first is the goal"] += 1
+            self.omissions[f"{len(goals) - 1} more goal states: the first is the goal"] += 1
         goal = goals[0]
         begin_step, end_step = self.texts.value(goal.find("time"), problem, "goalState: time")
         steps = round(end_step * self.dt / STEP)
         if steps < 1:
             raise self.texts.error(problem, f"its goal is to be reached at step {end_step:g}")
         if begin_step > 0.0:
-            self.lost["the earliest time of the goal"] += 1
+            self.omissions["the earliest time of the goal"] += 1
         if goal.find("orientation") is not None:
-            self.lost["the orientation of the goal"] += 1
+            self.omissions["the orientation of the goal"] += 1
         limits = EpisodeLimits(max_steps=steps, max_time=max(EpisodeLimits().max_time, steps * STEP))
-        if self.own.get("contact") in ("end", "count", "remove"):
-            limits = replace(limits, contact=self.own["contact"])  # type: ignore[arg-type]
-        if "max_distance" in self.own:
-            max_distance = self.texts.number(self.own["max_distance"], self.root, "source: max_distance")
+        if self.own_values.get("contact") in ("end", "count", "remove"):
+            limits = replace(limits, contact=self.own_values["contact"])  # type: ignore[arg-type]
+        if "max_distance" in self.own_values:
+            max_distance = self.texts.number(self.own_values["max_distance"], self.root, "source: max_distance")
             limits = replace(limits, max_distance=max(max_distance, 1.0))
         target_speed = Scenario.target_speed
         if (velocity := goal.find("velocity")) is not None:
             min_speed, target_speed = self.texts.value(velocity, problem, "goalState: velocity")
             if min_speed > 0.0:
-                self.lost["the least speed at the goal"] += 1
+                self.omissions["the least speed at the goal"] += 1
         elif speed > 1.0:
             target_speed = speed
         if not 0.1 <= target_speed <= MAX_SPEED:
             target_speed = min(max(target_speed, Scenario.target_speed), MAX_SPEED)
-            self.lost[f"the speed at the goal: the ego drives at {target_speed:g} m/s"] += 1
+            self.omissions[f"the speed at the goal: the ego drives at {target_speed:g} m/s"] += 1
         return limits, self._region(goal.find("position"), problem, lanes), target_speed
 
     def _region(self, position: Element | None, problem: Element, lanes: ImportedLanes) -> Pose | None:
@@ -229,7 +229,7 @@ class _Reader:
         if position is None or not len(position):
             return None
         if len(position) > 1:
-            self.lost["more than one goal region: the first is the goal"] += 1
+            self.omissions["more than one goal region: the first is the goal"] += 1
         region = position[0]
         if region.tag == "lanelet":
             lanelet_id = self.texts.whole(region.get("ref"), problem, "goalState: lanelet")
@@ -253,7 +253,7 @@ class _Reader:
     def _route(self, graph: LaneGraph, start: Pose, goal: Pose | None) -> tuple[tuple[Pose, ...], Route]:
         """Return the key points of the ego's route, and the route."""
         if goal is None:
-            self.lost[f"the ego has no place to reach: {WAY:g} m along its lane"] += 1
+            self.omissions[f"the ego has no place to reach: {WAY:g} m along its lane"] += 1
             return self._route_ahead(graph, start)
         try:
             ego_route = route_along(graph, (start, (goal.x, goal.y)))
@@ -262,7 +262,7 @@ class _Reader:
         except RouteError as error:
             if _lane_under(graph, start) is None or "no way" not in str(error):
                 raise RouteError(f"{self.texts.location}: the way of the ego: {error}") from None
-        self.lost[f"no way along the lanes leads to the goal: {WAY:g} m along the ego's lane"] += 1
+        self.omissions[f"no way along the lanes leads to the goal: {WAY:g} m along the ego's lane"] += 1
         return self._route_ahead(graph, start)
 
     def _route_ahead(self, graph: LaneGraph, start: Pose) -> tuple[tuple[Pose, ...], Route]:

@@ -59,7 +59,7 @@ class _Writer:
         self.episode, self.graph, self.dt = episode, graph, _fitting_step(episode, dt)
         limits = episode.limits
         self.steps = max(1, round(min(limits.max_steps * dt, limits.max_time) / self.dt))
-        self.lost: list[str] = []
+        self.omissions: list[str] = []
 
     def write(self, number: int) -> tuple[str, tuple[str, ...]]:
         episode, scenario = self.episode, self.episode.scenario
@@ -92,10 +92,12 @@ class _Writer:
             add_element(location, tag, value)
         add_element(add_element(root, "scenarioTags"), "simulated")
         first_free_id = self.graph.lane_count + 1
-        first_id, lost = write_lanes(root, self.graph, episode.signal_override, dt=self.dt, number=first_free_id)
-        self.lost += lost
+        first_id, omission_lines = write_lanes(
+            root, self.graph, episode.signal_override, dt=self.dt, number=first_free_id
+        )
+        self.omissions += omission_lines
         if episode.signal_override and episode.override_until < self.steps * self.dt:
-            self.lost.append(f"signals are forced only until {episode.override_until:g} s: here they stay")
+            self.omissions.append(f"signals are forced only until {episode.override_until:g} s: here they stay")
         others = list(enumerate(episode.agents[1:], first_id))  # ids in the order of the agents
         for obstacle_id, agent in others:
             if self._is_static(agent):
@@ -104,11 +106,11 @@ class _Writer:
             if not self._is_static(agent):
                 self._dynamic(root, obstacle_id, agent)
         if len(episode.agents) > 1:
-            self.lost.append("names of actors: obstacles have numbers")
+            self.omissions.append("names of actors: obstacles have numbers")
         self._problem(root, first_id + len(others))
         indent(root, " ")
         text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
-        return text, tuple(self.lost)
+        return text, tuple(self.omissions)
 
     @staticmethod
     def _is_static(agent: EpisodeAgent) -> bool:
@@ -131,7 +133,7 @@ class _Writer:
     def _dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
         first_step, rows = self._motion_rows(agent)
         if len(rows) < 2:
-            self.lost.append(f"{agent.name}, who is there for less than two steps")
+            self.omissions.append(f"{agent.name}, who is there for less than two steps")
             return
         obstacle = add_element(root, "dynamicObstacle", id=number)
         add_element(obstacle, "type", TYPES[model(agent.model).kind])
@@ -189,12 +191,14 @@ class _Writer:
         try:
             shortest = route_along(self.graph, (ego.pose, end))
         except RouteError:
-            self.lost.append("the ego's route: its start is not where a route can begin")
+            self.omissions.append("the ego's route: its start is not where a route can begin")
             return
         if abs(shortest.length - ego.route.length) > 1.5:
-            self.lost.append("the ego's route: a planning problem has a goal alone, and the shortest way is another")
+            self.omissions.append(
+                "the ego's route: a planning problem has a goal alone, and the shortest way is another"
+            )
         elif len(shortest.xy) != len(ego.route.xy):
-            self.lost.append("where the ego's route begins: a planning problem begins where the ego is")
+            self.omissions.append("where the ego's route begins: a planning problem begins where the ego is")
 
 
 def _fitting_step(episode: Episode, dt: float) -> float:

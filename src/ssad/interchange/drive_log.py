@@ -107,15 +107,15 @@ def scenario_of_drive(
     ego_poses = _ego_motion(scene_data, start)
     if len(ego_poses) < 2:
         raise ConfigError(f"{location}: it has no poses of the ego")
-    driven = ego_poses[ego_poses[:, 0] >= -0.25]
-    if float(np.hypot(*np.diff(driven[:, 1:3], axis=0).T).sum()) < LEAST_WAY:
+    path_length = ego_poses[ego_poses[:, 0] >= -0.25]
+    if float(np.hypot(*np.diff(path_length[:, 1:3], axis=0).T).sum()) < LEAST_WAY:
         raise ConfigError(f"{location}: the ego drives less than {LEAST_WAY:g} m; choose another scene")
     tracks, left_out = _tracks(scene_data, start)
     if not tracks:
         raise ConfigError(f"{location}: nothing is annotated that could be an actor; choose another scene")
     tracks, left_out = _nearest_tracks(tracks, ego_poses, left_out)
-    graph, is_known = _town(scene_data, location, driven, tracks, town=town, map_name=map_name)
-    scenario = _scenario(scene_data, graph, driven, tracks, name or f"log/{scene_data.record.name}", data.version)
+    graph, is_known = _town(scene_data, location, path_length, tracks, town=town, map_name=map_name)
+    scenario = _scenario(scene_data, graph, path_length, tracks, name or f"log/{scene_data.record.name}", data.version)
     build_episode(scenario, graph, seed=0)
     return LoggedDrive(scenario, graph, is_known, left_out)
 
@@ -246,8 +246,8 @@ def _scenario(  # noqa: PLR0917
         route = route_along(graph, points)
     except RouteError as error:
         raise RouteError(f"scene '{scene.record.name}': the way of the ego: {error}") from None
-    driven = path[path[:, 0] >= 0.0, 1:3]
-    route_distance = float(np.hypot(*np.moveaxis(driven[:, None] - route.xy[None], -1, 0)).min(1).max())
+    path_length = path[path[:, 0] >= 0.0, 1:3]
+    route_distance = float(np.hypot(*np.moveaxis(path_length[:, None] - route.xy[None], -1, 0)).min(1).max())
     if route_distance > OFF:
         raise RouteError(
             f"scene '{scene.record.name}': the way of the ego is up to {route_distance:.1f} m "
@@ -280,14 +280,14 @@ def _scenario(  # noqa: PLR0917
 def _key_points(path: F64) -> tuple[Pose, ...]:
     """Places of the ego at the start, each `KEY_POINT` m, and at the end."""
     unwrapped = np.unwrap(path[:, 3])
-    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, 1:3], axis=0).T))])
-    start_distance = float(np.interp(0.0, path[:, 0], driven))
-    count = max(1, round((driven[-1] - start_distance) / KEY_POINT))
-    distances = np.linspace(start_distance, driven[-1], count + 1)
+    path_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, 1:3], axis=0).T))])
+    start_distance = float(np.interp(0.0, path[:, 0], path_length))
+    count = max(1, round((path_length[-1] - start_distance) / KEY_POINT))
+    distances = np.linspace(start_distance, path_length[-1], count + 1)
     # Interpolation over distance needs increasing values, and a standing ego adds none.
-    is_increasing = np.concatenate([[True], np.diff(driven) > 1e-9])
+    is_increasing = np.concatenate([[True], np.diff(path_length) > 1e-9])
     x, y, yaw = (
-        np.interp(distances, driven[is_increasing], values[is_increasing])
+        np.interp(distances, path_length[is_increasing], values[is_increasing])
         for values in (path[:, 1], path[:, 2], unwrapped)
     )
     return tuple(

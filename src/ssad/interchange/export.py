@@ -35,7 +35,7 @@ def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int =
         SSADError: A scenario cannot be built, its town has no OpenDRIVE, or a file cannot be written.
     """
     files: list[Path] = []
-    lost: list[str] = []
+    lines: list[str] = []
     folder = make_folder(out)
     names = file_names(scenarios)
     for town in sorted({scenario.town for scenario in scenarios}):
@@ -48,8 +48,8 @@ def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int =
         )
         files.append(folder / f"{name}.xosc")
         write_atomic(files[-1], text)
-        lost += omissions
-    return files, lost
+        lines += omissions
+    return files, lines
 
 
 def export_commonroad(
@@ -73,7 +73,7 @@ def export_commonroad(
         SSADError: A scenario cannot be built or driven, or a file cannot be written.
     """
     files: list[Path] = []
-    lost: list[str] = []
+    lines: list[str] = []
     folder = make_folder(out)
     names = file_names(scenarios)
     numbers: Counter[str] = Counter()
@@ -81,13 +81,13 @@ def export_commonroad(
         graph = load_town(scenario.town)
         replayed, was_replayed = _with_trajectories(episode(scenario, seed), graph, system)
         if was_replayed:
-            lost.append(f"what others do by themselves: they repeat what they did beside '{system}'")
+            lines.append(f"what others do by themselves: they repeat what they did beside '{system}'")
         numbers[scenario.town] += 1
         text, omissions = commonroad_text(replayed, graph, number=numbers[scenario.town])
         files.append(folder / f"{name}.xml")
         write_atomic(files[-1], text)
-        lost += omissions
-    return files, lost
+        lines += omissions
+    return files, lines
 
 
 def _with_trajectories(nominal: Episode, graph: LaneGraph, system: str) -> tuple[Episode, bool]:

@@ -74,7 +74,7 @@ class AttributeReader:
 
 
 class PositionReader:
-    """Positions as poses in the world frame; inexact conversions are counted in `lost`."""
+    """Positions as poses in the world frame; inexact conversions are counted in `omissions`."""
 
     def __init__(
         self,

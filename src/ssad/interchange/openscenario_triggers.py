@@ -20,7 +20,7 @@ _OUTER: Final = ("Condition", "ByEntityCondition", "ByValueCondition", "EntityCo
 
 
 class TriggerReader:
-    """The triggers of a document; triggers without a counterpart are counted in `lost`."""
+    """The triggers of a document; triggers without a counterpart are counted in `omissions`."""
 
     def __init__(self, places: PositionReader, entities: Mapping[str, Entity], omissions: Counter[str]) -> None:
         self.values, self.places, self.entities, self.lost = places.values, places, entities, omissions

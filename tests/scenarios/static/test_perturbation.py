@@ -19,7 +19,7 @@ from ssad.core.images import read_image
 from ssad.core.types import Controller, EpisodeLimits
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.recorders.target_images import record_target_images
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering import onboard
@@ -192,7 +192,7 @@ def test_it_acts_on_a_recorded_target(name: str, targets: dict[str, Path]) -> No
 
 def on_target(perturbation: Perturbation, folder: Path) -> float:
     """Mean change of the images by a perturbation, code values."""
-    images = LightableClips(folder, 1)
+    images = RelightableTargetImages(folder, 1)
     changed = list(perturbation.on_target(images))
     clean = list(images.clean())
     assert [drive for drive, _, _ in changed] == [drive for drive, _, _ in clean]

@@ -85,8 +85,8 @@ class TwoStage(Adapter):
             for name in image_maps[0]
             if name not in ("anchors", "inside")
         }
-        anchors, inside = image_maps[0]["anchors"], image_maps[0]["inside"].tolist()
-        scale = input_scale((inside[0], inside[1]), size, anchors)
+        anchors, network_size = image_maps[0]["anchors"], image_maps[0]["inside"].tolist()
+        scale = input_scale((network_size[0], network_size[1]), size, anchors)
         filled = maps["filled"]
         logit = log_odds(maps["class_logits"])[..., self.columns].masked_fill(~filled[..., None], EMPTY_LOGIT)
         column = self.columns[logit.argmax(-1)]

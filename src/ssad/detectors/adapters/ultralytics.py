@@ -164,10 +164,10 @@ class Ultralytics(Adapter):
                 and YOLO11's.
         """
         size = check_images(self.name, images)
-        inside, scale = resized_size(size, self.input_width), self._scale(size, images.device)
+        network_size, scale = resized_size(size, self.input_width), self._scale(size, images.device)
         images = images.to(next(self.network.parameters()).dtype)
         multiple = max(32, *self.strides)
-        scores, boxes, features = self._heads(resize_and_pad(images, inside, multiple=multiple, grey=GREY))
+        scores, boxes, features = self._heads(resize_and_pad(images, network_size, multiple=multiple, grey=GREY))
         place, stride, level = self._places(features)
         distance = _expectation(boxes) * stride
         centre = place.T

@@ -86,17 +86,17 @@ class Mono3D(nn.Module):
         """
         maps, features, network_intrinsic, size = self._maps(images, intrinsic)
         scale, rows_above = self._scale(size, network_intrinsic), self._rows_above(size)
-        flat = flatten(maps)
+        flat_maps = flatten(maps)
         places = places_of(maps["cls_scores"], self.config.strides)
         with _full_precision(images):
             if self.training:
-                box = flat.reg.new_zeros((len(images), 0, 4))
+                box = flat_maps.reg.new_zeros((len(images), 0, 4))
             else:
-                solids = self._solids(flat, places.xy, network_intrinsic[:, None])
-                box = self._boxes(flat, places.xy, solids, intrinsic=network_intrinsic[:, None], size=size)
+                solids = self._solids(flat_maps, places.xy, network_intrinsic[:, None])
+                box = self._boxes(flat_maps, places.xy, solids, intrinsic=network_intrinsic[:, None], size=size)
         return Dense(
-            logit=flat.logit,
-            quality=flat.centreness,
+            logit=flat_maps.logit,
+            quality=flat_maps.centreness,
             box=box,
             place=(places.xy - places.xy.new_tensor([0.0, rows_above])) / scale,
             stride=places.stride / scale[0],
@@ -156,13 +156,13 @@ class Mono3D(nn.Module):
     ) -> list[Detections]:
         """Select and suppress detections; suppression runs on the host, with one transfer from the device."""
         with _full_precision(intrinsic):
-            flat, places = flatten(maps), places_of(maps["cls_scores"], self.config.strides)
-            class_scores = self._class_scores(flat, intrinsic)
+            flat_maps, places = flatten(maps), places_of(maps["cls_scores"], self.config.strides)
+            class_scores = self._class_scores(flat_maps, intrinsic)
             top_rows = self._top_places(maps, class_scores.amax(-1))
             class_scores = class_scores.gather(1, top_rows[..., None].expand(-1, -1, class_scores.shape[2]))
             image, place, label = (class_scores > threshold).nonzero(as_tuple=True)
             rows, score = top_rows[image, place], class_scores[image, place, label]
-            outputs, xy = select_rows(flat, image, rows), places.xy[rows]
+            outputs, xy = select_rows(flat_maps, image, rows), places.xy[rows]
             solids = centre, extent, yaw = self._solids(outputs, xy, intrinsic, image)
             image_boxes = self._boxes(outputs, xy, solids, intrinsic=intrinsic[image], size=size)
             candidates = torch.cat([centre, extent, outputs.reg[:, 7:9], outputs.direction], 1)
@@ -200,21 +200,26 @@ class Mono3D(nn.Module):
                 for image_column in image_columns
             ]
 
-    def _class_scores(self, flat: FlatMaps, intrinsic: Tensor) -> Tensor:
+    def _class_scores(self, flat_maps: FlatMaps, intrinsic: Tensor) -> Tensor:
         """Return scores [B, P, 10]: class times centreness, for PGD-Det times confidence of depth; see `fade`."""
-        scores = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
-        if flat.bins is not None:
-            scores = scores * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
+        scores = flat_maps.logit.sigmoid() * flat_maps.centreness.sigmoid()[..., None]
+        if flat_maps.bins is not None:
+            scores = scores * flat_maps.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
         if self.config.fade:
             scores = (
-                scores * torch.exp(-self.config.fade * self._depth(flat, intrinsic[:, None]).clamp_min(0.0))[..., None]
+                scores
+                * torch.exp(-self.config.fade * self._depth(flat_maps, intrinsic[:, None]).clamp_min(0.0))[..., None]
             )
         return scores
 
-    def _depth(self, flat: FlatMaps, intrinsic: Tensor) -> Tensor:
+    def _depth(self, flat_maps: FlatMaps, intrinsic: Tensor) -> Tensor:
         """Return the depth [..., P] of places, m; intrinsic [..., 3, 3], one per place or broadcast."""
-        depth = flat.reg[..., 2]
-        return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._depth_factor(intrinsic))
+        depth = flat_maps.reg[..., 2]
+        return (
+            depth
+            if flat_maps.bins is None
+            else self.bbox_head.fuse(depth, flat_maps.bins, self._depth_factor(intrinsic))
+        )
 
     def _vote(  # noqa: PLR0917
         self, values: Tensor, image_boxes: Tensor, score: Tensor, label: Tensor, image: Tensor, survivors: Tensor
@@ -369,20 +374,22 @@ class Mono3D(nn.Module):
             )
 
     def _solids(
-        self, flat: FlatMaps, xy: Tensor, intrinsic: Tensor, image: Tensor | None = None
+        self, flat_maps: FlatMaps, xy: Tensor, intrinsic: Tensor, image: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return centre, size, yaw of places; intrinsic [..., 3, 3] (broadcast), or one per image and image [P]."""
-        centre2d = xy - flat.reg[..., :2]
+        centre2d = xy - flat_maps.reg[..., :2]
         place_intrinsic = intrinsic if image is None else intrinsic[image]
-        depth = self._depth(flat, place_intrinsic)
+        depth = self._depth(flat_maps, place_intrinsic)
         centre = unproject(torch.cat([centre2d, depth[..., None]], -1), intrinsic, image)
-        direction = flat.direction.argmax(-1) if self.config.heading == "bins" else None
-        yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], place_intrinsic, offset=self.config.dir_offset)
-        return centre, flat.reg[..., 3:6], yaw
+        direction = flat_maps.direction.argmax(-1) if self.config.heading == "bins" else None
+        yaw = global_yaw(
+            flat_maps.reg[..., 6], direction, centre2d[..., 0], place_intrinsic, offset=self.config.dir_offset
+        )
+        return centre, flat_maps.reg[..., 3:6], yaw
 
     def _boxes(
         self,
-        flat: FlatMaps,
+        flat_maps: FlatMaps,
         xy: Tensor,
         solids: tuple[Tensor, Tensor, Tensor],
         *,
@@ -391,7 +398,7 @@ class Mono3D(nn.Module):
     ) -> Tensor:
         """Return 2D boxes [..., P, 4] at the image's pixel edges: PGD's own, else of the solids' corners."""
         if self.config.pgd:
-            box = torch.cat([xy - flat.reg[..., 9:11], xy + flat.reg[..., 11:13]], -1)
+            box = torch.cat([xy - flat_maps.reg[..., 9:11], xy + flat_maps.reg[..., 11:13]], -1)
         else:
             box = hull(project(solid_corners(*solids), intrinsic[..., None, :, :]))
         limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)

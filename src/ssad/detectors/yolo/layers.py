@@ -31,10 +31,10 @@ class ConvUnit(nn.Module):
 class Residual(nn.Module):
     """1x1 to `hidden` channels, 3x3 back to the input's channels; the input is added if `add`."""
 
-    def __init__(self, channels: int, hidden: int, *, smooth: bool, use_shortcut: bool = True) -> None:
+    def __init__(self, channels: int, hidden_channels: int, *, smooth: bool, use_shortcut: bool = True) -> None:
         super().__init__()
-        self.reduce = ConvUnit(channels, hidden, smooth=smooth)
-        self.expand = ConvUnit(hidden, channels, kernel=3, smooth=smooth)
+        self.reduce = ConvUnit(channels, hidden_channels, smooth=smooth)
+        self.expand = ConvUnit(hidden_channels, channels, kernel=3, smooth=smooth)
         self.add = use_shortcut
 
     def forward(self, x: Tensor) -> Tensor:

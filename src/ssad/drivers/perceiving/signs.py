@@ -155,9 +155,9 @@ class SignMemory:
         hits, last = (np.array(column) for column in zip(*((sine.hits, sine.last) for _, sine in signs), strict=True))
         yaw = pose[row, 2].astype(np.float64)
         offset, cosine, sine = place - pose[row, :2], np.cos(yaw), np.sin(yaw)
-        along, aside = cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0]
+        forward, lateral = cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0]
         confirmed = (hits >= self.settings.confirm) & (time[row] - last <= self.settings.memory)
-        nearby = (along > -BEHIND) & (along < AHEAD) & (np.abs(aside) < ASIDE)
+        nearby = (forward > -BEHIND) & (forward < AHEAD) & (np.abs(lateral) < ASIDE)
         is_ahead[row[confirmed & nearby]] = 1
         return is_ahead
 

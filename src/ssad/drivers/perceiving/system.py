@@ -137,8 +137,13 @@ class PerceivingSystem(Schema):
         name, options = self._part("perceiver")
         detector = (options.get("detector", self.detector) if name == "camera" else "") if name else self.detector
         tracker, settings = self._part("tracker")
-        given: dict[str, Any] = {"confirm": self.confirm, "reserve": self.reserve, "high": self.high, "low": self.low}
-        return tracking_settings(detector, **(given | settings if tracker == "kalman" else given))
+        given_settings: dict[str, Any] = {
+            "confirm": self.confirm,
+            "reserve": self.reserve,
+            "high": self.high,
+            "low": self.low,
+        }
+        return tracking_settings(detector, **(given_settings | settings if tracker == "kalman" else given_settings))
 
     def check(self) -> None:
         """Validate the settings, and make the parts that are named.

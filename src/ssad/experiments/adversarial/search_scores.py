@@ -35,8 +35,8 @@ def summary(row: Sequence[Outcome]) -> dict[str, Any]:
     first_rollout = next((rollout for rollout, outcome in enumerate(row, 1) if outcome.is_valid), None)
 
     def mean(values: Sequence[float | bool | None]) -> float | None:
-        measured = [float(value) for value in values if value is not None]
-        return float(np.mean(measured)) if measured else None
+        measured_values = [float(value) for value in values if value is not None]
+        return float(np.mean(measured_values)) if measured_values else None
 
     return {
         "CR": bool(valid),

@@ -53,8 +53,8 @@ def _counts(run: DrivingRun, systems: list[str]) -> str:
     for system in systems:
         cells = [estimates["CR"] for group in SCENARIOS if (estimates := run.numbers.get((system, group)))]
         ranges = [
-            str(fewest) if fewest == largest else f"{fewest} to {largest}"
-            for fewest, largest in (
+            str(min_count) if min_count == largest else f"{min_count} to {largest}"
+            for min_count, largest in (
                 (min(counts), max(counts)) for counts in ([cell.n for cell in cells], [cell.clusters for cell in cells])
             )
         ]

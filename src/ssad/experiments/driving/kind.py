@@ -131,15 +131,15 @@ class Driving(ScenarioKind):
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drive the episodes as one batch of the world, measure them, write their traces."""
         start_time = time.perf_counter()
-        episodes, traces, measured = drive(cells, device=job.device)
+        episodes, traces, simulator_counts = drive(cells, device=job.device)
         shared_seconds = (time.perf_counter() - start_time) / len(cells)
         results: dict[str, dict[str, Any]] = {}
         for cell, episode, trace in zip(cells, episodes, traces, strict=True):
             start_time = time.perf_counter()
             result = drive_record(cell, episode, trace, job.folder)
-            if measured:
-                result["metrics"]["lane_crossings"] = measured["lane_crossings"]
-                result["measured"] = to_plain_json(measured)
+            if simulator_counts:
+                result["metrics"]["lane_crossings"] = simulator_counts["lane_crossings"]
+                result["measured"] = to_plain_json(simulator_counts)
             if job.settings["witness"] and trace.end == "collision" and runs_embedded(cell):
                 grade = grade_of(episode, trace, job.device)
                 result["metrics"] |= grade.metrics()

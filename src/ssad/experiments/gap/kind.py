@@ -261,7 +261,7 @@ class Gap(ScenarioKind):
             replayed_traces[-1],
             graph,
             film=drive_film_frames,
-            seen=driver_perception,
+            perception=driver_perception,
         )
 
     def page(self, run: Run) -> tuple[str, Sequence[Table]]:
@@ -317,7 +317,7 @@ def conditions_of(suite: GapSuite) -> list[Condition]:
         suite.conditions()
     except ConfigError as error:
         raise type(error)(f"suite {suite.name}: {error}") from None
-    made = [
+    perturbations = [
         (perturbation, entry.model_dump(mode="json"))
         for entry in suite.perturbations
         for perturbation in entry.at(suite.severities)
@@ -326,5 +326,5 @@ def conditions_of(suite: GapSuite) -> list[Condition]:
     for system in suite.systems:
         conditions.append(Condition(system))
         if not system.is_perfect:
-            conditions += [Condition(system, perturbation, entry) for perturbation, entry in made]
+            conditions += [Condition(system, perturbation, entry) for perturbation, entry in perturbations]
     return conditions

@@ -43,8 +43,8 @@ def drive_perceiving(
     if spec["settings"] is None:
         return *drive(requests, device=device, key=_pairing_key)[:2], None
     system = PerceivingSystem.model_validate(spec["settings"])
-    watcher = PerceptionRecorder(system.view_cameras, len(requests), image_interval)
-    driver = system.make(watcher, repair=repair, device=device)
+    recorder = PerceptionRecorder(system.view_cameras, len(requests), image_interval)
+    driver = system.make(recorder, repair=repair, device=device)
     perturbation = perturbation_of(spec)
     if perturbation is not None and perturbation.needs_victim and driver.detector is None:
         raise ConfigError(
@@ -61,7 +61,7 @@ def drive_perceiving(
     drive_results = drive(
         requests, device=device, key=_pairing_key, driver=driver, sensors=suite.build(), perturbation=suite.changes
     )
-    return *drive_results[:2], watcher
+    return *drive_results[:2], recorder
 
 
 def perturbation_of(spec: Mapping[str, Any]) -> Perturbation | None:

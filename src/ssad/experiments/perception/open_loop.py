@@ -30,7 +30,7 @@ from ssad.engine.kind import Cell, CellError, Column, Job, Kind, Plan, Replay, R
 from ssad.engine.progress import LiveProgress
 from ssad.engine.replay import describe_difference
 from ssad.engine.run import hash_artefacts
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.experiments.perception.scene_boxes import (
     Examination,
     SceneCondition,
@@ -96,7 +96,7 @@ class TargetCondition:
         name: The target in words.
     """
 
-    images: LightableClips
+    images: RelightableTargetImages
     perturbation: Perturbation | None
     name: str
 
@@ -408,6 +408,6 @@ def _recorded_scenes(
 
 
 @lru_cache(maxsize=8)
-def _clean_sightings(images: LightableClips, detector: str, weights: str | None) -> tuple[TargetSighting, ...]:
+def _clean_sightings(images: RelightableTargetImages, detector: str, weights: str | None) -> tuple[TargetSighting, ...]:
     """Return a detector's sightings in clean images, which all cells of a target are compared with."""
     return tuple(sightings(cached_detector(detector, weights=weights, device=images.device), images.clean()))

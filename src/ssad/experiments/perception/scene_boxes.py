@@ -130,11 +130,11 @@ def recorded_scene(examination: Examination, data: NuScenes, condition: SceneCon
     )
 
 
-def _share_failures(look: Look, victim: MonitoredDetector, detectors: Sequence[MonitoredDetector]) -> Look:
+def _share_failures(perturb_images: Look, victim: MonitoredDetector, detectors: Sequence[MonitoredDetector]) -> Look:
     """Return a function of images after which a failure of the victim is one of all detectors."""
 
     def look_and_pass(frames: Sequence[SensorFrame]) -> Sequence[U8]:
-        images = look(frames)
+        images = perturb_images(frames)
         for detector in detectors:
             if victim.reason and detector is not victim and not detector.reason:
                 detector.reason = f"the attack on {victim.name} failed: {victim.reason}"
@@ -197,7 +197,7 @@ def find_boxes(examination: Examination, scene: SceneCondition, detectors: Seque
             examination.root,
             dataset.scene(scene.scene),
             device=examination.device,
-            look=presentation.look,
+            load_images=presentation.look,
             ahead=presentation.ahead,
             at_once=samples_at_once(presentation),
         )

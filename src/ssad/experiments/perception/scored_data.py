@@ -26,7 +26,7 @@ from ssad.rendering.target import Target, class_of_target
 RECORDED = "recorded"
 
 
-class Recorded(Schema):
+class RecordedData(Schema):
     """Validation set that is recorded by default: drives in towns that the shipped detectors never saw.
 
     Attributes:
@@ -61,7 +61,7 @@ class DetectorTable(Schema):
     data: str = Field(default=RECORDED, min_length=1)
     version: str | None = None
     split: str = "val"
-    recorded: Recorded = Recorded()
+    recorded: RecordedData = RecordedData()
 
 
 class Victims(NamedTuple):

@@ -17,7 +17,7 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.engine.kind import Job, Plan, Resources
 from ssad.experiments.perception import open_loop
 from ssad.experiments.perception.scene_boxes import Examination, boxes_path
-from ssad.experiments.perception.scored_data import Recorded, Victims, recording_of
+from ssad.experiments.perception.scored_data import RecordedData, Victims, recording_of
 from ssad.experiments.perception.shifts import kind as shifts_kind
 from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite, shifted_scene
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, deal_severities
@@ -81,7 +81,7 @@ def test_what_a_suite_says_by_default() -> None:
     assert found.shifts == list(SHIFTS)
     assert (found.detectors, found.data, found.version) == (["fcos3d-light", "pgd-det-light"], "recorded", None)
     assert (found.split, found.calibration, found.replicates) == ("val", "physical", 100)
-    recorded = Recorded()
+    recorded = RecordedData()
     assert (recorded.towns, recorded.scenes, recorded.seconds) == (["Oldmarket", "Larkhill"], 12, 8.0)
     assert (recorded.width, recorded.seed) == (800, 0)
 

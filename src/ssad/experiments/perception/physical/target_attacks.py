@@ -20,9 +20,9 @@ from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.detectors import cached_detector
 from ssad.engine.pool import open_pool, run_all
-from ssad.experiments.perception.physical.lit_images import LightableClips
+from ssad.experiments.perception.physical.lit_images import RelightableTargetImages
 from ssad.experiments.perception.physical.target_sheet import COLUMNS, target_sheet
-from ssad.experiments.perception.physical.textured_images import see_clips, unseen_parts
+from ssad.experiments.perception.physical.textured_images import cache_texture_images, uncached_parts
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.camera.scene import TextureDecal, TextureLayer
 from ssad.rendering.camera.scene_edit import SceneEdit
@@ -68,9 +68,9 @@ class TargetAttacks:
         detector: Detector = cached_detector(name, device=self.device)
         return detector
 
-    def clips(self, recording: str, count: int, detector: str) -> LightableClips:
+    def images(self, recording: str, count: int, detector: str) -> RelightableTargetImages:
         """Return the first images of a recording, clean or ready for a texture."""
-        return LightableClips.of(self.folder / "data" / recording, count, self.detector(detector), self.device)
+        return RelightableTargetImages.of(self.folder / "data" / recording, count, self.detector(detector), self.device)
 
     def texture(self, spec: TextureSpec) -> TrainedTexture:
         """Return a texture as a perturbation of the target."""
@@ -83,7 +83,7 @@ class TargetAttacks:
     def sheet(
         self,
         detector: str,
-        clips: LightableClips,
+        clips: RelightableTargetImages,
         *,
         textures: Mapping[str, TextureSpec],
         sides: Sequence[float | None],
@@ -126,7 +126,7 @@ class TargetAttacks:
         """Draw the first image of a recording under lights: by title the hour and the light (None: none)."""
         victim, titled_images = self.detector(detector), []
         for title, (hour, spec) in lights.items():
-            images = replace(self.clips(recording, 1, detector), hour=hour)
+            images = replace(self.images(recording, 1, detector), hour=hour)
             ((_, tensor, truth),) = images.clean() if spec is None else self.light(spec).on_target(images)
             titled_images.append((title, tensor))
         return target_sheet(victim, titled_images, truth, self.device)
@@ -165,9 +165,9 @@ class TrainedTexture(Perturbation):
         surface = surface_of(attacks.target, spec.surface)
 
         def views() -> list[TextureView]:
-            image_sets = [attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
+            image_sets = [attacks.images(spec.pair["train"], spec.pair["train_images"], spec.source)]
             if spec.around:
-                image_sets.append(attacks.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
+                image_sets.append(attacks.images(f"{spec.pair['train']}-around", spec.around, spec.source))
             return [view for image_set in image_sets for _, view in image_set.wearing(surface, solid=image_set.whole)]
 
         base_paint = paint_under(attacks.target, spec.surface)
@@ -221,8 +221,8 @@ class SearchedLight(Perturbation):
         car = parse_target(attacks.target)
         assert isinstance(car, TargetCar)
 
-        def training_images() -> LightableClips:
-            return attacks.clips(spec.pair["train"], spec.pair["train_images"], spec.source)
+        def training_images() -> RelightableTargetImages:
+            return attacks.images(spec.pair["train"], spec.pair["train_images"], spec.source)
 
         def projected(edit: SceneEdit) -> list[TextureView]:
             texture_size = edit.textures[0].shape[1], edit.textures[0].shape[2]
@@ -231,12 +231,14 @@ class SearchedLight(Perturbation):
                 TextureView(
                     clip.projected(edit).prepare({0: texture_size}, device=attacks.device), images.lit_truth(clip)
                 )
-                for clip in images.clips_at(spec.hour)
+                for clip in images.images_at(spec.hour)
             ]
 
         def views() -> list[SearchView]:
             images = training_images()
-            return [SearchView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.clips_at(spec.hour)]
+            return [
+                SearchView(clip.lit(attacks.device), images.lit_truth(clip)) for clip in images.images_at(spec.hour)
+            ]
 
         return attacks.lights.edit(
             spec,
@@ -260,7 +262,7 @@ class SearchedLight(Perturbation):
         return {"artefacts": artefacts, **lights.history(spec)}
 
 
-def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
+def render_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
     """Render and store the contribution of carriers to the images of a part, in a worker.
 
     Args:
@@ -268,10 +270,10 @@ def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
     """
     folder, part_number, target, surfaces, device = task
     start_warp_quietly()
-    see_clips(folder, layers_of(target, surfaces), part=part_number, device=device)
+    cache_texture_images(folder, layers_of(target, surfaces), part=part_number, device=device)
 
 
-def see_all(
+def render_all_surfaces(
     recordings: Sequence[TargetRecording],
     target: str,
     surfaces: Sequence[str],
@@ -291,15 +293,15 @@ def see_all(
         (recording.out, part_number, target, surfaces, recording.device)
         for recording in recordings
         if surfaces
-        for part_number in unseen_parts(recording.out, layers_of(target, surfaces))
+        for part_number in uncached_parts(recording.out, layers_of(target, surfaces))
     ]
     if tasks:
         pool = open_pool(len(tasks), workers=workers, ray=ray, device=recordings[0].device)
-        run_all(pool, see_surfaces, tasks, progress=progress)
+        run_all(pool, render_surfaces, tasks, progress=progress)
 
 
 def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[TextureLayer | TextureDecal, ...]]:
-    """Where textures go, each alone, as `see_clips` takes them."""
+    """Where textures go, each alone, as `cache_texture_images` takes them."""
     return [(surface_of(target, surface).layer,) for surface in surfaces]
 
 
