@@ -3,26 +3,31 @@
 `python -m benchmarks.drivers --sets precrash,natural` measures driving systems, `--adversaries natural,frea` egos with
 and without adversaries; `safebench` and `frea` must have been imported (docs/how-to/import-scenarios.md). Each set is
 kept in benchmarks/results/drivers.json, and `--page` writes the tables of what is there into docs/results/drivers.md
-and adversaries.md. Intervals are of 95 %; each scenario is a cluster, as in reports, but where all towns of a set are
-taken together, each route with its draws of traffic.
+and adversaries.md. Intervals are of 95 %; a route with all its draws of traffic is a cluster, as in reports, and fewer
+than ten routes have no interval, but the range over them.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import torch
 
 from benchmarks.insert import insert
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.types import Episode
 from ssad.drivers import LEARNED, make_system
 from ssad.drivers import SYSTEMS as REGISTERED
+from ssad.experiments.scenario_kind import route_of
 from ssad.metrics import CaseValue, Estimate, episode_metrics, estimate, paired_difference
+from ssad.metrics.intervals import MIN_ROUTES
 from ssad.scenarios.dynamic.generate import Trials
 from ssad.scenarios.dynamic.policy.adv_ppo import SHIPPED, Adversary
 from ssad.training.driver import draw_episodes, find_scenarios
@@ -46,14 +51,37 @@ def episodes_of(name: str) -> tuple[list[Episode], dict[str, Any]]:
     return draw_episodes(scenarios, graphs, draws=1, seed=0), graphs
 
 
-def case(episode: Episode, value: float, *, by_route: bool = False) -> CaseValue:
-    """A value of an episode; its cluster is its scenario, or its route with all draws of traffic."""
-    return CaseValue(float(value), repr(episode.scenario.route) if by_route else episode.scenario.name, episode.key)
+def case(episode: Episode, value: float) -> CaseValue:
+    """Return a value of an episode; its cluster is its route with all draws of traffic."""
+    return CaseValue(float(value), route_of(episode.scenario), episode.key)
 
 
-def plain(found: Estimate) -> dict[str, float]:
-    """Mean and limits."""
-    return {"mean": found.mean, "low": found.low, "high": found.high, "n": found.n}
+def plain(estimated: Estimate) -> dict[str, Any]:
+    """Return mean and limits, the number of cases and of routes, and what the limits are."""
+    return {
+        "mean": estimated.mean,
+        "low": estimated.low,
+        "high": estimated.high,
+        "n": estimated.n,
+        "routes": estimated.clusters,
+        "method": estimated.method,
+    }
+
+
+def provenance(systems: Sequence[str]) -> dict[str, Any]:
+    """Return commit, torch version and the hash of the weights of what is measured."""
+    commit = subprocess.run(
+        ["git", "log", "-1", "--format=%h (%cs)"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
+    folders = [ROOT / "src" / "ssad" / "drivers" / "learned" / "weights", SHIPPED]
+    files = [folder / f"{system}.safetensors" for folder in folders for system in systems]
+    weights = {file.stem: hashlib.sha256(file.read_bytes()).hexdigest()[:12] for file in files if file.is_file()}
+    return {"commit": commit, "torch": torch.__version__.partition("+")[0], "weights": weights}
+
+
+def rate(values: Sequence[CaseValue], kind: Literal["share", "bounded"]) -> dict[str, Any]:
+    """Return the mean of values with its limits, which need ten routes."""
+    return plain(estimate(values, kind, min_clusters=MIN_ROUTES))
 
 
 def drive(name: str) -> dict[str, Any]:
@@ -67,9 +95,9 @@ def drive(name: str) -> dict[str, Any]:
             rows += [episode_metrics(trace) for trace in rollout(World(part, graphs), make_system(system))]
         cases = list(zip(episodes, rows, strict=True))
         table[system] = {
-            "CR": plain(estimate([case(e, r.collision) for e, r in cases], "share")),
-            "RC": plain(estimate([case(e, r.route_completion) for e, r in cases], "bounded")),
-            "off": plain(estimate([case(e, r.off_road_fraction) for e, r in cases], "bounded")),
+            "CR": rate([case(e, r.collision) for e, r in cases], "share"),
+            "RC": rate([case(e, r.route_completion) for e, r in cases], "bounded"),
+            "off": rate([case(e, r.off_road_fraction) for e, r in cases], "bounded"),
             "speed": float(np.mean([r.driven / r.time for r in rows])),
         }
         print(
@@ -96,7 +124,7 @@ def attack(name: str, adversaries: Sequence[str]) -> dict[str, Any]:
                 for town in (*sorted(graphs), " + ".join(sorted(graphs))):
                     here = [k for k, e in enumerate(episodes) if town in (e.town, " + ".join(sorted(graphs)))]
                     parts = ([rows[k] for k in here] for rows in (episodes, found, natural))
-                    row = measured(*parts, by_route="+" in town)
+                    row = measured(*parts)
                     table.setdefault(town, {}).setdefault(ego, {})[f"{adversary} x {count}" if adversary else ""] = row
                     print(
                         town, ego, adversary, count, *(f"{key} {text(value)}" for key, value in row.items()), flush=True
@@ -110,9 +138,7 @@ def outcomes(trials: Trials, episodes: Sequence[Episode], graphs: Any, drivers: 
     return trials.run(bases)
 
 
-def measured(
-    episodes: Sequence[Episode], found: Sequence[Outcome], natural: Sequence[Outcome], *, by_route: bool
-) -> dict[str, Any]:
+def measured(episodes: Sequence[Episode], found: Sequence[Outcome], natural: Sequence[Outcome]) -> dict[str, Any]:
     """Shares of the episodes, and how many more collisions than in natural traffic."""
 
     def crashed(outcome: Outcome) -> bool:
@@ -125,19 +151,19 @@ def measured(
         "others": [o.hit_others for o in found],
     }
     rows = {
-        key: plain(estimate([case(e, v, by_route=by_route) for e, v in zip(episodes, column, strict=True)], "share"))
+        key: rate([case(e, v) for e, v in zip(episodes, column, strict=True)], "share")
         for key, column in values.items()
     }
-    pair = [
-        {e.key: case(e, crashed(o), by_route=by_route) for e, o in zip(episodes, side, strict=True)}
-        for side in (found, natural)
-    ]
-    return rows | {"more": plain(paired_difference(pair[0], pair[1], kind="share"))}
+    pair = [{e.key: case(e, crashed(o)) for e, o in zip(episodes, side, strict=True)} for side in (found, natural)]
+    return rows | {"more": plain(paired_difference(pair[0], pair[1], kind="share", min_clusters=MIN_ROUTES))}
 
 
 def text(value: Any) -> str:
-    """A mean with its interval."""
-    return f"{value['mean']:.2f} [{value['low']:.2f}, {value['high']:.2f}]"
+    """Return a mean with its interval, or with the range over its routes where they are too few for one."""
+    limits = f"{value['low']:.2f}, {value['high']:.2f}"
+    if value.get("method") == "range":
+        return f"{value['mean']:.2f} ({limits.replace(',', ' to')} over {value['routes']} routes)"
+    return f"{value['mean']:.2f} [{limits}]" if value.get("method") != "none" else f"{value['mean']:.2f}"
 
 
 def driver_table(data: dict[str, Any]) -> list[str]:
@@ -145,7 +171,12 @@ def driver_table(data: dict[str, Any]) -> list[str]:
     lines = []
     for name, table in data.items():
         n = table["blind"]["CR"]["n"]
-        lines += [f"`{name}` ({n} episodes):", "", "| system | CR | RC | off the road | mean speed, m/s |"]
+        routes = table["blind"]["CR"].get("routes")
+        lines += [
+            f"`{name}` ({n} episodes{f' on {routes} routes' if routes else ''}):",
+            "",
+            "| system | CR | RC | off the road | mean speed, m/s |",
+        ]
         lines += ["|---|---|---|---|---:|"]
         for system, row in table.items():
             cells = " | ".join(text(row[key]) for key in ("CR", "RC", "off"))
@@ -173,7 +204,18 @@ def page(data: dict[str, Any]) -> None:
     """Write the tables between their markers in the document."""
     for part, make in (("drivers", driver_table), ("adversaries", adversary_table)):
         if part in data:
-            insert(f"results/{part}.md", part, make(data[part]))
+            made = data.get("made", {}).get(part, {})
+            insert(f"results/{part}.md", part, [*made_lines(made), *make(data[part])])
+
+
+def made_lines(made: dict[str, Any]) -> list[str]:
+    """Return a sentence for each set that says of which commit, weights and torch version its numbers are."""
+    sets: dict[str, list[str]] = {}
+    for name, origin in made.items():
+        weights = ", ".join(f"`{system}` {digest}" for system, digest in origin["weights"].items())
+        sentence = f"commit {origin['commit']}, torch {origin['torch']}, weights {weights}"
+        sets.setdefault(sentence, []).append(f"`{name}`")
+    return [f"{', '.join(names)}: {sentence}.\n" for sentence, names in sets.items()]
 
 
 def main() -> None:
@@ -188,9 +230,11 @@ def main() -> None:
     shipped = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
     for name in filter(None, given.sets.split(",")):
         data.setdefault("drivers", {})[name] = drive(name)
+        data.setdefault("made", {}).setdefault("drivers", {})[name] = provenance(SYSTEMS)
         given.json.write_text(json.dumps(data, indent=1) + "\n")
     for name in filter(None, given.adversaries.split(",")):
         data.setdefault("adversaries", {})[name] = attack(name, shipped)
+        data.setdefault("made", {}).setdefault("adversaries", {})[name] = provenance([*EGOS, *shipped])
         given.json.write_text(json.dumps(data, indent=1) + "\n")
     if given.page:
         page(data)

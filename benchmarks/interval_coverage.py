@@ -9,13 +9,28 @@ from __future__ import annotations
 
 import argparse
 import zlib
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 import numpy.typing as npt
 
-from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, mean_limits, replicate_limits
+from ssad.metrics.intervals import (
+    LEVEL,
+    MIN_CLUSTERS,
+    MIN_ROUTES,
+    Clusters,
+    ConfidenceLimits,
+    bounded_limits,
+    difference_limits,
+    mean_limits,
+    replicate_limits,
+    share_limits,
+    t_quantile,
+)
 
 F64 = npt.NDArray[np.float64]
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "results" / "intervals.md"
@@ -39,6 +54,14 @@ STRATA = {
     "0.05 to 0.95": np.linspace(0.05, 0.95, 8).tolist(),
     "the paper's TD3": [1, 0.25, 0.75, 0, 1, 1, 1, 1],
 }
+
+ROUTE_COUNTS = (10, 15, 20, 38)
+DESIGN_EFFECTS = (1.6, 2.5, 4.0, 5.1, 6.4)
+"""From cases that are weakly alike to the greatest that a few routes of ten cases show."""
+ROUTE_SHARES = (0.02, 0.05, 0.1, 0.3, 0.5)
+FLIPS = ((0.02, 0.02), (0.05, 0.02), (0.1, 0.05), (0.3, 0.1), (0.5, 0.3))
+"""Shares of the cases where only the first, and only the second system has the event."""
+MAX_WIDTH_RATIO = 1.5
 
 
 def design(clusters: int, cases: int, strata: int = 1) -> Clusters:
@@ -189,6 +212,259 @@ def stream(*key: object) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(zlib.crc32(repr(key).encode())))
 
 
+def natural_sizes() -> F64:
+    """[38] cases on each route of the set `natural`, in ascending order."""
+    from ssad.experiments.scenario_kind import route_of
+    from ssad.scenarios.dynamic import load_scenarios
+
+    return np.sort(np.array([*Counter(map(route_of, load_scenarios("natural"))).values()], np.float64))
+
+
+def route_layout(routes: int, natural: F64) -> Clusters:
+    """Routes with unequal numbers of cases: `natural`; `frea`, 15 routes of 10 cases; else twice those of `natural`."""
+    if routes == len(natural):
+        size = natural
+    elif routes == 15:
+        size = np.full(routes, 10.0)
+    else:
+        size = 2.0 * natural[np.linspace(0, len(natural) - 1, routes).round().astype(int)]
+    return Clusters(size, np.zeros(routes, np.intp))
+
+
+def correlation_of(design_effect: float, layout: Clusters) -> float:
+    """Correlation of the cases of a cluster that makes a design effect; above 1 where none does."""
+    return (design_effect - 1.0) / (float(layout.size @ layout.size) / float(layout.size.sum()) - 1.0)
+
+
+def counts(
+    random: np.random.Generator, draws: int, shares: Sequence[float], layout: Clusters, correlation: float
+) -> list[F64]:
+    """Numbers [draws, K] of cases with each of several exclusive events (Dirichlet-multinomial)."""
+    shape, size = (draws, len(layout.size)), layout.size.astype(np.int64)
+    all_shares = np.array([*shares, 1.0 - sum(shares)])
+    if correlation >= 1.0:
+        chance = random.multinomial(1, all_shares, shape).astype(np.float64)
+    else:
+        drawn = random.gamma(all_shares * (1.0 - correlation) / correlation, size=(*shape, len(all_shares))) + 1e-300
+        chance = drawn / drawn.sum(axis=-1, keepdims=True)
+    remaining_cases, remaining_chance, events = np.broadcast_to(size, shape), np.ones(shape), []
+    for index in range(len(shares)):
+        conditional = np.clip(chance[..., index] / np.maximum(remaining_chance, 1e-300), 0.0, 1.0)
+        events.append(random.binomial(remaining_cases, conditional))
+        remaining_cases, remaining_chance = remaining_cases - events[-1], remaining_chance - chance[..., index]
+    return [event.astype(np.float64) for event in events]
+
+
+@dataclass(frozen=True)
+class RouteResult:
+    """Coverage of the intervals in one simulation, and their mean width over that of two oracles.
+
+    Attributes:
+        coverage: Share of the intervals that hold the truth.
+        width: Mean width over that of an oracle that knows the design effect: the same limits with the true effective
+            number of cases.
+        normal_width: Mean width over that of an oracle that knows the standard error: 3.92 standard errors.
+    """
+
+    coverage: float
+    width: float
+    normal_width: float
+
+    @property
+    def text(self) -> str:
+        """As it stands in the tables."""
+        return f"{percent(self.coverage)} ({self.width:.2f}, {self.normal_width:.2f})"
+
+
+def route_result(shares: Sequence[float], layout: Clusters, design_effect: float, draws: int) -> RouteResult | None:
+    """Result for one share, or for the difference of two; None where the routes are too small for the design effect."""
+    correlation = correlation_of(design_effect, layout)
+    if correlation > 1.0:
+        return None
+    cases = float(layout.size.sum())
+    random = stream("routes", tuple(shares), layout.size.tolist(), design_effect)
+    events = counts(random, draws, shares, layout, correlation)
+    estimates = [bounded_limits(sums, layout, cap=2.0 * cases) for sums in events]
+    oracles = [known_effect_limits(sums, layout, design_effect) for sums in events]
+    low, high, known_low, known_high = (
+        (estimates[0].low, estimates[0].high, oracles[0].low, oracles[0].high)
+        if len(shares) == 1
+        else (*difference_limits(*estimates), *difference_limits(*oracles))
+    )
+    truth = shares[0] - sum(shares[1:])
+    standard_error = np.sqrt((sum(shares) - truth**2) * design_effect / cases)
+    width = float((high - low).mean())
+    return RouteResult(
+        coverage(truth, low, high)[0],
+        width / float((known_high - known_low).mean()),
+        width / (2.0 * NormalDist().inv_cdf(0.5 + 0.5 * LEVEL) * standard_error),
+    )
+
+
+def known_effect_limits(sums: F64, layout: Clusters, design_effect: float) -> ConfidenceLimits:
+    """Limits of the oracle that knows the design effect."""
+    cases = float(layout.size.sum())
+    mean = sums.sum(axis=1) / cases
+    return ConfidenceLimits(mean, *share_limits(mean, np.full(mean.shape, cases / design_effect)), "beta")
+
+
+def route_lines(draws: int) -> list[str]:
+    """Coverage and width on routes like those of `natural` and `frea`, as Markdown."""
+    natural = natural_sizes()
+    lines = [
+        "Routes with unequal numbers of cases, as those of "
+        f"`natural` ({natural.sum():.0f} cases on {len(natural)}) and `frea` (150 on 15).",
+        "The cases of a route are alike by the design effect (beta-binomial). In brackets: the mean width over that",
+        "of an oracle that knows the design effect, and over that of one that knows the standard error. A dash: routes",
+        "too small for the design effect.",
+    ]
+    for title, columns in (
+        ("Shares", {f"p = {share:g}": (share,) for share in ROUTE_SHARES}),
+        (
+            "Paired differences, by the shares of only the first and only the second",
+            {f"{first:g} and {second:g}": (first, second) for first, second in FLIPS},
+        ),
+    ):
+        lines += ["", f"{title}:", "", *head("Routes, design effect", list(columns))]
+        results: dict[str, RouteResult] = {}
+        for routes in ROUTE_COUNTS:
+            layout = route_layout(routes, natural)
+            for design_effect in DESIGN_EFFECTS:
+                cells = []
+                for column, shares in columns.items():
+                    result = route_result(shares, layout, design_effect, draws)
+                    cells.append("–" if result is None else result.text)
+                    if result is not None:
+                        results[f"{routes} routes, {design_effect:g}, {column}"] = result
+                lines.append(row(f"{routes}, {design_effect:g}", cells))
+        lines += ["", *_route_summary(results)]
+    return lines
+
+
+def _route_summary(results: dict[str, RouteResult]) -> list[str]:
+    """Lowest coverage of a table, and where its intervals are more than 1.5 times as wide as an oracle's."""
+    lowest = min(results, key=lambda name: results[name].coverage)
+    lines = [f"* Lowest coverage: {percent(results[lowest].coverage)} ({lowest})."]
+    widths = {
+        "the design effect": {name: result.width for name, result in results.items()},
+        "the standard error": {name: result.normal_width for name, result in results.items()},
+    }
+    for oracle, ratios in widths.items():
+        wide = {name: ratio for name, ratio in ratios.items() if ratio > MAX_WIDTH_RATIO}
+        columns = ", ".join(dict.fromkeys(name.split(", ", 2)[2] for name in wide))
+        where = f"; all in the columns {columns}" if wide else ""
+        lines.append(
+            f"* More than {MAX_WIDTH_RATIO:g} times as wide as the oracle that knows {oracle}: {len(wide)} of "
+            f"{len(ratios)}, at most {max(ratios.values()):.2f}{where}."
+        )
+    return lines
+
+
+Limits = Callable[[F64, Clusters, float], tuple[F64, F64]]
+
+
+def limits_here(sums: F64, layout: Clusters, _: float) -> tuple[F64, F64]:
+    """Limits of SSAD."""
+    limits = bounded_limits(sums, layout, cap=2.0 * float(layout.size.sum()))
+    return limits.low, limits.high
+
+
+def limits_of_effective(sums: F64, layout: Clusters, *, kurtosis: bool) -> tuple[F64, F64]:
+    """Beta limits whose design effect is taken as it is estimated (Korn and Graubard 1998).
+
+    The degrees of freedom are clusters less one, or those of the variance: fewer with the kurtosis of the clusters.
+    """
+    cases, clusters = float(layout.size.sum()), len(layout.size)
+    mean = sums.sum(axis=1) / cases
+    squares = ((sums - layout.size * mean[:, None]) / cases) ** 2
+    min_effective = 1.0 / float((layout.weight**2).sum())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = clusters * (squares**2).sum(axis=1) / squares.sum(axis=1) ** 2 - 1.0
+        freedom = np.clip(np.nan_to_num(2.0 * clusters / excess), 1.0, clusters - 1.0) if kurtosis else clusters - 1.0
+        variance = squares.sum(axis=1) * clusters / (clusters - 1.0)
+        quantiles = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL) / t_quantile(freedom)
+        effective = np.nan_to_num(mean * (1.0 - mean) / variance * quantiles**2, nan=min_effective)
+    return share_limits(mean, np.clip(effective, min_effective, 2.0 * cases))
+
+
+def limits_of_likelihood(sums: F64, layout: Clusters, _: float) -> tuple[F64, F64]:
+    """Limits where the profile likelihood of the beta-binomial falls by half a Student quantile squared."""
+    from scipy.special import betaln
+
+    share = np.unique(np.concatenate([np.geomspace(1e-4, 0.05, 50), np.linspace(0.05, 0.95, 91)]))
+    correlation = np.array([1e-4, 0.03, 0.1, 0.2, 0.3, 0.45, 0.6, 0.75, 0.9, 0.999])[:, None]
+    first, second = share * (1.0 - correlation) / correlation, (1.0 - share) * (1.0 - correlation) / correlation
+    likelihood = np.zeros((len(sums), *first.shape))
+    for size in np.unique(layout.size):
+        numbers = np.arange(size + 1.0)
+        members = sums[:, layout.size == size]
+        tally = np.stack([(members == number).sum(axis=1) for number in numbers], axis=1).astype(np.float64)
+        terms = betaln(first + numbers[:, None, None], second + size - numbers[:, None, None]) - betaln(first, second)
+        likelihood += np.tensordot(tally, terms, 1)
+    profile = likelihood.max(axis=1)
+    is_inside = profile >= profile.max(axis=1, keepdims=True) - 0.5 * t_quantile(len(layout.size) - 1.0) ** 2
+    first_inside, last_inside = is_inside.argmax(axis=1), len(share) - 1 - is_inside[:, ::-1].argmax(axis=1)
+    ends = np.concatenate([[0.0], share, [1.0]])  # the next points of the grid outside: never too narrow
+    return ends[first_inside], ends[last_inside + 2]
+
+
+def limits_if_known(sums: F64, layout: Clusters, design_effect: float) -> tuple[F64, F64]:
+    """Limits that know the design effect, unless no case is an event: then as many cases as clusters."""
+    known = known_effect_limits(sums, layout, design_effect)
+    nothing = share_limits(known.mean, np.full(known.mean.shape, 1.0 / float((layout.weight**2).sum())))
+    has_events = sums.any(axis=1)
+    return np.where(has_events, known.low, nothing[0]), np.where(has_events, known.high, nothing[1])
+
+
+ALTERNATIVES: dict[str, Limits] = {
+    "here": limits_here,
+    "the same without room for alike cases": lambda sums, layout, _: limits_of_effective(sums, layout, kurtosis=True),
+    "degrees of freedom: clusters less one": lambda sums, layout, _: limits_of_effective(sums, layout, kurtosis=False),
+    "profile likelihood of beta-binomial counts": limits_of_likelihood,
+    "design effect known unless there is no event": limits_if_known,
+}
+
+
+def alternative_lines(draws: int) -> list[str]:
+    """Coverage and width of other intervals of a share on the same routes, as Markdown."""
+    natural = natural_sizes()
+    shares = sorted({*ROUTE_SHARES, *np.linspace(0.02, 0.26, 9).round(3).tolist()})
+    held: dict[str, list[float]] = {name: [] for name in ALTERNATIVES}
+    held_alike: dict[str, list[float]] = {name: [] for name in ALTERNATIVES}
+    widths: dict[tuple[str, int], list[float]] = {}
+    for routes in ROUTE_COUNTS:
+        layout = route_layout(routes, natural)
+        greatest = float(layout.size @ layout.size) / float(layout.size.sum())
+        for design_effect in (*(effect for effect in DESIGN_EFFECTS if effect < greatest), greatest):
+            for share in shares:
+                random = stream("alternatives", routes, design_effect, share)
+                (sums,) = counts(random, draws, (share,), layout, correlation_of(design_effect, layout))
+                known = known_effect_limits(sums, layout, design_effect)
+                for name, limits in ALTERNATIVES.items():
+                    low, high = limits(sums, layout, design_effect)
+                    target = held_alike if design_effect == greatest else held
+                    target[name].append(coverage(share, low, high)[0])
+                    if design_effect < greatest and share in ROUTE_SHARES:
+                        ratio = float((high - low).mean() / (known.high - known.low).mean())
+                        widths.setdefault((name, routes), []).append(ratio)
+    lines = [
+        f"Other intervals of a share on the same routes ({draws:,} data sets a cell, shares from {shares[0]:g} to "
+        f"{shares[-1]:g}): the",
+        "lowest coverage with the design effects above and where all cases of a route are alike, the mean width over",
+        "that of the oracle that knows the design effect, and the greatest ratio by the number of routes.",
+        "",
+        *head(
+            "Interval",
+            ["lowest coverage", "lowest, all alike", "mean width", *(f"greatest, {k} routes" for k in ROUTE_COUNTS)],
+        ),
+    ]
+    for name in ALTERNATIVES:
+        ratios = [widths[name, routes] for routes in ROUTE_COUNTS]
+        cells = [percent(min(held[name])), percent(min(held_alike[name])), f"{np.mean(np.concatenate(ratios)):.2f}"]
+        lines.append(row(name, [*cells, *(f"{max(values):.2f}" for values in ratios)]))
+    return lines
+
+
 def exact_limits(method: str, n: int) -> tuple[F64, F64]:
     """Limits [n + 1] of a share, by the number of events in n independent cases."""
     from scipy import special, stats
@@ -288,7 +564,7 @@ def tables(draws: int, detector_draws: int) -> list[str]:
             name = f"{clusters} x {cases}" + (f", correlation {correlation:g}" if cases > 1 else "")
             found = [share_coverage(p, design(clusters, cases), correlation, draws) for p in SHARES]
             lines.append(row(name, [percent(value) for value in found]))
-    lines += ["", *exact_lines()]
+    lines += ["", *route_lines(draws), "", *alternative_lines(draws // 2), "", *exact_lines()]
     kinds = [(1, 0.0), *((10, c) for c in CORRELATIONS)]
     titles = ["1 case", *(f"10 cases, correlation {c:g}" for c in CORRELATIONS)]
     lines += ["", "The average of eight groups with four clusters each; p in the groups:", "", *head("p", titles)]
@@ -336,4 +612,5 @@ def main() -> None:
 
 if __name__ == "__main__":
     assert MIN_CLUSTERS == 5, "the designs begin at five clusters"
+    assert min(ROUTE_COUNTS) == MIN_ROUTES, "the routes begin where intervals do"
     main()

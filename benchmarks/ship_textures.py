@@ -19,7 +19,7 @@ from ssad.rendering.target import class_of_target, parse_target
 from ssad.report.load import load_run
 from ssad.scenarios.static.physical.textures.card import SHIPPED, TextureCard, save_texture
 
-METRICS = ("AP50", "AP50_25", "ASR_25", "ASR_50")
+METRICS = ("AP50", "AP50_25", "ASR_25", "n0_25", "ASR_50", "n0_50")
 
 
 def ship(folder: Path, attacks: set[str]) -> list[str]:

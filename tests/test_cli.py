@@ -15,7 +15,7 @@ from helpers.plugin import install
 
 from ssad.core.version import __version__
 
-COMMANDS = ("run", "report", "compare", "replay", "shift", "score", "record", "list", "import", "doctor")
+COMMANDS = ("run", "plan", "report", "compare", "replay", "shift", "score", "record", "list", "import", "doctor")
 
 
 def fails(done: CompletedProcess[str], *parts: str) -> None:

@@ -19,7 +19,7 @@ from ssad.detectors import make_detector
 from ssad.detectors.check import find_faults
 from ssad.detectors.check_cases import CheckCase
 from ssad.detectors.check_geometry import check_boxes, check_places, check_solids
-from ssad.detectors.check_gradients import check_loss_signs, check_slopes, check_small_changes
+from ssad.detectors.check_gradients import check_loss_signs, check_ripples, check_slopes, check_small_changes
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolov5 import YOLOV5N
@@ -218,6 +218,28 @@ class WithYBeforeX(Wrapped):
 
 SLOPE = "has the sign and roughly the size of its finite differences"
 CONVENTION = "these fit better if read otherwise"
+
+
+class WithRipples(Wrapped):
+    """The picture shifted by a hundredth at most, to and fro a thousand times between black and white."""
+
+    amplitude, frequency = 0.01, 1000.0
+
+    def see(self, images: Tensor) -> Tensor:
+        return images + self.amplitude * torch.sin(self.frequency * images) if is_picture(images) else images
+
+
+class WithFineRipples(WithRipples):
+    amplitude, frequency = 2.0 / 2300.0, 2300.0
+
+
+class WithRoundedLogits(Wrapped):
+    """Logits in whole numbers, as integer arithmetic gives them."""
+
+    def change(self, dense: Dense) -> Dense:
+        return replace(dense, logit=dense.logit.round())
+
+
 SUBTLE: dict[str, tuple[Callable[[CheckCase], None], str, type[Wrapped], str]] = {
     f"{kind.__name__}-{name}": (part, name, kind, promise)
     for part, name, kind, promise in (
@@ -242,7 +264,10 @@ SUBTLE: dict[str, tuple[Callable[[CheckCase], None], str, type[Wrapped], str]] =
             "the losses are lower for the classes that Dense.logit favours",
         ),
         (check_small_changes, "yolov5n", WithFourBits, "the image is not quantised inside"),
-        (check_small_changes, "fcos", WithThreeBitsCutOff, "the image is not quantised inside"),
+        (check_small_changes, "fcos", WithThreeBitsCutOff, "gradient masking by rounding"),
+        (check_slopes, "yolov5n", WithRoundedLogits, "gradient masking: rounding or a detached tensor cuts it off"),
+        (check_ripples, "yolov5n", WithRipples, "gradient masking by rippling"),
+        (check_ripples, "yolov5n", WithFineRipples, "gradient masking by rippling"),
         (check_places, "yolov5n", WithTheBestPlacesOnly, "Dense.place depends on the size of the pictures alone"),
         (
             check_places,

@@ -6,12 +6,13 @@ import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from pydantic import ValidationError
 
 from ssad.core.errors import ConfigError, StoreError
+from ssad.core.run_records import NOT_NEGATIVE, SHARE
 from ssad.engine import replay as replays
 from ssad.engine.kind import Cell, CellError, Column, Job, Kind, Plan, Replay, Resources, SuiteBase, find_cell
 from ssad.experiments.runs import replay
@@ -162,3 +163,23 @@ def test_only_what_has_run_well_is_replayed(plan: Plan, tmp_path: Path, monkeypa
 
     monkeypatch.setattr(Least, "replay", again)
     assert replay(tmp_path, one.key[:8]) is found
+
+
+def test_limits_of_a_metric_come_from_its_column_its_unit_or_the_kind() -> None:
+    class Measures(Least):
+        columns = (
+            Column("share", limits=SHARE),
+            Column("gap", unit="m"),
+            Column("length", unit="m", limits=NOT_NEGATIVE),
+            Column("words"),
+            Column("collision"),
+        )
+        metric_limits: ClassVar = {"collision": SHARE, "other": (None, 5.0)}
+
+    assert Measures().limits == {
+        "share": (0.0, 1.0),
+        "gap": (-1e7, 1e7),
+        "length": (0.0, 1e7),
+        "collision": (0.0, 1.0),
+        "other": (None, 5.0),
+    }

@@ -436,10 +436,12 @@ def test_run_json_says_what_the_folder_holds(bench: Bench) -> None:
     header = read_json(bench.folder / "run.json")
     suite = WordSuite(name="w", systems=["a", "b"], words=["one", "two"], seed=2)
     plan = Words().plan(suite)
-    assert header == run_json(plan)
+    assert header == run_json(plan) | {"sealed": True}
     assert len(header["identity"]) == 16
     assert header["cells"][1] == {"key": plan.cells[1].key, "name": "b/one", "seed": 2, "system": "b", "word": "one"}
-    assert header["columns"] == [{"name": "length", "title": "of a word", "unit": "letters", "better": ""}]
+    column = {"name": "length", "title": "of a word", "unit": "letters", "better": "", "clock": False}
+    assert header["columns"] == [column]
+    assert header["limits"] == {}
     assert (header["kind"], header["factors"], header["code"]) == ("words", ["system", "word"], "0" * 12)
     assert header["versions"] == {"ssad": "1", "device": "cpu", "dictionary": "3"}
     assert header["systems"] == ["a", "b"]

@@ -82,6 +82,8 @@ BAD = {
     "liar": ("failed", "other cells"),
     "object": ("failed", "not plain data"),
     "nan": ("failed", "not plain data"),
+    "absurd": ("failed", "the result is impossible: metrics.value is 7.5, outside of [0, 1]"),
+    "text": ("failed", 'the result is impossible: metrics.value is "much", which is no number'),
     "memory": ("crashed", "out of memory: it held"),
 }
 HANGING = dict.fromkeys(("hang", "spin"), ("timeout", "took longer than 5 s"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from pathlib import Path
@@ -12,6 +13,7 @@ from helpers.descriptors import open_files
 
 from ssad.core.errors import StoreError
 from ssad.core.jsonl import read_lines
+from ssad.core.run_records import counts_text
 from ssad.engine import store as stores
 from ssad.engine.store import Store, locked, read_run
 
@@ -60,6 +62,73 @@ def test_every_cut_of_the_files_is_mended(tmp_path: Path) -> None:
                     store.append(result(key), {"key": key, "raw": key})
         assert (folder / "results.jsonl").read_bytes() == results
         assert (folder / "episodes.jsonl").read_bytes() == episodes
+
+
+@pytest.mark.parametrize("name", ["results.jsonl", "episodes.jsonl"])
+def test_a_torn_last_line_of_a_finished_run_is_mended_and_a_removed_one_is_not(tmp_path: Path, name: str) -> None:
+    """A power cut may tear a line that was counted; one that ends where a line ends was not torn."""
+    fill(tmp_path / "whole", "a", "b", "c")
+    files = {path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()}
+    line = len(files[name]) // 3
+    for cut in range(2 * line, 3 * line):
+        folder = tmp_path / f"cut{cut}"
+        folder.mkdir()
+        for other_name, content in files.items():
+            (folder / other_name).write_bytes(content[:cut] if other_name == name else content)
+        if cut == 2 * line:
+            with pytest.raises(StoreError, match=rf"{name}:3: this line is missing: the run wrote 3 lines; restore"):
+                fill(folder)
+            continue
+        fill(folder, "c")
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == files
+
+
+def test_a_kill_between_any_two_writes_leaves_a_folder_to_go_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also while failed cells are taken out: files that get shorter are counted first."""
+
+    class Killed(BaseException):
+        pass
+
+    def killed_at(number: int, call: Any) -> Any:
+        calls = iter(range(1000))
+
+        def wrapped(*arguments: Any) -> Any:
+            if next(calls) == number:
+                raise Killed
+            return call(*arguments)
+
+        return wrapped
+
+    fill(tmp_path / "whole", "a", "c", "d", "b")
+    files = {path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()}
+    for function in ("os.replace", "os.write", "os.pwrite"):
+        for number in range(6):
+            folder = tmp_path / f"{function}{number}"
+            fill(folder, "a")
+            with Store.open(folder, RUN) as store:
+                store.append({"key": "b", "status": "failed"}, {"key": "b", "raw": "early"})
+            fill(folder, "c")
+            with monkeypatch.context() as patch, contextlib.suppress(Killed):
+                patch.setattr(function, killed_at(number, getattr(os, function.removeprefix("os."))))
+                with Store.open(folder, RUN, retry=True) as store:
+                    store.append(result("d"), {"key": "d", "raw": "d"})
+            with Store.open(folder, RUN, retry=True) as store:
+                for key in "db":
+                    if key not in store.results:
+                        store.append(result(key), {"key": key, "raw": key})
+            assert {path.name: path.read_bytes() for path in folder.iterdir()} == files, (function, number)
+
+
+def test_a_folder_from_before_there_were_seals_goes_on_without(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text(json.dumps(RUN))
+    for name in ("results.jsonl", "episodes.jsonl"):
+        (tmp_path / name).write_text(json.dumps(result("a")) + "\n")
+    fill(tmp_path, "b")
+    assert sorted(os.listdir(tmp_path)) == [".lock", "episodes.jsonl", "results.jsonl", "run.json"]
+    assert "seal" not in (tmp_path / "results.jsonl").read_text()
+    assert [r["key"] for r in read_lines(tmp_path / "results.jsonl")] == ["a", "b"]
 
 
 def test_what_failed_goes_when_it_is_to_be_tried_again(tmp_path: Path) -> None:
@@ -284,10 +353,19 @@ def test_a_folder_is_for_one_command_at_a_time(tmp_path: Path) -> None:
 def test_episodes_without_a_result_go_and_no_others(tmp_path: Path) -> None:
     fill(tmp_path, "a", "b")
     whole = (tmp_path / "episodes.jsonl").read_bytes()
+    counts = (tmp_path / "seal.json").read_bytes()
+    results = (tmp_path / "results.jsonl").read_bytes()
+    fill(tmp_path, "c", "d")
     with open(tmp_path / "episodes.jsonl", "a") as file:
-        file.write('{"key": "c"}\n{"key": "d"}\n{"ke')
+        file.write('{"ke')
+    (tmp_path / "results.jsonl").write_bytes(results)
+    (tmp_path / "seal.json").write_bytes(counts)
     fill(tmp_path)
     assert (tmp_path / "episodes.jsonl").read_bytes() == whole
     (tmp_path / "results.jsonl").write_bytes(b"")
+    (tmp_path / "seal.json").unlink()
+    with pytest.raises(StoreError, match=r"seal\.json: is missing, though the run has lines"):
+        Store.open(tmp_path, RUN)
+    (tmp_path / "seal.json").write_text(counts_text({"results.jsonl": 0, "episodes.jsonl": 0}))
     fill(tmp_path)
     assert (tmp_path / "episodes.jsonl").read_bytes() == b""

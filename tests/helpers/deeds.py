@@ -41,5 +41,7 @@ DEEDS: dict[str, Any] = {
     "hang": lambda: time.sleep(1e6),
     "object": object,
     "nan": lambda: float("nan"),
+    "absurd": lambda: 7.5,
+    "text": lambda: "much",
     "slow": lambda: time.sleep(0.03),
 }

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from helpers.deeds import DEEDS
 
+from ssad.core.run_records import SHARE
 from ssad.engine.kind import Cell, Column, Job, Kind, Names, SuiteBase
 
 
@@ -25,7 +26,7 @@ class Dice(Kind):
     """Throws a die for each number."""
 
     name, suite, factors = "dice", DiceSuite, ("system", "number")
-    columns = (Column("value", "what the die shows", "", "higher"),)
+    columns = (Column("value", "what the die shows", "", "higher", limits=SHARE),)
 
     def cells(self, suite: DiceSuite) -> Iterator[Cell]:
         for system in suite.systems:

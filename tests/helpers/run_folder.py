@@ -10,6 +10,10 @@ from typing import Any
 
 from helpers.metric_traces import make_trace
 
+from ssad.core import safeio
+from ssad.core.jsonl import scan_lines
+from ssad.core.run_records import COUNTS, EPISODES, RESULTS, counts_text
+from ssad.core.seals import sealed, unsealed
 from ssad.metrics import episode_metrics
 
 GROUPS = (
@@ -24,13 +28,45 @@ GROUPS = (
 )
 
 
-def write_run(folder: Path, header: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) -> Path:
-    """run.json and results.jsonl in a new folder."""
+def write_run(
+    folder: Path,
+    header: Mapping[str, Any],
+    lines: Sequence[Mapping[str, Any]],
+    episodes: Sequence[Mapping[str, Any]] = (),
+) -> Path:
+    """run.json and sealed lines in a new folder."""
     folder.mkdir(parents=True, exist_ok=True)
     cells = [{"key": line["key"]} for line in lines]
     (folder / "run.json").write_text(json.dumps({"versions": {"ssad": "0"}, "cells": cells} | dict(header)))
-    (folder / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_lines(folder, lines, episodes)
     return folder
+
+
+def write_lines(
+    folder: Path, lines: Sequence[Mapping[str, Any]], episodes: Sequence[Mapping[str, Any]] | None = None
+) -> None:
+    """Lines in the place of those of a run, sealed; episodes stay without others."""
+    for name, records in ((RESULTS, lines), (EPISODES, episodes)):
+        if records is not None:
+            (folder / name).write_text("".join(safeio.dump_json(dict(record)) + "\n" for record in records))
+    reseal(folder)
+
+
+def reseal(folder: Path) -> None:
+    """Seal and count the lines of a run as they are now: a test that edits them is about something else."""
+    header = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(header | {"sealed": True}))
+    files = {name: scan_lines(folder / name) for name in (RESULTS, EPISODES)}
+    episodes = {record["key"]: unsealed(record) for record in files[EPISODES].records}
+    for name, lines in files.items():
+        torn = (folder / name).read_bytes().rpartition(b"\n")[2] if lines.tail == "open" else b""
+        text = "".join(
+            safeio.dump_json(sealed(record, number, episode=episodes.get(record["key"]) if name == RESULTS else None))
+            + "\n"
+            for number, record in enumerate(lines.records, 1)
+        )
+        (folder / name).write_bytes(text.encode() + torn)
+    (folder / COUNTS).write_text(counts_text({name: len(lines.records) for name, lines in files.items()}))
 
 
 def driving_line(

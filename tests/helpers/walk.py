@@ -8,6 +8,8 @@ import numpy as np
 class Walk:
     """Rows walk `steps` steps of standard normal size; `grain` rounds the score down, so that many are equal."""
 
+    name, external = "walk", False
+
     def __init__(self, batch: int, height: float, *, steps: int = 1, grain: float = 0.0) -> None:
         self.batch, self.height, self.steps, self.grain, self.width = batch, height, steps, grain, steps
         self._work = 0.0

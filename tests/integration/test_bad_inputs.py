@@ -99,7 +99,7 @@ CASES = (
     (f"{RUN} pictures=[nothing]", "pictures[0]: Input should be 'shifts' or 'camera'"),
     ("run precrash --device tpu", "--device tpu: expected auto, cpu or cuda"),
     ("report run", "the run has no results yet"),
-    ("report odd", "odd/results.jsonl: the line with key 3 is no result of a cell; remove it"),
+    ("report odd", "odd/results.jsonl:1: key is 3, which is no key of a cell; restore the file"),
     ("report torn", "torn/run.json:1: not valid JSON"),
     ("report picture.jpg", "not a results folder"),
     ("replay run x", "run/run.json: not what ssad run writes: no key 'suite'"),

@@ -136,9 +136,8 @@ def test_without_a_case_the_hash_of_the_trace_tells_copies(tmp_path: Path) -> No
     lines = [driving_line(f"k{k}", "RightTurn", "RightTurn/00") for k in range(6)]
     for line in lines:
         del line["case"], line["cluster"]
-    write_run(tmp_path, DRIVING_HEADER, lines)
     episodes = [{"key": f"k{k}", "end": "complete", "trace_hash": f"h{k % 2}"} for k in range(6)]
-    (tmp_path / "episodes.jsonl").write_text("".join(json.dumps(e) + "\n" for e in episodes))
+    write_run(tmp_path, DRIVING_HEADER, lines, episodes)
     write_report(tmp_path)
     found = {(r["group"], r["column"]): r for r in read_csv(tmp_path / "tables" / "metrics.csv")}
     assert (found["Right-turn", "CR"]["n"], found["Right-turn", "CR"]["clusters"]) == ("2", "1")
@@ -202,8 +201,7 @@ def test_traces_without_hashes_are_held_against_their_episodes(tmp_path: Path) -
         save_trace(tmp_path / "traces" / f"k{k}.npz", trace)
         lines.append(driving_line(f"k{k}", "RightTurn", f"r{k}") | {"artefacts": {"trace": f"traces/k{k}.npz"}})
         episodes.append({"key": f"k{k}", "end": "complete", "trace_hash": trace_hash(trace)})
-    write_run(tmp_path, DRIVING_HEADER, lines)
-    (tmp_path / "episodes.jsonl").write_text("".join(json.dumps(e) + "\n" for e in episodes))
+    write_run(tmp_path, DRIVING_HEADER, lines, episodes)
     assert check_artefacts(tmp_path) == []
     (tmp_path / "traces" / "k0.npz").unlink()
     save_trace(tmp_path / "traces" / "k1.npz", make_trace(9))

@@ -76,20 +76,40 @@ ABOUT = "autopilot collides in about"
             "225 times in 1,000 h.",
         ),
         (
-            [estimate("monte-carlo", 500.0, 200.0, 1400.0, events=3, effective=1.0), WEIGHED],
-            f"{ABOUT} 51 of a million episodes of lane-traffic/05 (95 %: 7.8 to 192; by importance sampling), "
-            "22.9 times in 1,000 h. Plain Monte Carlo saw 3 in 6,000 episodes. The interval of plain Monte Carlo does "
-            "not meet it: take more episodes before you trust either.",
+            [estimate("monte-carlo", 0.0, 0.0, 7.0, events=0), WEIGHED | {"system": "blind"}, WEIGHED, BRANCHED],
+            "The methods contradict each other for autopilot in lane-traffic/05: 0 by plain Monte Carlo (95 %: 0 to 7) "
+            "and 51 by importance sampling (95 %: 7.8 to 192) collisions in a million episodes. Trust none of them "
+            "until more episodes bring them together. "
+            "blind collides in about 51 of a million episodes of lane-traffic/05 (95 %: 7.8 to 192; by importance "
+            "sampling), 22.9 times in 1,000 h.",
+        ),
+        (
+            [NONE | {"obstacle": "autopilot has no methods snapshot() and restore(states)"}],
+            "autopilot did not collide in 6,000 episodes of lane-traffic/05: fewer than 615 in a million (95 % limit). "
+            "autopilot is measured by plain Monte Carlo alone: autopilot has no methods snapshot() and "
+            "restore(states); with these two methods (ssad.core.driving.Branching), splitting and importance sampling "
+            "would measure autopilot too, and find collisions that are too rare to be counted.",
+        ),
+        (
+            [
+                NONE | {"obstacle": "autopilot plans over a belief, which no snapshot holds"},
+                BRANCHED | {"status": "failed", "reason": "refused", "metrics": {}, "system": "blind"},
+            ],
+            "autopilot did not collide in 6,000 episodes of lane-traffic/05: fewer than 615 in a million (95 % limit). "
+            "autopilot is measured by plain Monte Carlo alone: autopilot plans over a belief, which no snapshot holds.",
         ),
     ],
 )
 def test_how_rare_collisions_are(lines: list[dict[str, Any]], said: str, tmp_path: Path) -> None:
     suite = {"name": "h", "kind": "how-often", "title": "How often"}
     header = {"suite": suite, "identity": "x", "columns": [], "factors": ["system", "method"]}
+    lines = [line | {"key": f"{line['method']} {line['system']}"} for line in lines]
     folder = write_run(tmp_path / "run", header, lines)
     sentences = verdict(load_run(folder))
     assert " ".join(sentences) == said
-    assert all(sentence in write_report(folder).read_text() for sentence in sentences)
+    page = write_report(folder).read_text()
+    places = [page.index(sentence) for sentence in sentences]
+    assert places == sorted(places)
 
 
 def told(folder: Path, kind: str, rows: list[dict[str, Any]], *, planned: int = 0) -> str:
@@ -180,19 +200,31 @@ def test_what_harms_the_system_most_is_said_first(tmp_path: Path) -> None:
 def texture(attack: str, hidden: float | None, **more: Any) -> dict[str, Any]:
     """A line of kind physical."""
     about = {"carrier": "paint", "test": "Oldmarket", "train": "Twinford", "view": "drive", "source": ""}
-    return {"detector": "d", "attack": attack, "metrics": {"ASR_25": hidden}} | about | more
+    metrics = {} if attack == "clean" else {"ASR_25": hidden, "n0_25": 38}
+    return {"detector": "d", "attack": attack, "metrics": metrics, "n": 40} | about | more
 
 
 def test_what_learns_nothing_is_no_attack_however_much_it_hides(tmp_path: Path) -> None:
     rows = [texture("clean", None), texture("noise", 0.4), texture("random", 0.1), texture("das", 0.2)]
     assert told(tmp_path / "paint", "physical", rows) == (
-        "das hides 20% of the targets from d. The strongest control (noise) hides 40%."
+        "das hides 20% of the 38 targets that d finds clean. The strongest control (noise) hides 40%."
     )
     lights = [texture(name, share, carrier="light, night") for name, share in (("random laser", 0.4), ("laser", 0.2))]
     assert told(tmp_path / "light", "physical", lights) == (
-        "laser hides 20% of the targets from d. The strongest control (random laser) hides 40%."
+        "laser hides 20% of the 38 targets that d finds clean. The strongest control (random laser) hides 40%."
     )
     assert told(tmp_path / "only", "physical", rows[:3]) == "See the table."
+
+
+def test_what_is_rarely_found_clean_has_no_success_rate(tmp_path: Path) -> None:
+    rows = [texture("clean", None), texture("das", None), texture("grey", None)]
+    for row in rows[1:]:
+        row["metrics"]["n0_25"] = 3
+    assert told(tmp_path / "few", "physical", rows) == (
+        "d finds 3 of 40 clean targets with a score above 0.25, less than 90%: attacks on it have no success rate."
+    )
+    uncounted = [texture("das", 0.9) | {"metrics": {"ASR_25": 0.9}}]
+    assert told(tmp_path / "old", "physical", uncounted) == "See the table.", "without n0 a rate says nothing"
 
 
 def test_an_attack_is_held_against_controls_of_its_own_pictures(tmp_path: Path) -> None:
@@ -205,7 +237,7 @@ def test_an_attack_is_held_against_controls_of_its_own_pictures(tmp_path: Path) 
         texture("grey", 0.3, carrier="patch"),
     ]
     assert told(tmp_path, "physical", rows) == (
-        "das hides 90% of the targets from d in Oldmarket. The strongest control (grey) hides 0%."
+        "das hides 90% of the 38 targets that d finds clean in Oldmarket. The strongest control (grey) hides 0%."
     )
 
 

@@ -6,10 +6,11 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ssad.experiments.perception.digital.page import published_attempts
-from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit, weaker
+from ssad.metrics.attack_audit import RULES, Attempt, ReferenceComparison, Verdict, audit, weaker
 
 CLEAN = 0.3
 BASE = Attempt(
@@ -33,6 +34,7 @@ BASE = Attempt(
 )
 NOISE = replace(BASE, attack="noise", score=0.29, steps=0, access="none", used=1.0, gradient_error=None, coupling=None)
 FGSM = replace(BASE, attack="fgsm", score=0.06, steps=1, used=1.0)
+EQUAL = ReferenceComparison("pgd", 1.0, 9.0, 0.1, {"apgd": (8.5, 0.12), "pgd": (9.1, 0.1), "square": (1.5, 0.3)})
 SOUND = [
     NOISE,
     FGSM,
@@ -44,6 +46,7 @@ SOUND = [
     replace(BASE, attack="square", access="black-box", score=0.1, steps=0, gradient_error=None),
     replace(BASE, attack="cw", loss="margin", score=0.0),
     replace(BASE, loss="depth", score=0.2),
+    replace(BASE, options="draws=2", comparisons=(EQUAL,) * 20),
     replace(BASE, source="other", score=0.25, gradient_error=None),
 ]
 
@@ -73,6 +76,20 @@ WEAKENED: dict[str, tuple[dict[str, Any], str, str]] = {
     "a loss that is coupled by the batch": ({"coupling": 0.4}, "coupling", "changes by 40% with what else is in"),
     "a budget before rounding": ({"change": 6.0}, "budget", "6 px from the clean one"),
 }
+
+
+def test_an_attack_below_the_reference_ensemble_is_named() -> None:
+    short = tuple(replace(EQUAL, loss=loss) for loss in np.linspace(5.0, 6.0, 20))
+    sound = [one for one in SOUND if not one.comparisons]
+    verdict = audit([*sound, replace(BASE, options="draws=2", comparisons=short)])
+    assert rules(verdict) == ["reference"]
+    assert "pgd with as many gradients by 8.1: it falls short by 44% [" in verdict.faults[0].text
+    few = audit([*sound, replace(BASE, options="draws=2", comparisons=short[:7])])
+    assert few.compared["reference"] == 0, "seven images give no interval"
+    ensemble = replace(BASE, attack="ensemble", comparisons=(*short, *(replace(EQUAL, attack="apgd"),) * 8))
+    texts = [fault.text for fault in audit([*sound, ensemble]).faults if fault.rule == "reference"]
+    assert len(texts) == 1
+    assert ", member pgd raises its loss" in texts[0]
 
 
 @pytest.mark.parametrize("case", WEAKENED.values(), ids=WEAKENED.keys())

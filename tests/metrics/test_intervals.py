@@ -8,7 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from benchmarks.interval_coverage import design, detection_coverage, mean_coverage, share_coverage
+from benchmarks.interval_coverage import (
+    correlation_of,
+    counts,
+    design,
+    detection_coverage,
+    mean_coverage,
+    natural_sizes,
+    route_layout,
+    route_result,
+    share_coverage,
+)
 from ssad.metrics.intervals import (
     Clusters,
     bounded_limits,
@@ -17,6 +27,8 @@ from ssad.metrics.intervals import (
     share_limits,
     t_quantile,
 )
+
+NATURAL = natural_sizes()
 
 
 def test_student_quantiles():
@@ -70,6 +82,40 @@ def test_coverage_of_shares_in_clusters(share, clusters, cases, correlation):
     assert held > 0.93
     if clusters > 30 and 0.1 < share < 0.9:
         assert held < 0.975
+
+
+@pytest.mark.parametrize(
+    ("routes", "design_effect", "shares"),
+    [
+        (10, 6.4, (0.18,)),
+        (10, 6.4, (0.24,)),
+        (15, 6.4, (0.1,)),
+        (20, 5.1, (0.1,)),
+        (38, 4.0, (0.06,)),
+        (38, 4.0, (0.02,)),
+        (15, 2.5, (0.5,)),
+        (10, 4.0, (0.3, 0.1)),
+        (38, 2.5, (0.05, 0.02)),
+        (20, 6.4, (0.5, 0.3)),
+    ],
+)
+def test_intervals_hold_on_routes_and_are_not_much_wider_than_necessary(routes, design_effect, shares):
+    """Without room for clusters that are more alike than those seen, the first would hold in 92 %."""
+    found = route_result(shares, route_layout(routes, NATURAL), design_effect, 4000)
+    assert found is not None
+    assert found.coverage > 0.93
+    assert 0.9 < found.width < 1.5
+
+
+def test_routes_of_the_simulation_have_the_correlation_that_makes_the_design_effect():
+    layout = route_layout(38, NATURAL)
+    assert (NATURAL.sum(), len(NATURAL)) == (150, 38)
+    assert route_result((0.1,), layout, 6.4, 10) is None, "cases all alike make less"
+    random = np.random.Generator(np.random.Philox(2))
+    first, second = counts(random, 20_000, (0.3, 0.1), layout, correlation_of(4.0, layout))
+    difference = (first - second).sum(axis=1) / 150
+    assert difference.mean() == pytest.approx(0.2, abs=0.005)
+    assert difference.var() / ((0.4 - 0.2**2) / 150) == pytest.approx(4.0, rel=0.05)
 
 
 @pytest.mark.parametrize("shares", [[0.05] * 8, [0.5] * 8, [0.2, 0.8] * 4, [0.1, 1.0] * 4])
@@ -227,11 +273,18 @@ def test_student_limits_are_those_of_the_formulas(name, seed):
 def test_bounded_limits_are_those_of_the_formulas(name, seed, cap):
     size, stratum = DESIGNS[name]
     values = np.random.Generator(np.random.Philox(seed)).beta(5.0, 1.0 + seed, size=12)
+    # shares vary more than what lies in between, so that the cap does not hide the formula
+    values = np.where(np.isfinite(cap), np.round(values - 0.2), values)
+    values[0] = 0.5
     sums = values * np.array(size)
-    mean, variance, freedom, _, _ = by_hand(sums.tolist(), size, stratum)
-    effective = mean * (1 - mean) / variance * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, freedom)) ** 2
+    mean, variance, freedom, _, parts = by_hand(sums.tolist(), size, stratum)
     layout = layout_of(size, stratum)
-    effective = min(max(effective, 1 / sum(layout.weight**2)), cap)
+    inverse, greatest = variance / (mean * (1 - mean)), sum(layout.weight**2)
+    if math.isfinite(cap):
+        active = sum(p**2 for p in parts) ** 2 / sum(p**4 for p in parts)
+        inverse = (active * inverse + 0.1 * greatest) / (active + 0.1)
+    effective = (stats.norm.ppf(0.975) / stats.t.ppf(0.975, freedom)) ** 2 / inverse
+    effective = min(max(effective, 1 / greatest), cap)
     found = bounded_limits(sums, layout, cap=cap)
     low, high = share_limits(mean, effective)
     assert (found.mean, found.low, found.high) == (pytest.approx(mean), pytest.approx(low), pytest.approx(high))

@@ -102,6 +102,30 @@ def test_targets_lost_are_those_that_were_found_before() -> None:
     assert "ASR_25" not in target_scores(clean)["metrics"]
 
 
+def test_a_detector_below_the_floor_at_the_score_of_a_rate_has_none_there() -> None:
+    """All clean targets are found, nine of ten above 0.25 and six above 0.5: AP50 alone would pass the floor."""
+    scores = [0.9] * 6 + [0.4] * 3 + [0.1]
+    clean = [seen((TARGET, score)) for score in scores]
+    gone = [seen() for _ in scores]
+    rates = ("ASR_25", "ASR_any_25", "ASR_all_25", "ASR_50")
+    metrics = target_scores(gone, clean, floor=0.9)["metrics"]
+    assert [metrics[name] for name in rates] == [1.0, 1.0, 1.0, None]
+    assert [metrics[name] for name in ("n0_25", "n0_50", "n0_all_25")] == [9, 6, 9]
+    strict = target_scores(gone, clean, floor=0.91)
+    assert [strict["metrics"][name] for name in rates] == [None] * 4
+    assert strict["metrics"]["n0_25"] == 9, "n0 says why there is no rate"
+    assert not any(name in strict["intervals"] for name in rates)
+
+
+def test_the_floor_of_the_whole_class_is_that_of_the_target() -> None:
+    """Other cars are far away and found less often."""
+    far = [200.0, 10.0, 210.0, 18.0]
+    clean = [seen((TARGET, 0.9), real=(TARGET, OTHER, far)) for _ in range(4)]
+    attacked = [seen(real=(TARGET, OTHER, far)), *clean[1:]]
+    metrics = target_scores(attacked, clean, floor=0.9)["metrics"]
+    assert (metrics["ASR_all_25"], metrics["n0_all_25"]) == (pytest.approx(1 / 4), 4)
+
+
 def test_intervals_come_from_drives_and_copies_do_not_narrow_them() -> None:
     draws = np.random.default_rng(0)
 

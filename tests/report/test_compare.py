@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.run_folder import GROUPS, driving_line, write_run
+from helpers.run_folder import GROUPS, driving_line, write_lines, write_run
 from typer.testing import CliRunner
 
 from ssad.cli import app
@@ -77,7 +77,7 @@ def test_what_one_run_alone_measures_makes_no_cell_unequal_and_equal_runs_have_n
     lines = [json.loads(line) for line in (second / "results.jsonl").read_text().splitlines()]
     for line in lines:
         line["metrics"] |= {"avoidable": 1.0, "time": None}
-    (second / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_lines(second, lines)
     (found,) = compare_runs([first, second])
     assert (found.both, found.equal) == (40, 40)
     assert found.findings == ("No difference is larger than chance alone makes.",)
@@ -87,7 +87,7 @@ def test_a_failed_cell_is_no_pair_and_is_named(tmp_path: Path):
     first, second = driving_run(tmp_path / "one", hits=8), driving_run(tmp_path / "two", hits=8)
     lines = [json.loads(line) for line in (second / "results.jsonl").read_text().splitlines()]
     lines[0] |= {"status": "timeout", "reason": "slow", "metrics": {}}
-    (second / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines[:-1]))
+    write_lines(second, lines[:-1])
     (found,) = compare_runs([first, second])
     difference = next(row.cells[2] for row in found.table.rows if row.head[2] == "CR")
     assert (difference.n, difference.failed, difference.mean) == (38, 2, 0.0)
@@ -160,7 +160,7 @@ def test_a_difference_that_failed_cells_may_explain_is_no_finding(tmp_path: Path
     lines = [json.loads(line) for line in (first / "results.jsonl").read_text().splitlines()]
     for line in lines[18:]:
         line |= {"status": "failed", "reason": "hung", "metrics": {}}
-    (first / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_lines(first, lines)
     (comparison,) = compare_runs([first, second])
     difference = next(row.cells[2] for row in comparison.table.rows if row.head[2] == "CR")
     assert difference.low < 0.0 < difference.mean < difference.high

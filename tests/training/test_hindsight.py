@@ -9,6 +9,7 @@ import pytest
 
 from ssad.core.driving import WorldState
 from ssad.core.types import Controller, EpisodeAgent, Pose
+from ssad.drivers.careful import careful_model
 from ssad.training.hindsight import Hindsight
 from ssad.world.world import World
 from tests.world.worlds import GRAPHS, ego, episode
@@ -73,6 +74,13 @@ BRAKES[:, 0] = 60.0 + np.cumsum(0.1 * BRAKES[:, 3]) - 0.1 * BRAKES[:, 3].sum()
 def test_what_the_driver_of_regulation_157_avoids(own: np.ndarray, other: np.ndarray, avoided: bool) -> None:
     memory, state = played(own, other)
     assert memory.is_avoidable(state, BOTH).tolist() == [avoided]
+
+
+@pytest.mark.parametrize("lead", [3.0, 5.0, 7.0])
+def test_the_human_stays_behind_a_slower_car_it_has_braked_for(lead: float) -> None:
+    memory, state = played(moves(60.0, speed=8.0), moves(60.0 + LONG, speed=lead))
+    memory.model = careful_model("cc")
+    assert memory.avoided(state, BOTH).tolist() == [True]
 
 
 @pytest.mark.parametrize(("bend", "avoided"), [(None, False), (54.0, True), (85.0, False), (15.0, False)])

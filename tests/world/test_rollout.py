@@ -358,7 +358,24 @@ def make_world(assign):
     return World(crowd(), GRAPHS, assign=assign)
 
 
-@pytest.mark.parametrize("make", [Pusher, Autopilot, Blind])
+class Steady(Pusher):
+    """Pushes less from step to step, and saves what step it is."""
+
+    def reset(self, episodes):
+        self.count = np.zeros(len(episodes), np.float32)
+
+    def act(self, view):
+        self.count[view.scene] += 1
+        return super().act(view) / self.count[view.scene, None]
+
+    def snapshot(self):
+        return {"count": self.count}
+
+    def restore(self, states):
+        self.count = states["count"]
+
+
+@pytest.mark.parametrize("make", [Pusher, Autopilot, Blind, Steady])
 def test_drivers_keep_their_promises(make) -> None:
     check_driver(make, make_world, episodes=4)
 
@@ -382,8 +399,24 @@ class Wild(Pusher):
         return super().act(view) * np.float32(3.0)
 
 
+class Lossy(Steady):
+    def restore(self, states): ...
+
+
+class Narrow(Steady):
+    def snapshot(self):
+        return {"count": self.count[:1]}
+
+
 @pytest.mark.parametrize(
-    ("make", "promise"), [(Forgetful, "reset makes it forget"), (Averaging, "alone"), (Wild, "in range")]
+    ("make", "promise"),
+    [
+        (Forgetful, "reset makes it forget"),
+        (Averaging, "alone"),
+        (Wild, "in range"),
+        (Lossy, "a restored snapshot continues as before"),
+        (Narrow, "a row for each episode"),
+    ],
 )
 def test_check_driver_names_the_broken_promise(make, promise) -> None:
     with pytest.raises(WorldCheckError, match=promise):

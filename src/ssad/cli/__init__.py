@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ssad.cli import data, exchange, looking, running
+from ssad.cli import data, exchange, looking, planning, running
 from ssad.cli.importing import ExportGroup, register
 from ssad.cli.listing import ALIASES, LISTS
 from ssad.cli.train import train_app
@@ -57,6 +57,7 @@ def about(
 
 for command in (
     running.run,
+    planning.plan,
     running.report,
     running.compare,
     running.replay,

@@ -16,9 +16,9 @@ from ssad.core.errors import SSADError
 from ssad.core.jsonl import read_lines
 from ssad.core.machine import default_workers
 from ssad.core.registry import label_of
+from ssad.core.run_records import RESULTS
 from ssad.engine.kind import Plan, Resources
 from ssad.engine.run import run
-from ssad.engine.store import RESULTS
 
 
 @dataclass

@@ -264,7 +264,8 @@ class Driver(Protocol):
     """Controls an agent ten times a second: the ego, or any other vehicle, cyclist or walker.
 
     A driver with an attribute `target_speed` (m/s) drives at that speed instead of the episode's; one with an
-    attribute `sensors` (names) gets their readings in `Observation.readings`. A minimal class may omit `name` and
+    attribute `sensors` (names) gets their readings in `Observation.readings`; one with the methods of `Branching` can
+    be measured by splitting and importance sampling. A minimal class may omit `name` and
     `controller`: `ssad.drivers.make_system` fills them in. `ssad.world.check.check_driver` tests an
     implementation against this protocol.
 
@@ -309,6 +310,46 @@ class Driver(Protocol):
             With a fourth column, the throttle drives in reverse where that is above 0.5. A walker's throttle is its
             speed as a share of 4 m/s, and its steer turns it by up to half a turn a second. A value that is not
             finite in a running episode fails the episode.
+        """
+
+
+@runtime_checkable
+class Branching(Protocol):
+    """A driver whose episodes can branch: all that it remembers can be saved and set, episode by episode. Optional.
+
+    Splitting and importance sampling (`ssad.world.rare`) continue an episode in several ways: they copy the state of
+    one episode of a batch to others, which may be at other steps. All episodes of such a batch are the same but for
+    their seeds. A driver that remembers nothing returns an empty mapping. A driver that runs inside the world needs
+    neither method.
+
+    Example:
+        A driver that counts its steps, an episode each::
+
+            def reset(self, episodes):
+                self.count = np.zeros(len(episodes), int)
+
+            def snapshot(self):
+                return {"count": self.count}
+
+            def restore(self, states):
+                self.count = states["count"]
+    """
+
+    def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return all that `act` depends on besides its argument.
+
+        Returns:
+            Arrays [B, ...] by name; row b belongs to episode b of the last `reset`. Names, shapes and types stay the
+            same from `reset` to `reset`, and no array holds objects. The caller copies what it keeps. Random numbers
+            belong to it too: the state of a generator, or a seed.
+        """
+
+    def restore(self, states: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Continue from earlier moments, to the bit.
+
+        Args:
+            states: Arrays [B, ...] as `snapshot` returns them. Row b is the new state of episode b, from any moment
+                of any episode of the batch. The driver may keep the arrays and change them.
         """
 
 

@@ -15,7 +15,7 @@ from ssad.core.protocols import Detector
 from ssad.core.seeding import seed32
 from ssad.detectors.check_cases import BATCH, CheckCase, modules_of, typical_threshold
 from ssad.detectors.check_geometry import check_boxes, check_places, check_solids
-from ssad.detectors.check_gradients import check_loss_signs, check_slopes, check_small_changes
+from ssad.detectors.check_gradients import check_loss_signs, check_ripples, check_slopes, check_small_changes
 
 RTOL = 2e-3
 MAX_DIFFERING = (
@@ -79,6 +79,7 @@ def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[in
         check_loss_signs,
         check_slopes,
         check_small_changes,
+        check_ripples,
         _check_modes,
         _check_sizes,
         _check_refusals,

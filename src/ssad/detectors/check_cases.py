@@ -130,9 +130,16 @@ def typical_threshold(trial: CheckCase, images: Tensor) -> float:
     return 0.0
 
 
-def noise(template: Tensor, amplitude: float) -> Tensor:
-    """Return random numbers within plus and minus `amplitude`, shaped as `template`; the same in every run."""
-    generator = torch.Generator().manual_seed(seed32("check_detector noise", *template.shape))
+def noise(template: Tensor, amplitude: float, draw: int = 0) -> Tensor:
+    """Return random numbers within plus and minus `amplitude`, shaped as `template`; the same in every run.
+
+    Args:
+        template: Shape, type and device of the numbers.
+        amplitude: Largest absolute value.
+        draw: Number of the draw.
+    """
+    key = (*template.shape, draw) if draw else tuple(template.shape)
+    generator = torch.Generator().manual_seed(seed32("check_detector noise", *key))
     return amplitude * (2 * torch.rand(template.shape, generator=generator) - 1).to(template)
 
 

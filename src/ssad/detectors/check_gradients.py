@@ -17,6 +17,10 @@ ROUGHLY = 4.0  # tolerated factor between a gradient and finite differences
 ROUNDING = 1e-5  # share of a value below which its changes drown in float32
 LEVELS = (0.21, 0.47, 0.78)  # grey values in the middle between the steps of coarse quantisation
 SMALL, LARGE = 0.5 / 255, 0.1  # changes of a grey picture: below and above such a step
+RIPPLE_STEPS = (0.5 / 255, 1 / 255, 2 / 255)  # steps of attacks
+RIPPLE_SHARE = 0.25  # change along the gradient, as a share of what its slope foretells, below which it is looked at
+RIPPLE_DRAWS = 64  # images nearby whose gradients are averaged then
+MAX_RIPPLE_RATIO = 0.5  # rise along the gradient, divided by that along the mean gradient, that counts as a ripple
 
 
 def check_slopes(trial: CheckCase) -> None:
@@ -40,7 +44,11 @@ def check_slopes(trial: CheckCase) -> None:
             for is_silent, channel_values in zip(silent_channels, perturbed_values, strict=True)
         ]
         if all(silent_channels):
-            trial.expect(not any(lost_channels), f"the gradient of {name} reaches the image, which {name} depends on")
+            trial.expect(
+                not any(lost_channels),
+                f"the gradient of {name} reaches the image, which {name} depends on (gradient masking: rounding or a "
+                "detached tensor cuts it off)",
+            )
             continue
         trial.expect(not any(lost_channels), f"the gradient of {name} reaches all three colour channels")
         ratios: list[float] = []
@@ -60,9 +68,11 @@ def check_slopes(trial: CheckCase) -> None:
 class _Probe:
     """An image with all differentiable quantities: one number for each output and each loss."""
 
-    def __init__(self, trial: CheckCase, number: int) -> None:
+    def __init__(self, trial: CheckCase, number: int, change: Tensor | None = None) -> None:
         self.trial = trial
         self.images = trial.images()[number : number + 1]
+        if change is not None:
+            self.images = self.images + change
         self.differentiable_images = self.images.clone().requires_grad_()
         dense = trial.dense(self.differentiable_images)
         self.assignment = trial.detector.assign(dense, trial.truth(((2, 0, 1)[number],)))
@@ -134,8 +144,51 @@ def check_small_changes(trial: CheckCase) -> None:
         ):  # else hardly anything changes it, as with some fresh weights
             is_sensitive = bool(small_response > 0.02 * SMALL / LARGE * large_response)
             trial.expect(
-                is_sensitive, "changes of half a step of 8 bits change Dense.logit: the image is not quantised inside"
+                is_sensitive,
+                "changes of half a step of 8 bits change Dense.logit: the image is not quantised inside (gradient "
+                "masking by rounding)",
             )
+
+
+def check_ripples(trial: CheckCase) -> None:
+    """Check that the gradient of Dense.logit is of use to an attack whose steps are half a code value to two.
+
+    A ripple finer than these steps turns the gradient from place to place, though finite differences agree with it
+    everywhere. Two signs together tell it from a detector that is merely steep: a step along the gradient changes the
+    output much less than its slope foretells, and a step along the mean gradient of many images nearby, in which the
+    ripple cancels out, does at least twice as much. The fault must show in all images.
+    """
+    name, ratios = "Dense.logit", []
+    for image_index in range(BATCH):
+        probe = _Probe(trial, image_index)
+        gradient = probe.gradient(name)
+        slope = float(gradient.abs().sum())
+        # A rise that would drown in float32 rounding says nothing.
+        if 2 * RIPPLE_STEPS[0] * slope < 10 * ROUNDING * abs(float(probe.values[name].detach())):
+            return
+        shares = {step: _rise(probe, gradient, step, name) / (2 * step * slope) for step in RIPPLE_STEPS}
+        weakest_step = min(RIPPLE_STEPS, key=lambda step: shares[step])
+        if shares[weakest_step] >= RIPPLE_SHARE:
+            return
+        mean_gradient = torch.zeros_like(gradient)
+        for draw in range(RIPPLE_DRAWS):
+            change = RIPPLE_STEPS[-1] * noise(probe.images, 1.0, draw)
+            mean_gradient += _Probe(trial, image_index, change).gradient(name) / RIPPLE_DRAWS
+        mean_rise = _rise(probe, mean_gradient, weakest_step, name)
+        ratios.append(2 * weakest_step * slope * shares[weakest_step] / max(mean_rise, 1e-30))
+        if ratios[-1] > MAX_RIPPLE_RATIO:
+            return
+    trial.need(
+        False,
+        f"steps of up to 2/255 along the gradient of {name} raise it at least half as much as those along the mean "
+        f"gradient of nearby images (gradient masking by rippling: {max(ratios):.2g} times as much)",
+    )
+
+
+def _rise(probe: _Probe, gradient: Tensor, step: float, name: str) -> float:
+    """Return the rise of a number from a step against the signs of a gradient to one along them."""
+    ahead, behind = (float(probe.at(probe.images + sign * step * gradient.sign())[name]) for sign in (1, -1))
+    return ahead - behind
 
 
 def check_loss_signs(trial: CheckCase) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from ssad.core.driving import Believer, Driver
+from ssad.core.driving import Believer, Branching, Driver
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.registry import Reference, check_arguments, label_of, resolve
@@ -108,5 +108,7 @@ class _NamedDriver:
         self.radars: Mapping[str, Lidar] = getattr(system, "radars", {})
         if isinstance(system, Believer):
             self.believe = system.believe
+        if isinstance(system, Branching):
+            self.snapshot, self.restore = system.snapshot, system.restore
         if callable(getattr(system, "to", None)):
             self.to = system.to  # type: ignore[attr-defined]

@@ -21,6 +21,7 @@ from ssad.core import safeio, schema
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import label_of
+from ssad.core.run_records import UNIT_LIMITS, ValueLimits
 from ssad.core.seeding import digest
 from ssad.core.source import source_version
 from ssad.core.types import U8, EpisodeTrace
@@ -63,12 +64,33 @@ class SuiteBase(schema.Schema):
 
 @dataclass(frozen=True)
 class Column:
-    """A metric of a kind's records: name, title, unit, and which way is better ("": neither)."""
+    """A metric of a kind's records.
+
+    Attributes:
+        name: Its key in `metrics`.
+        title: Title of the column.
+        unit: Unit of the values.
+        better: Which way is better; "": neither.
+        limits: Least and greatest possible value, such as `ssad.core.run_records.SHARE`; None: that of the unit
+            (`UNIT_LIMITS`) with either sign, if the unit has one. A result beyond them fails.
+        clock: Whether the machine's clock decides the value, so that equal runs have different ones: it is in no hash.
+    """
 
     name: str
     title: str = ""
     unit: str = ""
     better: Literal["higher", "lower", ""] = ""
+    limits: ValueLimits = (None, None)
+    clock: bool = False
+
+    @property
+    def value_limits(self) -> ValueLimits:
+        """Least and greatest possible value; None: no limit."""
+        low, high = self.limits
+        size = UNIT_LIMITS.get(self.unit)
+        if size is None:
+            return low, high
+        return -size if low is None else low, size if high is None else high
 
 
 @dataclass(frozen=True)
@@ -171,6 +193,8 @@ class Kind(ABC):
         suite: Schema of its suites.
         columns: Metrics of its records.
         factors: Fields of a record that make a row of the default table, from coarse to fine.
+        metric_limits: Least and greatest possible value of metrics that are no columns.
+        rates: Rates over cells, by symbol: the metric of the records that is above 0 where the event occurred.
         patience: Crashes and time-outs of one system after which its other cells are skipped (None: all are tried);
             for systems of which one hanging call predicts the others.
     """
@@ -179,6 +203,8 @@ class Kind(ABC):
     suite: ClassVar[type[SuiteBase]]
     columns: ClassVar[tuple[Column, ...]]
     factors: ClassVar[tuple[str, ...]]
+    metric_limits: ClassVar[Mapping[str, ValueLimits]] = {}
+    rates: ClassVar[Mapping[str, str]] = {}
     patience: ClassVar[int | None] = None
 
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
@@ -231,6 +257,12 @@ class Kind(ABC):
             Settings of the `Job`, plain data.
         """
         return {}
+
+    @cached_property
+    def limits(self) -> Mapping[str, ValueLimits]:
+        """Least and greatest possible value of each metric that has limits."""
+        limits = {column.name: column.value_limits for column in self.columns} | dict(self.metric_limits)
+        return {name: pair for name, pair in limits.items() if pair != (None, None)}
 
     def workers(self, plan: Plan, requested: int | None) -> int | None:
         """Return the number of workers that may run at once.
@@ -297,11 +329,15 @@ class Kind(ABC):
 
         A kind of your own renders its own template with `ssad.report.pages.render`, or leaves this out.
         """
-        return default.section(run, verdict=self.verdict(run))
+        return default.section(run, verdict=self.verdict(run), note=self.note(run))
 
     def summary(self, run: Run) -> Table:
         """Return the main table of a run, for the terminal and for pages that link to the run."""
-        return default.summary(run)
+        return default.summary(run, note=self.note(run))
+
+    def note(self, run: Run) -> str:
+        """Return the text under the table of columns by factors, on page and terminal; empty: there is none."""
+        return ""
 
     def verdict(self, run: Run) -> list[str]:
         """Return the findings of a run in sentences, the most important first; empty: there are none."""

@@ -8,8 +8,8 @@ from typing import Any
 
 from ssad.core.errors import StoreError
 from ssad.core.jsonl import read_lines
+from ssad.core.run_records import RESULTS
 from ssad.engine.kind import Plan, Replay, find_cell
-from ssad.engine.store import RESULTS
 
 
 def replay_cell(plan: Plan, folder: str | Path, name: str) -> Replay:

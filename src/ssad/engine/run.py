@@ -13,6 +13,7 @@ from typing import Any
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.machine import default_workers, machine_properties, versions
+from ssad.core.run_records import value_problem
 from ssad.core.seeding import digest
 from ssad.engine.command import command_of
 from ssad.engine.kind import Cell, CellError, Job, Kind, Plan, Resources
@@ -98,7 +99,8 @@ def run_json(plan: Plan) -> dict[str, Any]:
         "code": kind.code,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine_properties(),
-        "columns": [vars(column) for column in kind.columns],
+        "columns": [{key: value for key, value in vars(c).items() if key != "limits"} for c in kind.columns],
+        "limits": {name: list(pair) for name, pair in kind.limits.items()},
         "factors": list(kind.factors),
         "cells": [{"key": c.key, "name": c.name, "seed": c.seed, **c.fields} for c in plan.cells],
         **plan.inputs,
@@ -294,6 +296,8 @@ def _execute_batch(argument: tuple[Kind, list[Cell], Job]) -> dict[str, Mapping[
             safeio.dump_json(dict(result))
         except (TypeError, ValueError) as error:
             raise CellError(f"the result is not plain data: {error}") from None
+        if problem := value_problem({"status": "ok", **result}, kind.limits):
+            raise CellError(f"the result is impossible: {problem}")
         paths = [
             path
             for value in result.get("artefacts", {}).values()

@@ -1,8 +1,9 @@
-"""The results folder: append-only, safe against kill -9, without lost or duplicate lines.
+"""The results folder: append-only, safe against kill -9, without lost, duplicate or changed lines.
 
 DIR/run.json describes the run; DIR/episodes.jsonl and DIR/results.jsonl get one line per cell, the latter last: a
 cell is finished when its line in results.jsonl is complete. A truncated line is dropped on the next start; failed
-cells are removed when they are retried.
+cells are removed when they are retried. Each line has a seal, and DIR/seal.json counts the lines
+(`ssad.core.run_records`).
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from typing import Any, Self
 
 from ssad.core import safeio
 from ssad.core.errors import StoreError
-from ssad.core.jsonl import scan_lines
+from ssad.core.run_records import COUNTS, EPISODES, RESULTS, counts_text, read_records
+from ssad.core.seals import sealed
 
-RUN, RESULTS, EPISODES, LOCK = "run.json", "results.jsonl", "episodes.jsonl", ".lock"
+RUN, LOCK = "run.json", ".lock"
 
 Retry = bool | Collection[str]  # whether all failed cells are retried, or the keys of those that are
 
@@ -42,6 +44,8 @@ class Store:
         self.folder = folder
         self._lock = lock
         self._files: dict[str, int] = {}
+        self._counts = {RESULTS: 0, EPISODES: 0}
+        self._is_sealed = True
         self.results: dict[str, dict[str, Any]] = {}
         self.retried: frozenset[str] = frozenset()
 
@@ -74,27 +78,30 @@ class Store:
 
     def _begin(self, run: Mapping[str, Any], *, retry: Retry) -> None:
         if not (self.folder / RUN).exists():
-            safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
-        results, ends = scan_lines(self.folder / RESULTS)
-        # A kill may leave half a line, and the next line would be appended to it.
-        _truncate(self.folder / RESULTS, ends[-1] if ends else 0)
-        for record in results:
-            if record["key"] in self.results:
-                raise StoreError(f"{self.folder / RESULTS}: the cell {record['key']} is there twice")
-            self.results[record["key"]] = record
-        failed = frozenset(record["key"] for record in results if _failed(record))
+            content = safeio.dump_json({**run, "sealed": True}, indent=1)
+            safeio.write_atomic(self.folder / RUN, content + "\n")
+        records = read_records(self.folder, read_run(self.folder))
+        failed = frozenset(record["key"] for record in records.results if _failed(record))
         self.retried = failed.intersection(failed if retry is True else retry or ())
-        if self.retried:
-            self.results = {key: record for key, record in self.results.items() if key not in self.retried}
-            lines = [safeio.dump_json(record) + "\n" for record in self.results.values()]
-            safeio.write_atomic(self.folder / RESULTS, "".join(lines))
-        episodes, ends = scan_lines(self.folder / EPISODES)
-        while episodes and episodes[-1]["key"] not in self.results:  # its result was never written
-            episodes.pop()
-            ends.pop()
-        _truncate(self.folder / EPISODES, ends[-1] if ends else 0)
+        self.results = {record["key"]: record for record in records.results if record["key"] not in self.retried}
+        episodes = {key: episode for key, episode in records.episodes.items() if key in self.results}
+        # Folders from before there were seals stay without them: nobody knows what their lines were.
+        self._is_sealed = records.sealed
+        self._counts = {RESULTS: len(self.results), EPISODES: len(episodes)}
+        if self._is_sealed:
+            # Before the files get shorter: lines that are counted and not there would count as removed.
+            safeio.write_atomic(self.folder / COUNTS, counts_text(self._counts))
+            self._files[COUNTS] = _open(self.folder / COUNTS, os.O_RDWR)
+        if self.retried or not records.whole:
+            # A kill may leave half a line, and the next line would be appended to it.
+            for name, kept_records in ((RESULTS, self.results), (EPISODES, episodes)):
+                lines = [
+                    self._line(record, number, episodes.get(record["key"]) if name == RESULTS else None)
+                    for number, record in enumerate(kept_records.values(), 1)
+                ]
+                safeio.write_atomic(self.folder / name, "".join(lines))
         for name in (RESULTS, EPISODES):
-            self._files[name] = _open_append(self.folder / name)
+            self._files[name] = _open(self.folder / name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
     def append(self, result: Mapping[str, Any], episode: Mapping[str, Any] | None) -> None:
         """Add a finished cell; the record is durable when this returns.
@@ -112,11 +119,19 @@ class Store:
         # The result goes last: it marks the cell as finished, so its episode must already be there.
         if episode is not None:
             self._write(EPISODES, episode)
-        self._write(RESULTS, result)
+        self._write(RESULTS, result, episode)
+        if self._is_sealed:
+            # In place and not flushed: a count that lags behind the lines is legal, and the next one mends it.
+            os.pwrite(self._files[COUNTS], counts_text(self._counts).encode(), 0)
         self.results[key] = dict(result)
 
-    def _write(self, name: str, record: Mapping[str, Any]) -> None:
-        encoded = (safeio.dump_json(dict(record)) + "\n").encode()
+    def _line(self, record: Mapping[str, Any], number: int, episode: Mapping[str, Any] | None = None) -> str:
+        """Return the line of a record, with its seal if the folder has seals."""
+        line_content = sealed(record, number, episode=episode) if self._is_sealed else dict(record)
+        return safeio.dump_json(line_content) + "\n"
+
+    def _write(self, name: str, record: Mapping[str, Any], episode: Mapping[str, Any] | None = None) -> None:
+        encoded = self._line(record, self._counts[name] + 1, episode).encode()
         try:
             written = os.write(self._files[name], encoded)
             while written < len(encoded):  # a full disk or a signal can cut a write short
@@ -125,6 +140,7 @@ class Store:
         except OSError as error:
             path = self.folder / name
             raise StoreError(f"{path}: cannot be written: {error.strerror}; make room and run again") from None
+        self._counts[name] += 1
 
     def close(self) -> None:
         """Close the files and release the lock."""
@@ -204,13 +220,8 @@ def locked(folder: Path, command: str) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _truncate(path: Path, length: int) -> None:
-    if path.exists():
-        os.truncate(path, length)
-
-
-def _open_append(path: Path) -> int:
+def _open(path: Path, flags: int) -> int:
     try:
-        return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        return os.open(path, flags | os.O_CLOEXEC, 0o644)
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror}") from None

@@ -12,6 +12,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
+import numpy as np
+
+from ssad.metrics.intervals import Clusters, mean_limits
+
 NOISE = 0.02  # share of the clean score within which two attacks count as equal
 LEFT = 0.05  # share of the clean score under which the detector counts as defeated
 RESTARTS = 0.05  # share of the clean score that restarts may gain without a finding
@@ -20,7 +24,29 @@ COUPLED = 0.01  # relative change of an image's loss by another image of the bat
 MIN_BUDGET_SHARE = 0.25  # minimum share of the budget that an attack uses, unless the detector is defeated
 MIN_STEPS = 5  # steps from which an attack is expected to beat a single step on any loss
 WHOLE_LOSSES = frozenset({"full", "classification", "vanish", "margin"})  # losses about all that a detector finds
+MIN_PAIRS = 8  # images from which a comparison with the reference ensemble has an interval
+LOSS_SHORTFALL = 0.1  # share of the reference's rise of the loss that a sound attack may lack
+QUALITY_SHORTFALL = 0.02  # average precision of an image that it may leave beyond what the reference leaves
 UNBOUNDED = 64.0  # code values from which an L-infinity budget hides any picture
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceComparison:
+    """Effect of an attack and of the reference ensemble on one image (equal loss, budget and number of gradients).
+
+    Attributes:
+        attack: Name of the attack, or of the member of an ensemble.
+        loss_before: Ascended loss of the clean image.
+        loss: Ascended loss under the attack.
+        quality: Mean average precision of the image under the attack, 0 to 1.
+        references: Loss and quality under each member of the reference ensemble, by its name.
+    """
+
+    attack: str
+    loss_before: float
+    loss: float
+    quality: float
+    references: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +74,7 @@ class Attempt:
         source: Detector that the images were made against, if another one is evaluated.
         group: Further condition that must be equal for scores to be compared, such as a defence or a target; part
             of the detector's name in findings.
+        comparisons: Comparisons with the reference ensemble, one for each image that was chosen for it.
     """
 
     detector: str
@@ -69,6 +96,7 @@ class Attempt:
     change: float | None = None
     source: str = ""
     group: str = ""
+    comparisons: tuple[ReferenceComparison, ...] = ()
 
     @property
     def restarts(self) -> int:
@@ -455,10 +483,74 @@ def _used(attempts: Sequence[Attempt]) -> Iterator[Finding]:
             )
 
 
+def _reference(attempts: Sequence[Attempt]) -> Iterator[Finding]:
+    """Compare each attack with the strongest member of the reference ensemble, image by image.
+
+    The images are the sample, so the interval is of the attack's shortfall on such images of this run.
+    """
+    for attempt in _direct_attempts(attempts):
+        by_attack: dict[str, list[ReferenceComparison]] = {}
+        for comparison in attempt.comparisons:
+            by_attack.setdefault(comparison.attack, []).append(comparison)
+        for attack, comparisons in by_attack.items():
+            if len(comparisons) >= MIN_PAIRS:
+                title = attempt.title if len(by_attack) == 1 else f"{attempt.title}, member {attack}"
+                yield reference_finding(comparisons, title)
+
+
+def reference_finding(comparisons: Sequence[ReferenceComparison], title: str) -> Finding:
+    """Return a sentence if an attack falls short of the reference ensemble by more than the paired interval.
+
+    The reference is the member with the highest mean loss, and for the score the one with the lowest mean quality. An
+    attack falls short if the 95 % interval of the mean difference over images lies above `LOSS_SHORTFALL` of the rise
+    of the reference, or above `QUALITY_SHORTFALL`.
+
+    Args:
+        comparisons: Comparisons of one attack, `MIN_PAIRS` or more.
+        title: Description of the attack.
+    """
+    names = sorted(comparisons[0].references)
+    reference_values = np.array([[comparison.references[name] for name in names] for comparison in comparisons])
+    losses = np.array([comparison.loss for comparison in comparisons])
+    clean_losses = np.array([comparison.loss_before for comparison in comparisons])
+    qualities = np.array([comparison.quality for comparison in comparisons])
+    strongest = int(reference_values[..., 0].mean(0).argmax())
+    rise = float((reference_values[:, strongest, 0] - clean_losses).mean())
+    shortfall, low, high = _mean_with_limits(reference_values[:, strongest, 0] - losses)
+    if rise > 0 and low > LOSS_SHORTFALL * rise:
+        return (
+            f"{title} raises its loss by {float((losses - clean_losses).mean()):.3g} on {len(comparisons)} images, "
+            f"{names[strongest]} with as many gradients by {rise:.3g}: it falls short by {shortfall / rise:.0%} "
+            f"[{low / rise:.0%}, {high / rise:.0%}]"
+        )
+    most_harmful = int(reference_values[..., 1].mean(0).argmin())
+    excess, low, high = _mean_with_limits(qualities - reference_values[:, most_harmful, 1])
+    if low > QUALITY_SHORTFALL:
+        return (
+            f"{title} leaves an average precision of {float(qualities.mean()):.0%} on {len(comparisons)} images, "
+            f"{names[most_harmful]} with as many gradients {float(reference_values[:, most_harmful, 1].mean()):.0%}: "
+            f"it leaves {excess:.0%} [{low:.0%}, {high:.0%}] more"
+        )
+    return None
+
+
+def _mean_with_limits(values: np.ndarray) -> tuple[float, float, float]:
+    """Return the mean of values [N] and its limits; infinite ones where too few values differ for an interval."""
+    if np.ptp(values) == 0.0:
+        return float(values[0]), float(values[0]), float(values[0])
+    limits = mean_limits(values, Clusters(np.ones(len(values)), np.zeros(len(values), np.intp)))
+    low, high = float(limits.low), float(limits.high)
+    return float(limits.mean), -math.inf if math.isnan(low) else low, math.inf if math.isnan(high) else high
+
+
 RULES: Mapping[str, tuple[str, Rule]] = {
     "steps": ("more steps are never weaker", _steps),
     "radius": ("a larger budget is never weaker", _radius),
     "iterated": ("iterated attacks are at least as strong as a single step", _iterated),
+    "reference": (
+        "attacks are as strong as a reference ensemble (PGD, APGD, Square) with the same loss, budget and gradients",
+        _reference,
+    ),
     "losses": (
         f"the most steps that ran, if {MIN_STEPS} or more, are at least as strong as one on another loss",
         _losses,

@@ -40,6 +40,35 @@ COLLISIONS = {
     "collisions_static": Contact.STATIC,
 }
 
+_SHARE, _COUNT, _LENGTH, _TIME = (0.0, 1.0), (0.0, 1e9), (0.0, 1e7), (0.0, 1e9)
+LIMITS: Mapping[str, tuple[float | None, float | None]] = {
+    "collision": _SHARE,
+    "collision_events": _COUNT,
+    **dict.fromkeys(COLLISIONS, _COUNT),
+    "off_road": _LENGTH,
+    "off_road_fraction": _SHARE,
+    "distance_to_route": _LENGTH,
+    "route_completion": _SHARE,
+    "route_following": _SHARE,
+    "time": _TIME,
+    "driven": _LENGTH,
+    "red_lights": _COUNT,
+    "stop_signs": _COUNT,
+    "acceleration": (0.0, 1e5),
+    "yaw_velocity": (0.0, 1e3),
+    "lane_invasions": _COUNT,
+    "in_route_failure": _SHARE,
+    "driving_score": (0.0, 100.0),
+    "min_ttc": (0.0, 10.0),
+    "pet": (0.0, 10.0),
+    "min_distance": _LENGTH,
+    "impact_speed": (0.0, 1e3),
+    "lane_crossings": _COUNT,
+    **dict.fromkeys(("avoided_by_cc", "avoided_by_reg157", "avoided_by_rss", "avoided_by_fsm"), _SHARE),
+    "avoided_by_limit": _SHARE,
+}
+"""Least and greatest possible value of each field of `EpisodeMetrics`."""
+
 MAX_ROUTE_DISTANCE = 30.0
 OFF_ROUTE_DISTANCE = 15.0
 OFF_ROUTE_SHARE = 0.30

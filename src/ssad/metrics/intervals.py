@@ -20,15 +20,17 @@ from ssad.core.types import F64, Bool
 
 LEVEL = 0.95
 MIN_CLUSTERS = 5
+"""With fewer clusters there is no interval; their range is shown."""
 MIN_ROUTES = 10
 """Routes of a town from which on a number of drives has an interval: fewer show their range."""
-"""With fewer clusters there is no interval; their range is shown."""
 MIN_DIFFERENT = 8
 """A mean without bounds has an interval only if so many clusters differ from the commonest value."""
 
 _EXTREME_WEIGHT = 0.3
 """Part of a cluster that each end of an interval of a mean leaves room for: of the intervals simulated, at least
 93.4 % hold in every case (93.9 with 0.5), and at most 97.5 % where clusters are normal (97.8 with 0.5)."""
+_ALIKE_WEIGHT = 0.1
+"""Part of a cluster, all of whose cases are alike, that the design effect of a share makes room for."""
 _Z = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
 _TAIL_PROBABILITY = 0.5 - 0.5 * LEVEL
 
@@ -74,10 +76,12 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> C
     and Graubard 1998), less for few degrees of freedom. It is never below the number of clusters, since no values
     in [0, 1] vary more. A stratum whose clusters are all 0 or all 1 counts as if half a cluster differed.
 
+    Values that are 0 or 1 make room for clusters that are more alike than those seen (`alike_inverse`).
+
     Args:
         sums: [..., K] sum of the values of each cluster.
         clusters: Their sizes and strata.
-        cap: Maximum effective number; twice the number of cases for values that are 0 or 1.
+        cap: Maximum effective number: twice the number of cases for values that are 0 or 1, infinite for others.
 
     Returns:
         The limits [...]; NaN where values inside (0, 1) do not vary at all and `cap` is infinite.
@@ -97,7 +101,11 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> C
         effective = np.full(mean.shape, clusters.size.sum())  # nothing to estimate: the cases are independent
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
-            effective = mean * (1.0 - mean) / spread.variance * (_Z / t_quantile(spread.freedom)) ** 2
+            inverse = spread.variance / (mean * (1.0 - mean))
+        if math.isfinite(cap):
+            inverse = alike_inverse(inverse, spread.active_clusters, min_effective)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            effective = (_Z / t_quantile(spread.freedom)) ** 2 / inverse
         is_constant = _flat(spread.variance, mean) & (mean > 0.0) & (mean < 1.0)
         effective = np.clip(
             np.where(is_constant, np.inf, np.nan_to_num(effective, nan=min_effective)), min_effective, cap
@@ -105,6 +113,35 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> C
     lower, upper = share_limits(mean, np.where(np.isinf(effective), 1.0, effective))
     has_interval = np.isfinite(effective)
     return ConfidenceLimits(mean, np.where(has_interval, lower, np.nan), np.where(has_interval, upper, np.nan), "beta")
+
+
+def alike_inverse(inverse: F64, active_clusters: F64, min_effective: float) -> F64:
+    """Return one over the effective number of a share, averaged with that of cases all alike.
+
+    Few clusters with events rarely include the largest ones. So cases all alike stand for 0.1 of a cluster beside
+    those that carry the variation.
+
+    Args:
+        inverse: [...] variance of the share over that of a single case.
+        active_clusters: [...] number of clusters that carry the variation.
+        min_effective: Effective number of cases all alike.
+    """
+    alike_part = _ALIKE_WEIGHT / (active_clusters + _ALIKE_WEIGHT)
+    return np.asarray((1.0 - alike_part) * inverse + alike_part / min_effective)
+
+
+def variance_freedom(active_clusters: F64, clusters: int, max_freedom: float) -> F64:
+    """Return the degrees of freedom of a variance that few clusters may carry.
+
+    Args:
+        active_clusters: [...] number of equal contributions with the same kurtosis.
+        clusters: Number of clusters.
+        max_freedom: Clusters less strata.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kurtosis = clusters / active_clusters
+    freedom = np.nan_to_num(2.0 * clusters / np.maximum(kurtosis - 1.0, 1e-9), nan=max_freedom)
+    return np.asarray(np.clip(freedom, 1.0, max_freedom))
 
 
 def mean_limits(sums: F64, clusters: Clusters) -> ConfidenceLimits:
@@ -155,6 +192,32 @@ def replicate_limits(value: F64, variance: F64, clusters: int, *, bounded: bool)
     return value / factor, value * factor
 
 
+def difference_limits(first: ConfidenceLimits, second: ConfidenceLimits) -> tuple[F64, F64]:
+    """Return limits of first - second, two shares of one multinomial, from the limits of each (MOVER).
+
+    Args:
+        first: Limits [...] of the share of the cases where only the first system has the event.
+        second: The same for the second system.
+
+    Source:
+        Donner and Zou, "Closed-form confidence intervals for functions of the normal mean and standard deviation"
+        (2012); Newcombe, "Improved confidence intervals for the difference between binomial proportions based on
+        paired data" (1998).
+    """
+    product = first.mean * second.mean
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.where(product == 0.0, 0.0, -np.sqrt(product / ((1.0 - first.mean) * (1.0 - second.mean))))
+
+    def margin(first_margin: F64, second_margin: F64) -> F64:
+        squares = first_margin**2 + second_margin**2 - 2.0 * correlation * first_margin * second_margin
+        return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+    mean = first.mean - second.mean
+    lower = mean - margin(first.mean - first.low, second.high - second.mean)
+    upper = mean + margin(first.high - first.mean, second.mean - second.low)
+    return np.maximum(lower, -1.0), np.minimum(upper, 1.0)
+
+
 def share_limits(share: npt.ArrayLike, n: npt.ArrayLike) -> tuple[F64, F64]:
     """Return limits of a share observed in n independent cases; n and the number of events need not be whole.
 
@@ -193,10 +256,18 @@ def t_quantile(freedom: npt.ArrayLike) -> F64:
 
 @dataclass(frozen=True)
 class _Spread:
-    """Variation of contributions: variance of their sum, degrees of freedom, skewness of the sum."""
+    """Variation of contributions.
+
+    Attributes:
+        variance: [...] variance of their sum.
+        freedom: [...] degrees of freedom, fewer where few clusters carry the variation.
+        active_clusters: [...] number of equal contributions that would have the same kurtosis.
+        skew: [...] skewness of the sum.
+    """
 
     variance: F64
     freedom: F64
+    active_clusters: F64
     skew: F64
 
 
@@ -221,13 +292,13 @@ def _spread(contributions: F64, clusters: Clusters) -> _Spread:
     variance = (contributions**2 * stratum_count / (stratum_count - 1.0)).sum(axis=-1)
     cluster_count, max_freedom = contributions.shape[-1], float((cluster_counts - 1.0).sum())
     with np.errstate(divide="ignore", invalid="ignore"):
-        kurtosis = cluster_count * (contributions**4).sum(axis=-1) / (contributions**2).sum(axis=-1) ** 2
-        freedom = np.nan_to_num(2.0 * cluster_count / np.maximum(kurtosis - 1.0, 1e-9), nan=max_freedom)
+        active_clusters = (contributions**2).sum(axis=-1) ** 2 / (contributions**4).sum(axis=-1)
         third_moment = (
             contributions**3 * stratum_count**2 / np.maximum((stratum_count - 1.0) * (stratum_count - 2.0), 1.0)
         ).sum(axis=-1)
         skew = np.nan_to_num(third_moment / variance**1.5)
-    return _Spread(variance, np.clip(freedom, 1.0, max_freedom), skew)
+    freedom = variance_freedom(active_clusters, cluster_count, max_freedom)
+    return _Spread(variance, freedom, np.nan_to_num(active_clusters), skew)
 
 
 def _different(means: F64) -> npt.NDArray[np.intp]:

@@ -15,9 +15,10 @@ from ssad.core.detections import Detections, Truth
 from ssad.core.protocols import Detector
 from ssad.core.seeding import generator
 from ssad.core.types import F64, I32, Bool
+from ssad.metrics.attack_success import SuccessRate, attack_success_rate, event_share
 from ssad.metrics.detection2d import Boxes2D, Matched2D, average_precision, match_2d
 from ssad.metrics.detection_boxes import I64
-from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, replicate_limits
+from ssad.metrics.intervals import MIN_CLUSTERS, replicate_limits
 
 IOU = 0.5
 MIN_COVERED_SHARE = 0.25  # share of the target from which on a box of any class says that something is there
@@ -129,6 +130,7 @@ def target_scores(
     sightings: Sequence[TargetSighting],
     clean_sightings: Sequence[TargetSighting] | None = None,
     *,
+    floor: float = 0.0,
     replicates: int = 100,
     seed: int = 0,
 ) -> dict[str, Any]:
@@ -138,11 +140,14 @@ def target_scores(
     count every vehicle of its class. found_25 and found_50 are shares of the pictures in which the target is found with
     that score; ASR_25 and ASR_50 the share of those where it is found without the attack and is not with it; ASR_any_25
     the share of these where no box of any class covers a quarter of it either; ASR_all_25 that of all vehicles (no
-    match is counted twice).
+    match is counted twice). n0_25, n0_50 and n0_all_25 are the numbers of targets, or vehicles, of which these are
+    shares. There is no ASR where the target is found clean in less than `floor` of the pictures, above the score of
+    the ASR.
 
     Args:
         sightings: With the attack.
         clean_sightings: The same pictures without it; None for these themselves.
+        floor: Minimum share of the pictures in which the target is found clean, at each ASR's own score.
         replicates: Of the bootstrap over drives, for the intervals of AP.
         seed: Of its draws.
 
@@ -166,6 +171,10 @@ def target_scores(
             lower_limit, upper_limit = replicate_limits(np.asarray(ap), variance, len(drives), bounded=True)
             intervals[name] = [float(lower_limit), float(upper_limit)]
             ap_replicates[name] = [round(entry, 5) for entry in values]
+
+    def add_rate(name: str, rate: SuccessRate) -> None:
+        metrics[name], intervals[name] = rate.value, rate.interval
+
     scores = [entry.confidences() for entry in sightings]
     scores_before = scores if clean_sightings is None else [entry.confidences() for entry in clean_sightings]
     target_scores_now, target_scores_before = (
@@ -175,24 +184,32 @@ def target_scores(
     for confidence in CONFIDENCES:
         percent = round(100 * confidence)
         is_found = target_scores_now > confidence
-        metrics[f"found_{percent}"], intervals[f"found_{percent}"] = _share(
+        metrics[f"found_{percent}"], intervals[f"found_{percent}"] = event_share(
             is_found, np.ones(len(target_scores_now), bool), drive_indices
         )
-        if clean_sightings is not None:
-            metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(
-                ~is_found, target_scores_before > confidence, drive_indices
-            )
+        if clean_sightings is None:
+            continue
+        was_found = target_scores_before > confidence
+        add_rate(f"ASR_{percent}", attack_success_rate(was_found, is_found, drive_indices, floor=floor))
+        metrics[f"n0_{percent}"] = int(was_found.sum())
     if clean_sightings is not None:
         min_score = CONFIDENCES[0]
-        is_undetected = np.maximum(target_scores_now, [entry.any_class for entry in sightings]) <= min_score
-        metrics["ASR_any_25"], intervals["ASR_any_25"] = _share(
-            is_undetected, target_scores_before > min_score, drive_indices
-        )
+        was_found = target_scores_before > min_score
+        is_detected = np.maximum(target_scores_now, [entry.any_class for entry in sightings]) > min_score
+        add_rate("ASR_any_25", attack_success_rate(was_found, is_detected, drive_indices, floor=floor))
         is_counted = np.concatenate([~entry.crowd for entry in sightings])
         all_scores, all_scores_before = np.concatenate(scores)[is_counted], np.concatenate(scores_before)[is_counted]
         drive_per_object = np.repeat(drive_indices, [len(entry.real) for entry in sightings])[is_counted]
-        lost_and_counted = all_scores <= min_score, all_scores_before > min_score
-        metrics["ASR_all_25"], intervals["ASR_all_25"] = _share(*lost_and_counted, drive_per_object)
+        # Distant vehicles are found less often than the target, whose share tells whether the threshold suits.
+        all_rate = attack_success_rate(
+            all_scores_before > min_score,
+            all_scores > min_score,
+            drive_per_object,
+            floor=floor,
+            clean_share=float(was_found.mean()),
+        )
+        add_rate("ASR_all_25", all_rate)
+        metrics["n0_all_25"] = all_rate.n0
     metrics["confidence"] = float(target_scores_now.mean())
     defined_intervals = {name: interval for name, interval in intervals.items() if interval is not None}
     rounded = {name: None if ap is None else round(ap, 6) for name, ap in metrics.items()}
@@ -280,19 +297,3 @@ def _boxes(
         None if score is None else np.concatenate(score),
         None if ignore is None else np.concatenate(ignore),
     )
-
-
-def _share(event: Bool, is_counted: Bool, drive: I32) -> tuple[float | None, list[float] | None]:
-    """Share of the counted pictures with an event, and its interval from drives; None where nothing is counted."""
-    if not is_counted.any():
-        return None, None
-    drives, drive_of_counted = np.unique(drive[is_counted], return_inverse=True)
-    drive_sizes = np.bincount(drive_of_counted).astype(np.float64)
-    event_sums: F64 = np.bincount(drive_of_counted, weights=event[is_counted].astype(np.float64)).astype(np.float64)
-    share = float(event_sums.sum() / drive_sizes.sum())
-    if len(drives) < MIN_CLUSTERS:
-        return share, None
-    limits = bounded_limits(
-        event_sums, Clusters(drive_sizes, np.zeros(len(drive_sizes), np.intp)), cap=2.0 * float(drive_sizes.sum())
-    )
-    return share, [float(limits.low), float(limits.high)]

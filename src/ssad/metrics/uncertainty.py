@@ -23,6 +23,7 @@ from ssad.metrics.intervals import (
     Clusters,
     ConfidenceLimits,
     bounded_limits,
+    difference_limits,
     mean_limits,
     replicate_limits,
 )
@@ -252,27 +253,8 @@ def paired_difference(
             high=np.fmax(highest.high, highest.mean) if unknown_pairs else highest.high,
             failed=missing,
         )
-    correlation = (
-        0.0
-        if first_share * second_share == 0.0
-        else -math.sqrt(first_share * second_share / ((1.0 - first_share) * (1.0 - second_share)))
-    )
-
-    def margin(first_margin: float, second_margin: float) -> float:
-        return math.sqrt(
-            max(
-                first_margin * first_margin
-                + second_margin * second_margin
-                - 2.0 * correlation * first_margin * second_margin,
-                0.0,
-            )
-        )
-
-    lower = first_share - second_share - margin(first_share - only_first.low, only_second.high - second_share)
-    upper = first_share - second_share + margin(only_first.high - first_share, second_share - only_second.low)
-    return replace(
-        only_first, mean=first_share - second_share, low=max(lower, -1.0), high=min(upper, 1.0), failed=missing
-    )
+    lower, upper = difference_limits(*(_as_limits(share) for share in (only_first, only_second)))
+    return replace(only_first, mean=first_share - second_share, low=float(lower), high=float(upper), failed=missing)
 
 
 def sign_flip_test(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, draws: int = 20_000) -> float:
@@ -314,18 +296,31 @@ def sign_flip_test(first: Mapping[str, CaseValue], second: Mapping[str, CaseValu
     return as_large / len(signs) if is_exact else (as_large + 1) / (draws + 1)
 
 
+def _as_limits(share: Estimate) -> ConfidenceLimits:
+    mean, low, high = (np.asarray(number) for number in (share.mean, share.low, share.high))
+    return ConfidenceLimits(mean, low, high, share.method)
+
+
+def complete_pairs(
+    first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]
+) -> list[tuple[CaseValue, CaseValue]]:
+    """Return the values of the cells that both have, that failed in neither and are measured in both.
+
+    Args:
+        first: Values of one system by cell.
+        second: Values of the other system.
+    """
+    pairs = [(first[key], second[key]) for key in sorted(set(first) & set(second))]
+    return [pair for pair in pairs if not any(half.failed or math.isnan(half.value) for half in pair)]
+
+
 def _pairs(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -> tuple[list[CaseValue], int]:
     """Return the differences of the cells that both have, and the number of cells without one."""
     pairs = [
         CaseValue(
             first_value.value - second_value.value, first_value.cluster, f"{first_value.case}\n{second_value.case}"
         )
-        for key in sorted(set(first) & set(second))
-        if not (
-            (first_value := first[key]).failed
-            or (second_value := second[key]).failed
-            or math.isnan(first_value.value - second_value.value)
-        )
+        for first_value, second_value in complete_pairs(first, second)
     ]
     return pairs, len(set(first) | set(second)) - len(pairs)
 

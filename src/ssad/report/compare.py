@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -220,6 +220,7 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int, wanted_pairs:
     verdicts: list[str] = []
     replays: list[ReplayPair] = []
     equal = shared_count = 0
+    clock_metrics = {column["name"] for column in first.run.header.get("columns") or [] if column.get("clock")}
     unshared_counts = [0, 0]
     for first_subject, second_subject in pairs:
         first_lines = {name: line for (subject, name), line in first.lines.items() if subject == first_subject}
@@ -230,7 +231,9 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int, wanted_pairs:
             unshared_counts[0] + len(first_lines) - len(shared_names),
             unshared_counts[1] + len(second_lines) - len(shared_names),
         ]
-        equal += sum(_equal(_metrics(first_lines[name]), _metrics(second_lines[name])) for name in shared_names)
+        equal += sum(
+            _equal(_metrics(first_lines[name]), _metrics(second_lines[name]), clock_metrics) for name in shared_names
+        )
         title = first_subject if first_subject == second_subject else f"{first_subject} → {second_subject}"
         for name in shared_names:
             first_line, second_line = first_lines[name], second_lines[name]
@@ -305,10 +308,11 @@ def _findings(table: Table) -> Iterator[str]:
         yield "No difference is larger than chance alone makes."
 
 
-def _equal(first_line: Mapping[str, Any], second_line: Mapping[str, Any]) -> bool:
+def _equal(first_line: Mapping[str, Any], second_line: Mapping[str, Any], ignored: Container[str]) -> bool:
     shared_fields = {
         name
         for name in first_line.keys() & second_line.keys()
+        if name not in ignored
         if first_line[name] is not None and second_line[name] is not None
     }
     return bool(shared_fields) and all(first_line[name] == second_line[name] for name in shared_fields)
@@ -486,9 +490,8 @@ def _state(line: Mapping[str, Any]) -> str:
 
 def _changes(first: Run, second: Run) -> Iterator[str]:
     """Yield the differences between the headers of two runs: code, versions, suite, systems, weights, towns."""
-    for name in sorted(
-        (set(first.header) | set(second.header)) - {"cells", "columns", "identity", "command", "started"}
-    ):
+    unmentioned_keys = {"cells", "columns", "limits", "identity", "command", "started", "sealed"}
+    for name in sorted((set(first.header) | set(second.header)) - unmentioned_keys):
         yield from _differences(name, first.header.get(name), second.header.get(name))
 
 

@@ -14,10 +14,11 @@ from ssad.report.records import Line, field, metric_cell
 from ssad.report.tables import METHODS, Table, TableCell
 
 
-def section(run: Run, *, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
-    """Return the page of a run, with its leading sentences, and its one table."""
+def section(run: Run, *, verdict: Sequence[str] = (), note: str = "") -> tuple[str, Sequence[Table]]:
+    """Return the page of a run, with its leading sentences, and its one table, with a note of its kind."""
     factors = _factors(run)
     table = result_table(run)
+    table = replace(table, note=f"{note} {table.note}".strip())
     failures = [
         ([field(name)(line) for name in factors], line["status"], line.get("reason", "")) for line in run.failures
     ]
@@ -33,9 +34,9 @@ def section(run: Run, *, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tab
     return page, [table]
 
 
-def summary(run: Run) -> Table:
-    """Return the table for the terminal."""
-    return replace(result_table(run), note="")
+def summary(run: Run, *, note: str = "") -> Table:
+    """Return the table for the terminal, with a note of its kind."""
+    return replace(result_table(run), note=note)
 
 
 def result_table(run: Run, factors: Sequence[str] = ()) -> Table:
@@ -50,7 +51,7 @@ def result_table(run: Run, factors: Sequence[str] = ()) -> Table:
         columns = {metric: {"name": metric} for line in run.lines for metric in line.get("metrics") or {}}
     titles = {name: _title(column) for name, column in columns.items()}
     notes = [f"{titles[name]}: {c['better']} is better." for name, c in columns.items() if c.get("better")]
-    return Table.pivot(
+    table = Table.pivot(
         "results",
         "Results",
         run.lines,
@@ -59,6 +60,7 @@ def result_table(run: Run, factors: Sequence[str] = ()) -> Table:
         metric=_cell,
         note=" ".join([*notes, METHODS]),
     )
+    return replace(table, clock=tuple(titles[name] for name, column in columns.items() if column.get("clock")))
 
 
 def _factors(run: Run) -> list[str]:

@@ -60,6 +60,7 @@ def join_runs(runs: Sequence[Run]) -> Run:
         lines=tuple(lines[name] for name in cells if name in lines),
         episodes={key: episode for run in runs for key, episode in run.episodes.items()},
         planned=len(cells),
+        sealed=all(run.sealed for run in runs),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import shlex
 import textwrap
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +14,7 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
-from ssad.core.jsonl import read_lines
+from ssad.core.run_records import RESULTS, read_records
 
 INCIDENTAL = (
     "batch",
@@ -38,6 +39,7 @@ class Run:
         lines: Lines of results.jsonl, in the order of the suite.
         episodes: Lines of episodes.jsonl by key; empty for kinds that have none.
         planned: Number of cells of the complete run.
+        sealed: Whether its lines have seals, so that a change to them is noticed.
     """
 
     folder: Path
@@ -45,6 +47,7 @@ class Run:
     lines: tuple[Mapping[str, Any], ...]
     episodes: Mapping[str, Mapping[str, Any]]
     planned: int
+    sealed: bool = True
 
     @property
     def suite(self) -> Mapping[str, Any]:
@@ -114,24 +117,30 @@ def _spoken(value: Any) -> str:
 
 
 def load_run(folder: Path | str) -> Run:
-    """Read run.json, results.jsonl and episodes.jsonl.
+    """Read run.json, results.jsonl and episodes.jsonl, and check every line.
+
+    A folder whose lines have no seals, such as one of an earlier version, is read with a warning.
 
     Raises:
-        StoreError: The folder does not hold a run, the run has no result yet, or a line is broken or no result of a
-            cell.
+        StoreError: The folder does not hold a run, the run has no result yet, or its records fail a check of
+            `ssad.core.run_records.read_records`.
     """
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise StoreError(f"{folder}: no run here (run.json is missing); give a folder written by: ssad run")
     header: Mapping[str, Any] = safeio.read_json(folder / "run.json")
-    lines = read_lines(folder / "results.jsonl")
-    if not lines:
+    if not isinstance(header, dict):
+        raise StoreError(f"{folder / 'run.json'}: not written by ssad run; give a folder written by: ssad run")
+    records = read_records(folder, header)
+    if not records.results:
         raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
-    for line in lines:
-        if not (isinstance(line["key"], str) and "status" in line):
-            problem = f"the line with key {line['key']!r} is no result of a cell"
-            raise StoreError(f"{folder}/results.jsonl: {problem}; remove it and run the suite again")
+    if not records.sealed:
+        warnings.warn(
+            f"{folder / RESULTS}: its lines have no seals, so changes to them cannot be noticed; run the suite again "
+            "for sealed ones",
+            stacklevel=1,
+        )
     positions = {cell["key"]: position for position, cell in enumerate(header.get("cells", []))}
-    lines.sort(key=lambda line: positions.get(line["key"], len(positions)))
-    episodes = {line["key"]: line for line in read_lines(folder / "episodes.jsonl")}
-    return Run(folder, header, tuple(lines), episodes, max(len(positions), len(lines)))
+    lines = sorted(records.results, key=lambda line: positions.get(line["key"], len(positions)))
+    planned = max(len(positions), len(lines))
+    return Run(folder, header, tuple(lines), records.episodes, planned, sealed=records.sealed)

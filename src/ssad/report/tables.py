@@ -103,7 +103,18 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """A table: name of its files, title, heads of the leading columns, and the rest; source of published numbers."""
+    """A table.
+
+    Attributes:
+        name: Name of its files.
+        title: Title.
+        heads: Heads of the leading columns.
+        columns: Heads of the other columns.
+        rows: Rows.
+        note: Text under the table.
+        source: Source of the published numbers.
+        clock: Those of `columns` that the machine's clock decides: equal runs differ there.
+    """
 
     name: str
     title: str
@@ -112,6 +123,7 @@ class Table:
     rows: tuple[TableRow, ...]
     note: str = ""
     source: str = ""
+    clock: tuple[str, ...] = ()
 
     @classmethod
     def pivot(
@@ -195,14 +207,21 @@ def _of_second(function: Callable[[Record], Result], entry: tuple[int, Record]) 
     return function(entry[1])
 
 
-def to_csv(table: Table) -> str:
-    """Return one line a number, with interval, n, source, clusters and method: for further computation."""
+def to_csv(table: Table, *, clock: bool = True) -> str:
+    """Return one line a number, with interval, n, source, clusters and method: for further computation.
+
+    Args:
+        table: The table.
+        clock: Whether the columns that the machine's clock decides are there too.
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     heads = ("column", "mean", "low", "high", "n", "failed", "source", "clusters", "method")
     writer.writerow([*(head.lower() for head in table.heads), *heads])
     for row in table.rows:
         for column, cell in zip(table.columns, row.cells, strict=True):
+            if column in table.clock and not clock:
+                continue
             numbers = ["" if math.isnan(number) else repr(float(number)) for number in (cell.mean, cell.low, cell.high)]
             source = "published" if row.published else "ours"
             details = (
@@ -237,8 +256,9 @@ def tex(text: str) -> str:
 
 
 def to_latex(table: Table) -> str:
-    r"""Return a booktabs tabular; it needs \usepackage{booktabs}."""
+    r"""Return a booktabs tabular, with the note as a comment before it; it needs \usepackage{booktabs}."""
     lines = [
+        *(f"% {line}" for line in table.note.splitlines()),
         "\\begin{tabular}{" + "l" * len(table.heads) + "c" * len(table.columns) + "}",
         "\\toprule",
         " & ".join(tex(head) for head in [*table.heads, *table.columns]) + r" \\",

@@ -12,10 +12,12 @@ from ssad.report.records import Line, metric_cell, metric_of
 
 def complete_verdict(run: Run, sentences: Sequence[str]) -> list[str]:
     """Return the sentences of a kind after the state of the run, and a default where there are none."""
-    progress_sentences = (
-        [f"Not finished: {len(run.lines)} of {run.planned} cells have run."] if len(run.lines) < run.planned else []
-    )
-    return [sentence for sentence in [*progress_sentences, *sentences] if sentence] or ["See the table."]
+    state_sentences = []
+    if len(run.lines) < run.planned:
+        state_sentences.append(f"Not finished: {len(run.lines)} of {run.planned} cells have run.")
+    if not run.sealed:
+        state_sentences.append("The records have no seals: changes to them would not be noticed.")
+    return [sentence for sentence in [*state_sentences, *sentences] if sentence] or ["See the table."]
 
 
 def worst_condition(subject: str, metric: str, scores: Mapping[str, float], condition_noun: str) -> str:

@@ -8,7 +8,16 @@ import numpy.typing as npt
 from ssad.core.driving import WorldState
 from ssad.core.geometry import obb_distance, to_local
 from ssad.core.types import F64, I32, Bool
-from ssad.drivers.careful.driver import EASY, PULL, bend_speed, is_coming, is_in_the_way, squared_bend_speeds
+from ssad.drivers.careful.driver import (
+    EASY,
+    PULL,
+    RESPONSE,
+    bend_speed,
+    following_acceleration,
+    is_coming,
+    is_in_the_way,
+    squared_bend_speeds,
+)
 from ssad.drivers.careful.encounter import Encounter
 from ssad.drivers.careful.grade import AFTER, EARLIEST, HORIZON, conflict_start
 from ssad.drivers.careful.models import CarefulModel, careful_model, initial_reaction, react
@@ -23,9 +32,9 @@ class Hindsight:
     """Remembers the last 6 s of scenes, and plays them again with a careful driver at the wheel.
 
     It is `ssad.drivers.careful.grade` for two in an empty town: the careful driver takes over when the danger begins,
-    goes on along the ego's route at the speed that it finds (less in bends), and brakes as its model says. The other
-    does what it did, and from the contact on brakes to a stop straight ahead, as in a saved scenario. Whom else there
-    is, red lights and what hides the other from sight are left out.
+    goes on along the ego's route at the speed that it finds (less in bends), brakes as its model says, and follows the
+    other once it has braked for it. The other does what it did, and from the contact on brakes to a stop straight
+    ahead, as in a saved scenario. Whom else there is, red lights and what hides the other from sight are left out.
     """
 
     def __init__(self, scenes: int, agents: int, *, dt: float = 0.1, model: CarefulModel | None = None) -> None:
@@ -124,6 +133,7 @@ class Hindsight:
         kept_speed = np.maximum(speed, 1.0)
         arc_position, left, _ = (part[:, 0] for part in path.project(np.zeros((len(speed), 1, 2))))
         x, accel, memory, poses = np.zeros(len(speed)), np.zeros(len(speed)), initial_reaction(speed.shape), []
+        follows = np.zeros(speed.shape, bool)
         for t in range(encounter.gap.shape[1]):
             lateral_offset = left * np.maximum(1.0 - x / 10.0, 0.0)
             poses.append(
@@ -134,8 +144,11 @@ class Hindsight:
                 **current_values | {"speed": speed, "accel": accel, "gap": current_values["gap"] - x}
             )
             requested_accel, memory = react(self.model, current_encounter, memory, self.dt)
+            follows |= memory.brake > 0.0
             bend_limit = bend_speed(speed_caps, bend_positions - (arc_position - BEHIND + x)[:, None])
-            free_accel = np.clip(2.0 * (np.minimum(kept_speed, bend_limit) - speed), -2.0 * EASY, PULL)
+            free_accel = np.clip((np.minimum(kept_speed, bend_limit) - speed) / RESPONSE, -2.0 * EASY, PULL)
+            following = following_acceleration(self.model, current_encounter, follows)
+            free_accel = np.minimum(free_accel, np.maximum(following, -EASY))
             free_accel = np.where(is_coming(current_encounter), np.minimum(free_accel, 0.0), free_accel)
             requested_accel = np.where(
                 is_in_the_way(current_encounter, half_length) & (speed < 1.5),

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Driver, Reproducible, Sensor, Simulator
+from ssad.core.driving import Branching, Driver, Reproducible, Sensor, Simulator
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import generator
 from ssad.core.types import ENDS, AgentKind, Controller, End
@@ -246,6 +246,9 @@ def check_driver(
     )
     if driver.controller == Controller.EXTERNAL:
         _check_controls(make(), simulator(assignment), steps, available)
+        world = simulator(assignment)
+        if isinstance(driver, Branching) and isinstance(world, Reproducible):
+            _check_branches(driver, world, steps, available)
 
 
 def _ego_poses(driver: Driver, world: Simulator, *, steps: int, sensors: Mapping[str, Sensor]) -> list[bytes]:
@@ -257,6 +260,32 @@ def _ego_poses(driver: Driver, world: Simulator, *, steps: int, sensors: Mapping
         loop.step()
         poses.append(world.state().pose[:, 0].copy())
     return [np.stack(poses)[:, scene].tobytes() for scene in range(world.batch)]
+
+
+def _check_branches(driver: Driver, world: Simulator, steps: int, sensors: Mapping[str, Sensor]) -> None:
+    """Check that a driver continues from a restored snapshot as before."""
+    assert isinstance(driver, Branching)
+    assert isinstance(world, Reproducible)
+    loop = Loop(world, {0: driver}, sensors=sensors)
+    loop.reset()
+    for _ in range(steps // 2):
+        loop.step()
+    saved = world.snapshot()
+    states = {name: np.array(values) for name, values in driver.snapshot().items()}
+    _require(
+        all(values.ndim > 0 and len(values) == world.batch for values in states.values()),
+        "snapshot has a row for each episode",
+    )
+    runs = []
+    for _ in range(2):
+        poses = []
+        for _ in range(steps - steps // 2):
+            loop.step()
+            poses.append(world.state().pose.copy())
+        runs.append(np.stack(poses).tobytes())
+        world.restore(saved)
+        driver.restore({name: values.copy() for name, values in states.items()})
+    _require(runs[0] == runs[1], "a restored snapshot continues as before")
 
 
 def _check_controls(driver: Driver, world: Simulator, steps: int, known: Mapping[str, Sensor]) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -97,6 +98,13 @@ class PolicyDriver:
         self.sensors = (policy.observation,)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
+        """Do nothing: the policy is stateless."""
+
+    def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return an empty mapping: the policy is stateless."""
+        return {}
+
+    def restore(self, states: Mapping[str, npt.NDArray[Any]]) -> None:
         """Do nothing: the policy is stateless."""
 
     def act(self, view: Observation) -> F32:

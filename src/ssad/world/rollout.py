@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,8 @@ _AGENT = ("x", "y", "yaw", "speed", "active")
 class Loop:
     """Drivers acting in a simulator.
 
-    All changing state lies in the simulator, so a restored snapshot continues bit-exactly if the drivers keep none.
+    A restored snapshot of the simulator continues bit-exactly if the drivers keep no state, or theirs is restored too
+    (`ssad.core.driving.Branching`).
 
     Args:
         simulator: The simulator.
@@ -106,10 +108,18 @@ class Loop:
             for target, _ in self.drivers
         ]
 
-    def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
+    def reset(
+        self, scenes: Scenes | None = None, *, episodes: Scenes | None = None, seeds: Sequence[int] | None = None
+    ) -> None:
         """Restart scenes (default: all) as `Simulator.reset` does, and assign the drivers there.
 
         Drivers forget the past only when all scenes restart.
+
+        Args:
+            scenes: Numbers of the scenes; None: all.
+            episodes: Number of the next episode of each of these scenes; None: the same again.
+            seeds: [B] seeds of the episodes that drivers are given, so that scenes of one episode differ in what
+                drivers draw; None: those of the episodes.
         """
         simulator = self.simulator
         simulator.reset(scenes, episodes=episodes)
@@ -120,7 +130,10 @@ class Loop:
             if isinstance(target, int):
                 self._seat(policy, (np.arange(simulator.agents) == target) & started[:, None])
             if (driver.controller == Controller.EXTERNAL or isinstance(driver, Believer)) and scenes is None:
-                driver.reset([simulator.episodes[episode_index] for episode_index in simulator.assigned])
+                assigned = [simulator.episodes[episode_index] for episode_index in simulator.assigned]
+                if seeds is not None:
+                    assigned = [replace(episode, seed=seed) for episode, seed in zip(assigned, seeds, strict=True)]
+                driver.reset(assigned)
 
     def _seat(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
         driver = self.drivers[policy][1]

@@ -86,6 +86,36 @@ def test_rss_keeps_its_distance_along_and_across() -> None:
     assert demand(RSS(), gap=60.0, lead=-10.0) > demand(RSS(), gap=60.0, lead=10.0) == 0.0
 
 
+@pytest.mark.parametrize("name", ["rss", "fsm"])
+def test_who_is_too_near_is_a_danger_also_at_the_same_speed(name: str) -> None:
+    assert demand(careful_model(name), speed=10.0, lead=10.0, gap=3.0) > 0.0
+    assert demand(careful_model(name), speed=10.0, lead=10.0, gap=40.0) == 0.0
+
+
+def test_rss_reaches_its_braking_in_six_tenths_of_a_second() -> None:
+    brake = braking(RSS(), meet(gap=5.0), 20)
+    assert brake[:7] == pytest.approx(np.zeros(7))
+    assert np.diff(brake).max() <= 12.66 * 0.1
+    assert brake[-1] == pytest.approx(0.774 * 9.81)
+
+
+def test_following_gaps_are_those_of_the_sources() -> None:
+    speeds = np.array([0.0, 2.0, 25.0 / 3.6, 50.0 / 3.6, 100.0 / 3.6])
+    assert CarefulHuman().following_gap(speeds) == pytest.approx(2.0 * speeds)
+    # 1.25 s between the rows of 20 and 30 km/h
+    expected = [2.0, 2.0, 1.25 * 25.0 / 3.6, 1.5 * 50.0 / 3.6, 1.6 * 100.0 / 3.6]
+    assert Reg157().following_gap(speeds) == pytest.approx(expected)
+    for speed in (6.0, 20.0):
+        gap = float(RSS().following_gap(np.array(speed)))
+        # the leader has braked with 6 m/s^2 for 0.75 s
+        after = {"speed": speed, "lead": speed - 4.5}
+        assert demand(RSS(), gap=gap - 0.5 * 6.0 * 0.75**2 + 0.01, **after) == 0.0
+        assert demand(RSS(), gap=gap - 0.5 * 6.0 * 0.75**2 - 0.01, **after) > 0.0
+        gap = float(FSM().following_gap(np.array(speed)))
+        assert demand(FSM(), speed=speed, lead=speed, gap=gap + 0.01) == 0.0
+        assert demand(FSM(), speed=speed, lead=speed, gap=gap - 0.01) > 0.0
+
+
 def test_fsm_brakes_a_little_before_it_must() -> None:
     fsm = FSM()
     safe, unsafe = 20 * 0.75 + 400 / 8 - 100 / 14 + 2, 20 * 0.75 + 400 / 12 - 100 / 14

@@ -154,14 +154,14 @@ def test_with_snapshots_of_world_and_driver_it_goes_on_to_the_bit() -> None:
     loop.reset()
     for _ in range(13):
         loop.step()
-    kept = loop.simulator.snapshot(), driver.snapshot()  # type: ignore[attr-defined]
+    kept = loop.simulator.snapshot(), driver.snapshot_batch()  # type: ignore[attr-defined]
     ends = []
     for _ in range(2):
         for _ in range(13):
             loop.step()
         ends.append(loop.simulator.hashes())  # type: ignore[attr-defined]
         loop.simulator.restore(kept[0])  # type: ignore[attr-defined]
-        driver.restore(kept[1])
+        driver.restore_batch(kept[1])
     assert ends[0] == ends[1]
 
 

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import itertools
+import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.command import ssad
 from helpers.metric_traces import make_trace
+from rich.console import Console
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
@@ -18,10 +23,13 @@ from ssad.core.jsonl import read_lines
 from ssad.core.traces import load_trace
 from ssad.drivers import make_system
 from ssad.engine.kind import Job, Resources
+from ssad.engine.run import run
 from ssad.experiments.adversarial.kind import Adversarial
 from ssad.experiments.adversarial.search_scores import distinct_collisions, summary
+from ssad.experiments.runs import write_report
 from ssad.experiments.suites import load_suite
 from ssad.metrics.realism import FEATURES
+from ssad.report.compare import compare_runs
 from ssad.scenarios.dynamic import load_scenarios, read_scenarios
 from ssad.scenarios.dynamic.generate import Trials
 from ssad.world.roads import load_town
@@ -157,18 +165,43 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
     assert line["metrics"] == {"applies": True, "survived": False}
 
 
+def test_equal_runs_have_the_same_hash_and_are_equal_however_long_they_take(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = {name: np.zeros(20) for name in FEATURES}
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.reference", lambda folder, device: usual)
+    settings = ["generators=halton", "budget=8", "grade=false", "scenarios=UnprotectedLeftTurn/00", "systems=autopilot"]
+    plan = Adversarial().plan(load_suite("adversarial-quick", settings), check=False)
+    folders, hashes, tables = [tmp_path / "fast", tmp_path / "slow"], [], []
+    for folder, tick in zip(folders, (1.0, 7.0), strict=True):
+        ticks = itertools.count(0.0, tick)
+        clock = SimpleNamespace(process_time=lambda ticks=ticks: next(ticks))
+        monkeypatch.setattr("ssad.experiments.adversarial.kind.time", clock)
+        run(plan, folder, Resources(0, console=Console(file=io.StringIO())))
+        page = write_report(folder).read_text()
+        hashes += re.findall(r'equal hashes">([0-9a-f]{12})<', page)
+        tables.append((folder / "tables" / "adversarial.csv").read_text().splitlines())
+    assert len(hashes) == 2
+    assert hashes[0] == hashes[1]
+    different_lines = [line for line, other in zip(*tables, strict=True) if line != other]
+    assert different_lines
+    assert all("CPU time a scenario" in line for line in different_lines)
+    (comparison,) = compare_runs(folders)
+    assert (comparison.both, comparison.equal) == (1, 1)
+
+
 @pytest.mark.slow
 def test_what_a_run_finds_replays_as_a_plain_scenario(tmp_path: Path) -> None:
-    run = tmp_path / "run"
+    folder = tmp_path / "run"
     settings = ("--set", "generators=halton", "--set", "systems=autopilot", "--set", "budget=16", "--set", "keep=2")
     scenarios = ("--set", "scenarios=[UnprotectedLeftTurn/02,UnprotectedLeftTurn/00]")
-    done = ssad("run", "adversarial-quick", *settings, *scenarios, "--out", run, "--workers", "1")
+    done = ssad("run", "adversarial-quick", *settings, *scenarios, "--out", folder, "--workers", "1")
     assert done.returncode == 0, done.stderr
-    lines = [line for line in read_lines(run / "results.jsonl") if line["metrics"]["survived"]]
+    lines = [line for line in read_lines(folder / "results.jsonl") if line["metrics"]["survived"]]
     found = [line for line in lines if line["metrics"]["CR"]]
     assert found
     assert all(line["metrics"]["replayed"] == 1.0 for line in found)
-    file = run / found[0]["artefacts"]["scenarios"]
+    file = folder / found[0]["artefacts"]["scenarios"]
     saved = read_scenarios(file)
     assert 1 <= len(saved) <= 2
     assert saved[0].name.startswith(f"{found[0]['cluster']}/halton")
@@ -191,8 +224,8 @@ def test_what_a_run_finds_replays_as_a_plain_scenario(tmp_path: Path) -> None:
     replayed = list(read_lines(plain / "results.jsonl"))
     assert len(replayed) == len(saved)
     assert all(line["metrics"]["collision"] for line in replayed)
-    first = load_trace(run / found[0]["artefacts"]["trace"])
+    first = load_trace(folder / found[0]["artefacts"]["trace"])
     same = load_trace(plain / replayed[0]["artefacts"]["trace"])
     assert np.array_equal(first.x, same.x)
-    report = (run / "report.html").read_text()
+    report = (folder / "report.html").read_text()
     assert "halton" in report

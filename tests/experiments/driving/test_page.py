@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from helpers.browser import ask
 from helpers.metric_traces import make_trace
-from helpers.run_folder import driving_lines, write_run
+from helpers.run_folder import DRIVING_HEADER, driving_line, driving_lines, reseal, write_run
+from rich.console import Console
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
@@ -26,7 +27,7 @@ from ssad.core.lane_strips import simplify_polyline
 from ssad.core.safeio import to_plain_json
 from ssad.core.traces import load_trace, save_trace
 from ssad.drivers import make_system
-from ssad.experiments.driving.driving_tables import precrash_table
+from ssad.experiments.driving.driving_tables import average_note, full_table, precrash_table, summary_table
 from ssad.experiments.driving.embed import SCALE, encode_int16, episode_data, origin, town_data
 from ssad.experiments.driving.episodes import load_episodes
 from ssad.experiments.driving.page import _system_tile
@@ -36,6 +37,7 @@ from ssad.report import write_video
 from ssad.report.load import load_run
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS
 from ssad.report.tables import tex, to_csv, to_latex, to_markdown
+from ssad.report.terminal import terminal_table
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.roads import load_town, save_graph
 from ssad.world.rollout import rollout
@@ -82,6 +84,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "episodes.jsonl").write_text("".join(json.dumps(e) + "\n" for e in episodes))
     header = {"suite": {"name": "t", "title": "A <b>title</b>", "seed": 1}, "versions": {"ssad": "0"}, "cells": cells}
     (folder / "run.json").write_text(json.dumps(header))
+    reseal(folder)
     return folder
 
 
@@ -114,6 +117,30 @@ def test_latex_is_balanced_and_escaped(run_folder: Path) -> None:
     assert tex("50 % & a_b #1 {x} ~ ^ \\") == (
         r"50 \% \& a\_b \#1 \{x\} \textasciitilde{} \textasciicircum{} \textbackslash{}"
     )
+
+
+def test_tables_say_what_an_average_averages_and_what_is_in_none(tmp_path: Path) -> None:
+    """On the terminal, on the page, in Markdown and in LaTeX; a group without an average is named."""
+    groups = ("StraightObstacle", "RightTurn", "CutIn")
+    lines = [driving_line(group, group, f"{group}/00") for group in groups]
+    run = load_episodes(load_run(write_run(tmp_path / "one", DRIVING_HEADER, lines)))
+    note = "Avg. is the mean of Straight Obstacle and Right-turn, each weighed the same. CutIn is in no average."
+    tables = [summary_table(run), precrash_table(run), full_table(run)]
+    assert all(table is not None and note in table.note for table in tables)
+    assert note in to_latex(tables[2])
+    assert note in to_markdown(tables[2])
+    console = Console(file=io.StringIO(), width=200)
+    console.print(terminal_table(run.run, tables[0]))
+    assert note in " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
+    lines = driving_lines() + [driving_line(f"{name}{k}", name, name) for k, name in enumerate(("CutIn", "CutOut"))]
+    run = load_episodes(load_run(write_run(tmp_path / "all", DRIVING_HEADER, lines)))
+    assert average_note(run) == (
+        "Avg. is the mean of the eight pre-crash scenarios, each weighed the same. Avg. natural is the mean of "
+        "Natural: Town02 and Natural: Town05, each weighed the same. Avg. other is the mean of CutIn and CutOut, each "
+        "weighed the same."
+    )
+    alone = load_episodes(load_run(write_run(tmp_path / "custom", DRIVING_HEADER, lines[-1:])))
+    assert average_note(alone) == "", "there is no average to explain"
 
 
 class _Page(html.parser.HTMLParser):
@@ -231,7 +258,7 @@ def test_bad_folders_and_suffixes_end_in_one_line(run_folder: Path, tmp_path: Pa
 
 
 def test_a_lost_trace_costs_only_its_replay(run_folder: Path, tmp_path: Path) -> None:
-    for name in ("run.json", "results.jsonl", "episodes.jsonl"):
+    for name in ("run.json", "results.jsonl", "episodes.jsonl", "seal.json"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
     text = write_report(tmp_path).read_text()
     assert "8 episodes have no replay" in text

@@ -141,8 +141,7 @@ def test_copies_change_no_table(folder: Path, tmp_path: Path) -> None:
     copies = [line | {"key": f"{line['key']}{k}"} for k in range(2) for line in lines]
     written = {}
     for name, told in (("plain", lines), ("copied", [*lines, *copies])):
-        run = write_run(tmp_path / name, header, told)
-        (run / "episodes.jsonl").write_bytes((folder / "episodes.jsonl").read_bytes())
+        run = write_run(tmp_path / name, header, told, read_lines(folder / "episodes.jsonl"))
         write_report(run)
         written[name] = {path.name: path.read_bytes() for path in (run / "tables").iterdir()}
     assert written["plain"]

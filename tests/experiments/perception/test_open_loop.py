@@ -142,3 +142,30 @@ def test_the_floor_is_the_same_and_the_clean_target_is_seen_once(
             kind().result(cell, Job(tmp_path, "cpu", settings | {"floor": 0.9}))
         assert kind().result(cell, Job(tmp_path, "cpu", settings | {"floor": 0.0}))["clean_AP50"] == 0.0
     assert shown == ["clean", 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("floor", "rate"), [(0.4, 0.0), (0.9, None)])
+def test_a_rate_is_held_to_the_floor_of_the_suite_at_its_own_score(
+    floor: float, rate: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clean target is found in both images, so AP50 passes; above 0.25 it is found in one."""
+
+    class Shown(Perturbation):
+        name, family = "own", "own"
+
+        def on_target(self, images: Any) -> Iterator[Any]:
+            return iter([])
+
+    def sightings(detector: Any, given: Any) -> Iterator[TargetSighting]:
+        yield from (seen(0.9), seen(0.1))
+
+    monkeypatch.setattr(LightableClips, "clean", lambda self: iter([]))
+    monkeypatch.setattr(open_loop, "loaded_detector", lambda *given, **options: None)
+    monkeypatch.setattr(open_loop, "sightings", sightings)
+    images = LightableClips(tmp_path, 2)
+    monkeypatch.setattr(Perception, "scenes", lambda self, cell, job: ())
+    monkeypatch.setattr(Perception, "target", lambda *given: TargetCondition(images, Shown(), "sedan"))
+    settings = {"detectors": {}, "replicates": 0, "seed": 0, "floor": floor}
+    result = Perception().result(Cell("key", "cell", "one", 0, {"view": "drive"}, {}), Job(tmp_path, "cpu", settings))
+    assert result["clean_AP50"] == 1.0
+    assert (result["metrics"]["ASR_25"], result["metrics"]["n0_25"]) == (rate, 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,11 @@ def test_every_part_is_a_run_of_its_own_and_the_front_page_leads_there(tmp_path:
         assert all(sentence.replace("'", "&#39;") in page for sentence in verdict(load_run(out / name)))
     assert verdict(load_run(out / "first"))[0].startswith("autopilot collided in 0 of 1 drives")
     assert load_run(out / "second").suite["seed"] == 4
+    altered = tmp_path / "altered"
+    shutil.copytree(out, altered)
+    results = altered / "second" / "results.jsonl"
+    results.write_text(results.read_text().replace('"status":"ok"', '"status":"failed"'))
+    assert "second/results.jsonl:1: this line was changed" in write_report(altered).read_text()
 
 
 def test_a_part_that_fails_fails_alone_and_can_be_run_again_and_what_is_done_is_kept(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from ssad.core.driving import Observation
 from ssad.core.types import F32, F64, Bool, Controller, Episode, SignalState
 from ssad.drivers.careful.encounter import Encounter
-from ssad.drivers.careful.models import CarefulModel, Reaction, careful_model, react
+from ssad.drivers.careful.models import CarefulModel, Reaction, careful_model, initial_reaction, react
 from ssad.drivers.careful.sight import Path, encounters
 from ssad.drivers.careful.steering import pursue
 from ssad.world.models import model
@@ -23,14 +24,18 @@ PULL = 2.0  # m/s^2, acceleration to its target speed
 WAIT = 3.0  # m to a standing agent in its path at which it stays standing
 SOON = 3.0  # s to a conflict within which it does not accelerate
 CROSSING = 10.0  # m ahead within which a standing driver lets others cross
+RESPONSE = 0.5  # s, time constant with which its speed follows a change
+APPROACH = 1.0  # m/s^2, braking with which it comes to its following gap
+OPENING = 0.3  # 1/s, share of a missing gap by which it is slower than the vehicle in front
 
 
 class Careful:
     """A careful driver of the regulation literature, at the wheel.
 
     It keeps its route at its target speed, slower in bends, and stops at red lights. Of others it knows what is in line
-    of sight; it does nothing about them but what its model says, which is to brake, and waits behind who stands in its
-    way. It neither changes lane nor swerves, and knows no right of way and no stop signs.
+    of sight; it brakes for them as its model says, keeps the following gap of its model behind a vehicle in front, and
+    waits behind who stands in its way. It neither changes lane nor swerves, and knows no right of way and no stop
+    signs.
     """
 
     controller = Controller.EXTERNAL
@@ -42,7 +47,8 @@ class Careful:
         Args:
             name: Its short name, one of `ssad.drivers.careful.MODELS`.
             model: A custom model instead.
-            keep_speed: Keep the speed at the takeover instead of the target speed; at least 1 m/s.
+            keep_speed: Keep the speed at the takeover instead of the target speed, at least 1 m/s, and follow a vehicle
+                only once the model has braked for it.
 
         Raises:
             UnknownNameError: There is no such model.
@@ -52,8 +58,9 @@ class Careful:
         self.keep_speed = keep_speed
         self._half = self._power = self._wheel = np.zeros((0, 2))
         self._cruise = np.zeros(0)
-        self._memory: Reaction | None = None
+        self._memory = initial_reaction((0, 0))
         self._moved = np.zeros((0, 0))
+        self._follows = np.zeros((0, 0), bool)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Forget all agents and prepare for new episodes."""
@@ -62,14 +69,35 @@ class Careful:
         self._power = np.array([(body.max_accel, body.max_brake) for body in bodies]).reshape(-1, 2)
         self._wheel = np.array([(body.wheelbase, body.max_steer) for body in bodies]).reshape(-1, 2)
         self._cruise = np.full(len(bodies), np.nan)
-        self._memory = None
+        self._forget(max((len(episode.agents) for episode in episodes), default=0))
+
+    def _forget(self, agent_count: int) -> None:
+        """Make a new memory of this many agents in each episode."""
+        shape = (len(self._half), agent_count)
+        self._memory, self._moved = initial_reaction(shape), np.zeros(shape)
+        self._follows = np.full(shape, not self.keep_speed)
+
+    def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return its memory of the agents [B, A], whom it follows [B, A], and its speed at the takeover [B], m/s."""
+        return {
+            "since": self._memory.since,
+            "brake": self._memory.brake,
+            "lateral_travel": self._moved,
+            "follows": self._follows,
+            "cruise": self._cruise,
+        }
+
+    def restore(self, states: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Set the memory of each episode."""
+        self._memory = Reaction(states["since"], states["brake"])
+        self._moved, self._follows = states["lateral_travel"], states["follows"]
+        self._cruise = states["cruise"]
 
     def act(self, view: Observation) -> F32:
         """Return the controls: speed keeping limited by bends, other agents, red lights and the model."""
         scenes, agent_count = view.scene, view.readings["truth"].kind.shape[1]
-        if self._memory is None:
-            shape = (len(self._half), agent_count)
-            self._memory, self._moved = Reaction(np.full(shape, -1.0), np.zeros(shape)), np.zeros(shape)
+        if agent_count > self._moved.shape[1]:  # the world has room for more agents than these episodes have
+            self._forget(agent_count)
         path, half_size = Path(view.route), self._half[scenes]
         encounter, visible, lateral_travel = encounters(
             view, path, half=half_size, reach=REACH, moved=self._moved[scenes], dt=STEP
@@ -82,6 +110,7 @@ class Careful:
             updated_memory.brake,
             lateral_travel,
         )
+        self._follows[scenes] |= updated_memory.brake > 0.0
         speed = np.asarray(view.speed, np.float64)
         is_new = np.isnan(self._cruise[scenes])
         self._cruise[scenes] = np.where(is_new, speed, self._cruise[scenes])
@@ -89,7 +118,11 @@ class Careful:
         target = np.maximum(self._cruise[scenes], 1.0) if self.keep_speed else target_speed
         allowed = squared_bend_speeds(view.route)
         bend_limit = bend_speed(allowed, np.arange(allowed.shape[1], dtype=np.float64))
-        acceleration = np.clip(2.0 * (np.minimum(target, bend_limit) - speed), -2.0 * EASY, PULL)
+        acceleration = np.clip((np.minimum(target, bend_limit) - speed) / RESPONSE, -2.0 * EASY, PULL)
+        following = following_acceleration(self.model, encounter, self._follows[scenes] & visible)
+        hardest = -EASY if self.keep_speed else -2.0 * EASY
+        following_limit: F64 = np.maximum(following, hardest).min(1, initial=PULL)
+        acceleration = np.minimum(acceleration, following_limit)
         must_wait = (visible & is_in_the_way(encounter, half_size[:, :1])).any(1)
         acceleration = np.where((visible & is_coming(encounter)).any(1), np.minimum(acceleration, 0.0), acceleration)
         brake = np.maximum(demanded.max(1, initial=0.0), _red_light_braking(view, half_size[:, 0]))
@@ -114,6 +147,28 @@ def is_in_the_way(encounter: Encounter, half_length: F64) -> Bool:
     is_blocking = (encounter.lateral <= 0.0) & (encounter.gap < WAIT)
     is_crossing = (encounter.approach > 0.3) & (encounter.gap < CROSSING) & (encounter.time_to_enter() < 3.0)
     return np.asarray(is_near & (is_blocking | is_crossing))
+
+
+def following_acceleration(model: CarefulModel, encounter: Encounter, follows: Bool) -> F64:
+    """Return the acceleration, m/s^2, with which a driver comes to or keeps its gap to each vehicle in front.
+
+    Args:
+        model: The model with the following gap.
+        encounter: The others that the driver sees.
+        follows: Which of them it follows, if they are in its path and move along it or stand.
+
+    Returns:
+        The acceleration, of any size; infinite where there is no vehicle to follow.
+    """
+    is_in_front = (encounter.lateral <= 0.0) & np.isinf(encounter.through) & (encounter.gap > -0.5 * encounter.length)
+    lead = np.maximum(encounter.lead, 0.0)
+    # what the gap will be when the speed has followed
+    gap = encounter.gap - RESPONSE * np.maximum(encounter.speed - lead, 0.0)
+    room = gap - np.maximum(model.following_gap(lead), WAIT)
+    approach_speed = np.sqrt(lead * lead + 2.0 * APPROACH * np.maximum(room, 0.0))
+    allowed = np.where(room > 0.0, approach_speed, np.maximum(lead + OPENING * room, 0.0))
+    is_followed = follows & is_in_front & (encounter.lead > -0.5)
+    return np.where(is_followed, (allowed - encounter.speed) / RESPONSE, np.inf)
 
 
 def is_coming(encounter: Encounter) -> Bool:

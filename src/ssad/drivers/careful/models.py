@@ -19,6 +19,9 @@ from ssad.drivers.careful.encounter import Encounter
 
 HARD = 0.774 * 9.81  # m/s^2: emergency braking of a careful human (about 7.59)
 JERK = HARD / 0.6  # m/s^3: full braking is reached after 0.6 s (about 12.65)
+FOLLOWING_SPEEDS = np.array([7.2, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0]) / 3.6  # m/s, UN R157, paragraph 5.2.3.3
+FOLLOWING_TIMES = np.array([1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6])  # s, time gaps at these speeds
+FOLLOWING_DISTANCE = 2.0  # m, minimum at any speed
 SPARE = 0.1  # s between the departure of one agent from the conflict zone and the arrival of the other
 
 
@@ -45,6 +48,10 @@ class CarefulModel:
         """Return the braking that each other agent requires, m/s^2; 0: no danger, or not perceived yet."""
         raise NotImplementedError
 
+    def following_gap(self, speed: F64) -> F64:
+        """Return the gap, m, that the driver keeps behind a vehicle at its speed, m/s."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class CarefulHuman(CarefulModel):
@@ -55,6 +62,7 @@ class CarefulHuman(CarefulModel):
         evaluate: Lateral travel while the driver evaluates the risk, m (0.4 s at 1.8 m/s).
         critical: TTC below which the driver brakes, s.
         wait_for_overlap: Perceive a cut-in only once it is in the path, as in JRC's grids; else as in the regulation.
+        headway: Time gap behind a vehicle, s.
     """
 
     name: str = "cc"
@@ -66,6 +74,11 @@ class CarefulHuman(CarefulModel):
     evaluate: float = 0.72
     critical: float = 2.0
     wait_for_overlap: bool = False
+    headway: float = 2.0
+
+    def following_gap(self, speed: F64) -> F64:
+        """Return the way of the headway, m."""
+        return self.headway * speed
 
     def demand(self, encounter: Encounter) -> F64:
         """Brake hard below the critical TTC, once the other is perceived."""
@@ -101,6 +114,11 @@ class Reg157(CarefulModel):
     spare: float = 0.1
     reach: float = 46.0
 
+    def following_gap(self, speed: F64) -> F64:
+        """Return the minimum following distance of paragraph 5.2.3.3, m: a time gap by speed, but at least 2 m."""
+        time_gap = np.interp(speed, FOLLOWING_SPEEDS, FOLLOWING_TIMES)
+        return np.asarray(np.maximum(speed * time_gap, FOLLOWING_DISTANCE))
+
     def demand(self, encounter: Encounter) -> F64:
         """Brake once the TTC of a vehicle in the lane falls below the time that braking takes."""
         in_lane = (encounter.lateral <= 0.0) | ((encounter.lateral <= self.margin) & (encounter.approach > 0.0))
@@ -127,17 +145,26 @@ class RSS(CarefulModel):
         brake: m/s^2 that both sides are sure to reach.
         sideways: m/s^2, the same across the path, to add and to take away.
         wander: m across the path that bodies wander.
+        drifts: True if the driver itself may move towards the other during the delay, as in definition 6; False: it
+            keeps its path, as in JRC's grids.
     """
 
     name: str = "rss"
     delay: float = 0.75
-    jerk: float = np.inf
+    jerk: float = JERK
     coast: float = 0.0
     hold: float = HARD
     accelerate: float = 3.0
     brake: float = 6.0
     sideways: float = 1.0
     wander: float = 0.3
+    drifts: bool = True
+
+    def following_gap(self, speed: F64) -> F64:
+        """Return the gap, m, that is still safe after the leader has braked during the delay (JRC's `RSS_distance`)."""
+        leader_speed = np.maximum(speed - self.brake * self.delay, 0.0)
+        leader_distance = leader_speed * leader_speed / (2.0 * self.brake)
+        return self._runs(speed, self.accelerate, self.brake) - leader_distance + 0.5 * self.brake * self.delay**2
 
     def _runs(self, speed: F64, acceleration: float, brake: float) -> F64:
         """Return the stopping distance, m, of a body that speeds up during the delay and then brakes."""
@@ -150,10 +177,9 @@ class RSS(CarefulModel):
         leader_distance = -encounter.lead * np.abs(encounter.lead) / (2.0 * self.brake)
         oncoming_distance = self._runs(np.abs(encounter.lead), self.accelerate, self.brake)
         safe_gap = np.maximum(ego_distance + np.where(encounter.lead >= 0.0, leader_distance, oncoming_distance), 0.0)
-        lateral_stop = self._runs(np.zeros_like(encounter.speed), self.sideways, self.sideways)
-        safe_lateral = (
-            self.wander + lateral_stop + self._runs(np.maximum(encounter.approach, 0.0), self.sideways, self.sideways)
-        )
+        safe_lateral = self.wander + self._runs(np.maximum(encounter.approach, 0.0), self.sideways, self.sideways)
+        if self.drifts:
+            safe_lateral = safe_lateral + self._runs(np.zeros_like(encounter.speed), self.sideways, self.sideways)
         is_beside = (encounter.lateral <= 0.0) | ((encounter.lateral < safe_lateral) & (encounter.approach > 0.0))
         is_danger = (
             (encounter.gap < safe_gap)
@@ -185,6 +211,11 @@ class FSM(CarefulModel):
     hard_braking: float = 6.0
     leader: float = 7.0
     margin: float = 2.0
+
+    def following_gap(self, speed: F64) -> F64:
+        """Return the smallest gap, m, at which the proactive score is 0 behind a leader of the same speed."""
+        stop = speed * speed / (2.0 * self.gentle_braking) - speed * speed / (2.0 * self.leader)
+        return speed * self.delay + stop + 2.0 * self.margin
 
     def demand(self, encounter: Encounter) -> F64:
         """Brake according to the critical fuzzy score, else the proactive one."""
@@ -232,7 +263,9 @@ def _danger_level(gap: F64, safe: F64, unsafe: F64) -> F64:
 
 def stays_in_path(encounter: Encounter) -> Bool:
     """Return True where the other agent is still in the path when the driver reaches it."""
-    return np.asarray(encounter.time_to_leave() + SPARE > encounter.time_to_reach())
+    # an agent that never leaves stays, also before a driver that never reaches it
+    time_to_leave = encounter.time_to_leave()
+    return np.isinf(time_to_leave) | (time_to_leave + SPARE > encounter.time_to_reach())
 
 
 MODELS: dict[str, CarefulModel] = {m.name: m for m in (CarefulHuman(), Reg157(), RSS(), FSM())}

@@ -239,7 +239,7 @@ def _check_snapshot(perceiver: Perceiver, world: Simulator, steps: int, sensors:
     loop, driver, looks = _make_loop(perceiver, world, sensors)
     for _ in range(steps // 2):
         _run_guarded(loop.step)
-    saved = cast(Reproducible, world).snapshot(), driver.snapshot()
+    saved = cast(Reproducible, world).snapshot(), driver.snapshot_batch()
     runs = []
     for _ in range(2):
         for scene in looks:
@@ -248,7 +248,7 @@ def _check_snapshot(perceiver: Perceiver, world: Simulator, steps: int, sensors:
             _run_guarded(loop.step)
         runs.append([list(scene) for scene in looks])
         cast(Reproducible, world).restore(saved[0])
-        driver.restore(saved[1])
+        driver.restore_batch(saved[1])
     _require(runs[0] == runs[1], "a restored snapshot continues as before")
 
 

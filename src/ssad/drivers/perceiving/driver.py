@@ -180,13 +180,16 @@ class PerceivingDriver:
         self.perceiver.reset(episodes)
         self.planner.reset(episodes)
 
-    def snapshot(self) -> Any:
-        """Return the complete state; `restore` continues from it bit by bit, together with a simulator snapshot."""
+    def snapshot_batch(self) -> Any:
+        """Return the state of the whole batch; with a simulator's snapshot, `restore_batch` continues to the bit.
+
+        Single episodes cannot be told apart in it, so the driver is no `ssad.core.driving.Branching`.
+        """
         signs = None if self._signs is None else self._signs.snapshot()
         parts = [snapshot_part(part) for part in (self.perceiver, self.tracker, self.planner)]
         return parts, self._looks.copy(), list(self._waiting), signs
 
-    def restore(self, snapshot: Any) -> None:
+    def restore_batch(self, snapshot: Any) -> None:
         """Continue from an earlier snapshot of the same batch."""
         (perceiver, tracker, planner), look_counts, pending, sign_state = snapshot
         self.perceiver = restore_part(self.perceiver, perceiver)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
+from ssad.core.run_records import COUNT, NOT_NEGATIVE, SHARE
 from ssad.core.safeio import to_plain_json
 from ssad.core.source import source_version
 from ssad.core.traces import motion_hash, save_trace
@@ -69,32 +70,36 @@ class Adversarial(ScenarioKind):
     name = "adversarial"
     suite = AdversarialSuite
     factors = ("generator", "system", "group")
+    rates: ClassVar[Mapping[str, str]] = {"CR": "CR", "CR_any": "CR_any"}
     columns = (
-        Column("applies", "generator applies"),
-        Column("survived", "plain replay survived"),
-        Column("CR", "collision found, adversary on the road and hitting nobody else", "", "higher"),
-        Column("CR_any", "any collision with the adversary found", "", "higher"),
-        Column("rollouts", "rollouts to the first", "", "lower"),
-        Column("share", "share of rollouts that collide", "", "higher"),
-        Column("distinct", "distinct collisions", "", "higher"),
-        Column("off_road", "rollouts with the adversary off the road", "", "lower"),
-        Column("hit_others", "rollouts with the adversary in others", "", "lower"),
-        Column("moving", "collisions in which the ego moves", "", "higher"),
-        Column("impact_speed", "impact speed", "m/s"),
-        *(Column(f"avoided_by_{name}", f"saved collisions that {who} avoids") for name, who in AVOIDERS.items()),
-        Column("attributable", "saved collisions that a careful driver avoids", "", "higher"),
-        Column("attributable_moving", "the same, with the ego moving", "", "higher"),
-        Column("acceleration", "largest acceleration of the adversary", "m/s^2"),
-        Column("jerk", "largest jerk of the adversary", "m/s^3"),
-        Column("within_limits", "collisions within the adversary's limits", "", "higher"),
-        Column("replayed", "saved scenarios that collide again", "", "higher"),
-        Column("realism", "realism score of the adversaries", "", "higher"),
-        Column("w_speed", "Wasserstein distance of speed", "m/s", "lower"),
-        Column("w_acceleration", "Wasserstein distance of acceleration", "m/s^2", "lower"),
-        Column("w_yaw_rate", "Wasserstein distance of yaw rate", "rad/s", "lower"),
-        Column("w_nearest", "Wasserstein distance of the nearest object", "m", "lower"),
-        Column("seconds_first", "CPU time a scenario to the first", "s", "lower"),
-        Column("seconds", "CPU time a scenario", "s", "lower"),
+        Column("applies", "generator applies", limits=SHARE),
+        Column("survived", "plain replay survived", limits=SHARE),
+        Column("CR", "collision found, adversary on the road and hitting nobody else", "", "higher", limits=SHARE),
+        Column("CR_any", "any collision with the adversary found", "", "higher", limits=SHARE),
+        Column("rollouts", "rollouts to the first", "", "lower", limits=COUNT),
+        Column("share", "share of rollouts that collide", "", "higher", limits=SHARE),
+        Column("distinct", "distinct collisions", "", "higher", limits=COUNT),
+        Column("off_road", "rollouts with the adversary off the road", "", "lower", limits=SHARE),
+        Column("hit_others", "rollouts with the adversary in others", "", "lower", limits=SHARE),
+        Column("moving", "collisions in which the ego moves", "", "higher", limits=SHARE),
+        Column("impact_speed", "impact speed", "m/s", limits=NOT_NEGATIVE),
+        *(
+            Column(f"avoided_by_{name}", f"saved collisions that {who} avoids", limits=SHARE)
+            for name, who in AVOIDERS.items()
+        ),
+        Column("attributable", "saved collisions that a careful driver avoids", "", "higher", limits=SHARE),
+        Column("attributable_moving", "the same, with the ego moving", "", "higher", limits=SHARE),
+        Column("acceleration", "largest acceleration of the adversary", "m/s^2", limits=NOT_NEGATIVE),
+        Column("jerk", "largest jerk of the adversary", "m/s^3", limits=NOT_NEGATIVE),
+        Column("within_limits", "collisions within the adversary's limits", "", "higher", limits=SHARE),
+        Column("replayed", "saved scenarios that collide again", "", "higher", limits=SHARE),
+        Column("realism", "realism score of the adversaries", "", "higher", limits=SHARE),
+        Column("w_speed", "Wasserstein distance of speed", "m/s", "lower", limits=NOT_NEGATIVE),
+        Column("w_acceleration", "Wasserstein distance of acceleration", "m/s^2", "lower", limits=NOT_NEGATIVE),
+        Column("w_yaw_rate", "Wasserstein distance of yaw rate", "rad/s", "lower", limits=NOT_NEGATIVE),
+        Column("w_nearest", "Wasserstein distance of the nearest object", "m", "lower", limits=NOT_NEGATIVE),
+        Column("seconds_first", "CPU time a scenario to the first", "s", "lower", limits=NOT_NEGATIVE, clock=True),
+        Column("seconds", "CPU time a scenario", "s", "lower", limits=NOT_NEGATIVE, clock=True),
     )
 
     def plan(self, suite: AdversarialSuite, *, device: str = "cpu", check: bool = True) -> Plan:

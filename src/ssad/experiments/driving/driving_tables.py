@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -37,9 +37,37 @@ def precrash_table(run: DrivingRun) -> Table | None:
         columns={**SCENARIOS, AVERAGE: "Avg."},
         metric=lambda row, group: _cell(run, (row[1], group), row[0]),
         published=published,
-        note=f"Shaded rows: {SOURCE}. Avg. is the mean of the scenarios' values. {METHODS} {_counts(run, systems)}",
+        note=f"Shaded rows: {SOURCE}. {average_note(run)} {METHODS} {_counts(run, systems)}",
         source=SOURCE,
     )
+
+
+def average_note(run: DrivingRun) -> str:
+    """Return in sentences which groups each average is the mean of, and which are in none; empty: no averages."""
+    groups = {group for _, group in run.numbers}
+    families = {record.group: record.outcome.family for record in run.records}
+    sentences = []
+    for family, average in FAMILIES.items():
+        members = [run.headings[group] for group in run.headings if group in groups and families.get(group) == family]
+        if average in groups and members:
+            is_complete = family == "pre-crash" and len(members) == len(SCENARIOS)
+            text = "the eight pre-crash scenarios" if is_complete else _listing(members)
+            sentences.append(f"{average} is the mean of {text}, each weighed the same.")
+    left_out = [
+        run.headings[group]
+        for group in run.headings
+        if group in groups and group in families and FAMILIES[families[group]] not in groups
+    ]
+    if sentences and left_out:
+        sentences.append(f"{_listing(left_out)} {'is' if len(left_out) == 1 else 'are'} in no average.")
+    return " ".join(sentences)
+
+
+def _listing(names: Sequence[str]) -> str:
+    """Return names as text: "A, B and C"; of more than five the first four and the number of the others."""
+    if len(names) > 5:
+        names = [*names[:4], f"{len(names) - 4} more"]
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
 
 
 def _cell(run: DrivingRun, key: tuple[str, str], symbol: str) -> TableCell:
@@ -105,7 +133,7 @@ def _town_weights(run: DrivingRun, towns: Mapping[str, str]) -> str:
 
 def full_table(run: DrivingRun) -> Table:
     """Return every metric for every system and group."""
-    note = f"Avg. is the mean of the eight pre-crash scenarios' values. {METHODS}"
+    note = f"{average_note(run)} {METHODS}"
     if not run.is_measured("SS"):
         note += " SS is not measured, since no town of this run has stop signs; the driving score is without them."
     return Table.listing(
@@ -167,7 +195,8 @@ def summary_table(run: DrivingRun) -> Table:
         columns={symbol: symbol for symbol in SHOWN},
         metric=partial(_cell, run),
         note="CR: collisions per episode; [a, b]: its 95 % interval, a–b: range\n"
-        "OR: m driven off the road, DR: m from the route, RC: share of the route",
+        "OR: m driven off the road, DR: m from the route, RC: share of the route\n"
+        f"{average_note(run)}".rstrip(),
     )
 
 

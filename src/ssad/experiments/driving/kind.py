@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -22,6 +22,7 @@ from ssad.experiments.scenario_kind import (
     drive_record,
 )
 from ssad.metrics import METRICS
+from ssad.metrics.driving import LIMITS
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.simulators.closed_loop import (
@@ -71,6 +72,8 @@ class Driving(ScenarioKind):
     suite = DrivingSuite
     columns = tuple(Column(m.symbol, m.title, m.unit, m.better) for m in METRICS.values() if m.field)
     factors = ("system", "group")
+    metric_limits = LIMITS
+    rates: ClassVar[Mapping[str, str]] = {m.symbol: m.field for m in METRICS.values() if m.kind == "share"}
 
     def plan(self, suite: DrivingSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Look up systems, scenarios and towns; with `check`, build each scenario once."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -16,6 +16,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.core.machine import start_warp_quietly
+from ssad.core.run_records import NOT_NEGATIVE, SHARE
 from ssad.core.traces import first_difference, load_trace
 from ssad.drivers.perceiving.system import PerceivingSystem
 from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
@@ -30,6 +31,7 @@ from ssad.experiments.scenario_kind import (
     describe_scenarios,
     drive_record,
 )
+from ssad.metrics.driving import LIMITS
 from ssad.metrics.perception_in_drive import (
     BANDS,
     SIGN_BANDS,
@@ -86,37 +88,39 @@ class Gap(ScenarioKind):
     name = "gap"
     suite = GapSuite
     columns = (
-        Column("AP", "AP of all objects, on the drive's pictures", "", "higher"),
-        Column("recall", "recall of the objects in view, within 2 m", "", "higher"),
-        Column("missed_burst", "looks in a row that an object in view is missed", "", "lower"),
-        Column("distance_share", "RMS error of the distances, as a share of them", "", "lower"),
-        Column("target_recall", "recall of the object that matters", "", "higher"),
+        Column("AP", "AP of all objects, on the drive's pictures", "", "higher", limits=SHARE),
+        Column("recall", "recall of the objects in view, within 2 m", "", "higher", limits=SHARE),
+        Column("missed_burst", "looks in a row that an object in view is missed", "", "lower", limits=NOT_NEGATIVE),
+        Column("distance_share", "RMS error of the distances, as a share of them", "", "lower", limits=NOT_NEGATIVE),
+        Column("target_recall", "recall of the object that matters", "", "higher", limits=SHARE),
         *(
-            Column(f"target_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher")
+            Column(f"target_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher", limits=SHARE)
             for a, b in BANDS
         ),
-        Column("distance_error", "error of its distance", "m", "lower"),
-        Column("phantoms", "phantoms a look", "", "lower"),
-        Column("believed", "share of the steps in which it is believed where it is", "", "higher"),
-        Column("switches", "changes of its track", "", "lower"),
-        Column("HOTA", "HOTA of what is believed", "", "higher"),
-        Column("MOTA", "MOTA of the same", "", "higher"),
-        Column("IDF1", "IDF1 of the same", "", "higher"),
+        Column("distance_error", "error of its distance", "m", "lower", limits=NOT_NEGATIVE),
+        Column("phantoms", "phantoms a look", "", "lower", limits=NOT_NEGATIVE),
+        Column("believed", "share of the steps in which it is believed where it is", "", "higher", limits=SHARE),
+        Column("switches", "changes of its track", "", "lower", limits=NOT_NEGATIVE),
+        Column("HOTA", "HOTA of what is believed", "", "higher", limits=SHARE),
+        Column("MOTA", "MOTA of the same", "", "higher", limits=(None, 1.0)),
+        Column("IDF1", "IDF1 of the same", "", "higher", limits=SHARE),
         Column("collision", "CR", "", "lower"),
         Column("impact_speed", "impact speed", "m/s", "lower"),
         Column("route_completion", "RC", "", "higher"),
         Column("min_ttc", "least time to collision", "s", "higher"),
         Column("stop_signs", "stop signs run", "", "lower"),
-        Column("sign_recall", "share of the looks in which the stop sign ahead was read", "", "higher"),
+        Column("sign_recall", "share of the looks in which the stop sign ahead was read", "", "higher", limits=SHARE),
         *(
-            Column(f"sign_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher")
+            Column(f"sign_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher", limits=SHARE)
             for a, b in SIGN_BANDS
         ),
-        Column("sign_read_at", "m from a stop sign at which one was first read", "m", "higher"),
-        Column("hard_braking", "times of braking above 4 m/s^2", "", "lower"),
-        Column("phantom_stop_s", "time stood before a phantom", "s", "lower"),
+        Column("sign_read_at", "m from a stop sign at which one was first read", "m", "higher", limits=NOT_NEGATIVE),
+        Column("hard_braking", "times of braking above 4 m/s^2", "", "lower", limits=NOT_NEGATIVE),
+        Column("phantom_stop_s", "time stood before a phantom", "s", "lower", limits=NOT_NEGATIVE),
     )
     factors = ("system", "perturbation", "severity")
+    metric_limits = LIMITS
+    rates: ClassVar[Mapping[str, str]] = {"CR": "collision"}
 
     def plan(self, suite: GapSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Look up names and build detectors once; with `check`, build each scenario once."""

@@ -4,18 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ssad.core.driving import Driver
+from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import Episode, EpisodeTrace
+from ssad.simulators.closed_loop import onboard_sensors, policies_of, requested_sensors
+from ssad.world.rare.branching import branch_obstacle, refusal
 
 Method = Literal["monte-carlo", "splitting", "importance"]
+METHODS: tuple[Method, ...] = get_args(Method)
 Crash = Mapping[str, Any]
 """A collision that was found: `keys`, the step from which each of its random keys holds; `means` that were moved."""
+
+
+def first_obstacle(drivers: Sequence[Driver]) -> str:
+    """Return why episodes of these drivers cannot branch, in a clause; "" where they can."""
+    # All sensors that the engine renders keep a history of each episode.
+    return next(filter(None, (branch_obstacle(driver, requested_sensors([driver])) for driver in drivers)), "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +35,7 @@ class ChanceEpisode:
     Attributes:
         episode: The episode.
         graph: Lane graph of its town.
-        driver: The system under test, which must be memoryless.
+        driver: The system under test.
         noise: Fields of `ssad.world.noise.Noise`.
         device: Device of the world.
         seed: Seed of the random numbers.
@@ -51,27 +61,46 @@ class ChanceEpisode:
         assignment = np.zeros(rows, np.int64)
         return World([self.episode], graphs, assign=assignment, device=self.device, noise=noise)
 
+    def drivers(self) -> list[Driver]:
+        """Return the system under test and the drivers that actors of the scenario follow."""
+        from ssad.drivers import make_system
+
+        return [self.driver, *(make_system(name) for name in policies_of(self.episode.scenario))]
+
+    def obstacle(self) -> str:
+        """Return why the episode cannot branch, in a clause; "" where it can."""
+        return first_obstacle(self.drivers())
+
+    def _equipment(self) -> dict[str, Any]:
+        """Return the sensors and the actors' drivers, as `Loop` and `rollout` take them."""
+        drivers = self.drivers()
+        for driver in drivers:
+            if callable(getattr(driver, "to", None)):
+                driver.to(self.device)  # type: ignore[attr-defined]
+        policies = dict(zip(policies_of(self.episode.scenario), drivers[1:], strict=True))
+        return {"sensors": onboard_sensors(drivers, self.device), "policies": policies.__getitem__}
+
     def process(self, rows: int) -> Any:
-        """So many copies with their driver, as the estimators take them.
+        """So many copies with their drivers, as the estimators take them.
 
         Raises:
-            ConfigError: The driver remembers something, or the scenario is not one of the embedded world.
+            ConfigError: The scenario is not one of the embedded world.
         """
         from ssad.world.rare.process import WorldProcess
         from ssad.world.rollout import Loop
 
-        return WorldProcess(Loop(self.world(rows), {0: self.driver}))
+        return WorldProcess(Loop(self.world(rows), {0: self.driver}, **self._equipment()))
 
     def run_again(self, crash: Crash) -> EpisodeTrace:
         """The trace of a collision that was found."""
         from ssad.world.rollout import rollout
 
         keys = {int(step): int(key) for step, key in crash["keys"].items()}
-        (trace,) = rollout(self.world(1, keys, crash["means"]), self.driver)
+        (trace,) = rollout(self.world(1, keys, crash["means"]), self.driver, **self._equipment())
         return trace
 
-    def usual(self, rows: int = 200) -> tuple[float, float]:
-        """Return the mean duration of an episode, h, and the mean distance of the ego, km."""
+    def usual(self, rows: int) -> tuple[float, float]:
+        """Return the mean duration of so many episodes, h, and the mean distance of the ego, km."""
         from ssad.world.rare.brute import draw_keys, run
 
         process = self.process(rows)
@@ -97,11 +126,16 @@ class ChanceEpisode:
 
         Returns:
             Metrics, and the likeliest sampled collision.
+
+        Raises:
+            ConfigError: The method needs branches, and episodes of a driver cannot branch.
         """
         from ssad.world.rare.brute import monte_carlo
         from ssad.world.rare.importance import importance, learn
         from ssad.world.rare.splitting import keys_of, splitting
 
+        if method != "monte-carlo" and (obstacle := self.obstacle()):
+            raise ConfigError(refusal(obstacle))
         rng = generator("how often", self.seed)
         collision: dict[str, Any] | None = None
         if method == "splitting":
@@ -133,7 +167,7 @@ class ChanceEpisode:
             *_, (failure_estimate, keys) = monte_carlo(process, rng, episodes=episodes)
             if len(keys):
                 collision = {"keys": {"0": str(int(keys[0]))}, "means": []}
-        duration_hours, distance_km = self.usual()
+        duration_hours, distance_km = self.usual(min(200, batch, episodes))
         driven_hours = failure_estimate.work * process.world.dt / 3600.0 / process.world.agents
         metrics = {
             "per_million": 1e6 * failure_estimate.probability,

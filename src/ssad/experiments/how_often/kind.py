@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from ssad.core.errors import ConfigError
 from ssad.core.machine import start_warp_quietly
+from ssad.core.run_records import NOT_NEGATIVE
 from ssad.core.safeio import to_plain_json
 from ssad.core.schema import Schema
 from ssad.core.traces import save_trace
-from ssad.core.types import EpisodeTrace
+from ssad.core.types import EpisodeTrace, Scenario
 from ssad.engine.kind import Cell, Column, Job, Names, Plan
-from ssad.experiments.how_often.failure_rate import ChanceEpisode, Method
-from ssad.experiments.how_often.verdict import verdict
+from ssad.experiments.how_often.failure_rate import METHODS, ChanceEpisode, Method, first_obstacle
+from ssad.experiments.how_often.verdict import contradictions, unbranched, verdict
 from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, describe_scenarios
+from ssad.report import default
 from ssad.report.load import Run
-from ssad.simulators.closed_loop import cached_town, system_of, system_version
+from ssad.report.tables import Table
+from ssad.simulators.closed_loop import cached_town, policies_of, system_of, system_version
+from ssad.world.rare.branching import refusal
 
 SETTINGS = ("episodes", "particles", "repeats", "components", "batch")  # of the estimators, as suites name them
 
@@ -46,9 +52,10 @@ class HowOftenSuite(ScenarioSuite):
     """Failure probabilities: scenarios x systems x methods.
 
     Attributes:
-        systems: Driving systems under test, without memory: the Autopilot, the blind one, learned policies.
+        systems: Driving systems under test.
         noise: Random behaviour of traffic.
-        methods: Estimators; each gets cells of its own.
+        methods: Estimators; each gets cells of its own. auto: all for systems whose episodes can branch
+            (`ssad.core.driving.Branching`), monte-carlo alone for others.
         episodes: Episodes of Monte Carlo, and of importance sampling after it has learned.
         particles: Particles of each repeat of splitting, and of the splitting that a proposal is first learned from.
         repeats: Independent repeats of splitting; at least 8 for an interval.
@@ -59,7 +66,7 @@ class HowOftenSuite(ScenarioSuite):
     kind: Literal["how-often"] = "how-often"
     systems: Names
     noise: NoiseSuite = NoiseSuite()
-    methods: list[Method] = Field(default=["monte-carlo", "splitting", "importance"], min_length=1)
+    methods: Literal["auto"] | Annotated[list[Method], Field(min_length=1)] = "auto"
     episodes: int = Field(default=4000, ge=10)
     particles: int = Field(default=200, ge=10, le=100_000)
     repeats: int = Field(default=10, ge=1, le=1000)
@@ -74,22 +81,26 @@ class HowOften(ScenarioKind):
     suite = HowOftenSuite
     factors = ("system", "group", "method")
     columns = (
-        Column("per_million", "collisions in a million episodes", "", "lower"),
+        Column("per_million", "collisions in a million episodes", "", "lower", limits=NOT_NEGATIVE),
         Column("low", "lower 95 % limit"),
         Column("high", "upper 95 % limit"),
-        Column("effective", "effective number of collisions", "", "higher"),
-        Column("events", "collisions simulated"),
-        Column("episodes", "episodes"),
-        Column("work", "million agent-steps"),
-        Column("training", "of these for learning"),
-        Column("hours", "simulated", "h"),
-        Column("km", "simulated", "km"),
-        Column("per_hour", "collisions in 1,000 h", "", "lower"),
-        Column("per_km", "collisions in 1,000 km", "", "lower"),
+        Column("effective", "effective number of collisions", "", "higher", limits=NOT_NEGATIVE),
+        Column("events", "collisions simulated", limits=NOT_NEGATIVE),
+        Column("episodes", "episodes", limits=NOT_NEGATIVE),
+        Column("work", "million agent-steps", limits=NOT_NEGATIVE),
+        Column("training", "of these for learning", limits=NOT_NEGATIVE),
+        Column("hours", "simulated", "h", limits=NOT_NEGATIVE),
+        Column("km", "simulated", "km", limits=NOT_NEGATIVE),
+        Column("per_hour", "collisions in 1,000 h", "", "lower", limits=NOT_NEGATIVE),
+        Column("per_km", "collisions in 1,000 km", "", "lower", limits=NOT_NEGATIVE),
     )
 
     def plan(self, suite: HowOftenSuite, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Look up systems, scenarios and towns; with `check`, try each once."""
+        """Look up systems, scenarios and towns, and choose methods; with `check`, try each once.
+
+        Raises:
+            ConfigError: The input is wrong, or every cell has a method that needs branches and a system without.
+        """
         systems = {name: system_version(name) for name in suite.systems}
         scenarios, towns = describe_scenarios(suite)
         settings = {"noise": suite.noise.model_dump()} | {name: getattr(suite, name) for name in SETTINGS}
@@ -105,11 +116,15 @@ class HowOften(ScenarioKind):
                 method=method,
                 **settings,
             )
-            for system, entry, method in product(suite.systems, scenarios, suite.methods)
+            for system, entry in product(suite.systems, scenarios)
+            for method in methods_of(suite, system, entry.scenario)
         )
         if check:
             for cell in cells:
                 chance_of(cell, device).process(1)
+            refused = [cell.spec["method"] != "monte-carlo" and chance_of(cell, device).obstacle() for cell in cells]
+            if all(refused):
+                raise ConfigError(refusal(str(refused[0])))
         return Plan(self, suite, device, cells, {"towns": towns, "systems": systems})
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
@@ -118,6 +133,8 @@ class HowOften(ScenarioKind):
         episode = chance_of(cell, job.device)
         metrics, crash = episode.estimate(cell.spec["method"], **{name: cell.spec[name] for name in SETTINGS})
         result: dict[str, Any] = {"metrics": to_plain_json(metrics), "case": cell.key, "n": metrics["episodes"]}
+        if obstacle := episode.obstacle():
+            result["obstacle"] = obstacle
         if crash is None:
             return result
         artefact = f"traces/{cell.key}.npz"
@@ -137,6 +154,20 @@ class HowOften(ScenarioKind):
     def verdict(self, run: Run) -> list[str]:
         """Return the findings of a run in sentences."""
         return verdict(run)
+
+    def summary(self, run: Run) -> Table:
+        """Return the main table; its note says which methods contradict each other, and which systems lack some."""
+        # A terminal cuts what is wider than itself, and the table may be.
+        notes = [textwrap.fill(sentence, 78) for sentence in (*contradictions(run), *unbranched(run))]
+        return replace(default.summary(run), note="\n".join(notes))
+
+
+def methods_of(suite: HowOftenSuite, system: str, scenario: Scenario) -> Sequence[Method]:
+    """Return the methods of a suite for a system in a scenario."""
+    if suite.methods != "auto":
+        return suite.methods
+    drivers = [system_of(name) for name in (system, *policies_of(scenario))]
+    return ("monte-carlo",) if first_obstacle(drivers) else METHODS
 
 
 def chance_of(cell: Cell, device: str) -> ChanceEpisode:

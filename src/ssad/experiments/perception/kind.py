@@ -16,6 +16,7 @@ from pydantic import Field
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
+from ssad.core.run_records import COUNT, SHARE
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan
@@ -24,8 +25,10 @@ from ssad.experiments.perception.physical.lit_images import RelightableTargetIma
 from ssad.experiments.perception.scene_boxes import Examination, SceneCondition, score_scenes, sum_applied
 from ssad.experiments.perception.scored_data import Victims, data_of, detectors_of
 from ssad.experiments.perception.sheets import detection_sheet
+from ssad.metrics.attack_success import rate_note
 from ssad.recorders.target_recording import TargetRecording
 from ssad.rendering.target import Target, TargetCar, parse_target
+from ssad.report.load import Run
 from ssad.scenarios.static.catalogue import NONE, PerturbationTable, parse_perturbation
 from ssad.scenarios.static.digital.perturbation import DigitalAttack
 from ssad.scenarios.static.digital.tally import sum_notes
@@ -46,7 +49,8 @@ class PerceptionSuite(DetectorSuite, PerturbationTable):
         target_town: Town in which targets are recorded.
         target_images: Number of images of each target.
         target_size: Side of the square images of targets, pixels.
-        floor: AP50 of the clean target below which no texture or light is reported.
+        floor: AP50 of the clean target below which no texture or light is reported; share of the images in which the
+            clean target is found, below which no attack success rate at that score is.
     """
 
     kind: Literal["perception"] = "perception"
@@ -67,9 +71,11 @@ class Perception(OpenLoopKind):
     suite = PerceptionSuite
     columns = (
         *OpenLoopKind.columns,
-        Column("AP50", "AP50 of the target", "", "lower"),
-        Column("ASR_25", "attack success rate at 0.25", "", "higher"),
-        Column("ASR_50", "attack success rate at 0.5", "", "higher"),
+        Column("AP50", "AP50 of the target", "", "lower", limits=SHARE),
+        Column("ASR_25", "attack success rate at 0.25", "", "higher", limits=SHARE),
+        Column("n0_25", "n0 at 0.25", limits=COUNT),
+        Column("ASR_50", "attack success rate at 0.5", "", "higher", limits=SHARE),
+        Column("n0_50", "n0 at 0.5", limits=COUNT),
     )
     factors = ("data", "detector", "perturbation", "severity")
 
@@ -142,6 +148,10 @@ class Perception(OpenLoopKind):
         folder = job.folder / "data" / target_folder(target)
         images = RelightableTargetImages.of(folder, job.settings["target_images"], detector, job.device)
         return TargetCondition(images, perturbation_of(cell), target)
+
+    def note(self, run: Run) -> str:
+        """Return the meaning of n0, and the floor of attack success rates."""
+        return rate_note(run.suite["floor"]) if "floor" in run.suite else ""
 
     def sheet(
         self, examination: Examination, suite: PerceptionSuite, cell: Cell | None = None

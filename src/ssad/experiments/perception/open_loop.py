@@ -21,6 +21,7 @@ from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.images import save_picture
 from ssad.core.machine import default_workers, retain_freed_memory, start_warp_quietly
 from ssad.core.protocols import Detector
+from ssad.core.run_records import SHARE
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -116,9 +117,9 @@ class OpenLoopKind(Kind):
     families: ClassVar[Mapping[str, str]] = {}
 
     columns: ClassVar[tuple[Column, ...]] = (
-        Column("mAP", "mean average precision", "", "higher"),
-        Column("NDS", "nuScenes detection score", "", "higher"),
-        Column("AP_car", "average precision of cars", "", "higher"),
+        Column("mAP", "mean average precision", "", "higher", limits=SHARE),
+        Column("NDS", "nuScenes detection score", "", "higher", limits=SHARE),
+        Column("AP_car", "average precision of cars", "", "higher", limits=SHARE),
     )
     patience: ClassVar[int | None] = 2
 
@@ -297,7 +298,7 @@ class OpenLoopKind(Kind):
                 f"the floor of {floor:g}"
             )
         attacked = tuple(sightings(detector, perturbation.on_target(images)))
-        scores = target_scores(attacked, clean, **bootstrap) | {"clean_AP50": clean_precision}
+        scores = target_scores(attacked, clean, floor=floor, **bootstrap) | {"clean_AP50": clean_precision}
         return scores | self.target_columns(cell, job, condition, clean, attacked)
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[SceneCondition], job: Job) -> dict[str, Any]:

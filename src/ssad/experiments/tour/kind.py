@@ -16,6 +16,7 @@ from pydantic import Field
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.jsonl import read_lines
+from ssad.core.run_records import COUNT, NOT_NEGATIVE
 from ssad.core.schema import Schema
 from ssad.engine.kind import Cell, CellError, Column, Job, Kind, Plan, Resources, SuiteBase
 from ssad.experiments.suites import kind_of, load_suite
@@ -63,8 +64,8 @@ class Tour(Kind):
     name = "tour"
     suite = TourSuite
     columns = (
-        Column("cells", "cells"),
-        Column("seconds", "seconds of work", "s", "lower"),
+        Column("cells", "cells", limits=COUNT),
+        Column("seconds", "seconds of work", "s", "lower", limits=NOT_NEGATIVE, clock=True),
     )
     factors = ("part",)
 

@@ -30,7 +30,8 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     for part_settings in run.suite["parts"]:
         name = str(part_settings["name"])
         part: dict[str, Any] = {"name": name, "trouble": reasons.get(name, ""), **_describe_part(part_settings)}
-        part_run = _read_run(run.folder / name)
+        part_run, problem = _read_run(run.folder / name)
+        part["trouble"] = part["trouble"] or problem
         if part_run is not None:
             write_report(part_run.folder)
             kind = kind_of_run(part_run)
@@ -52,9 +53,9 @@ def _describe_part(part: Mapping[str, Any]) -> dict[str, Any]:
     return {"question": part.get("question", ""), "limits": part.get("limits", "")}
 
 
-def _read_run(folder: Path) -> Run | None:
-    """Return the run of a part; None: it has no results."""
+def _read_run(folder: Path) -> tuple[Run | None, str]:
+    """Return the run of a part, or None and why it cannot be read."""
     try:
-        return load_run(folder)
-    except SSADError:
-        return None
+        return load_run(folder), ""
+    except SSADError as error:
+        return None, str(error)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from ssad.core.errors import ConfigError
 from ssad.core.version import __version__
 from ssad.scenarios.static.shifts import KNOWN, VERSIONS, Calibration, ShiftSpec
+from ssad.scenarios.static.shifts.spec import LIDAR_VERSIONS
 
 Labels = Literal["original", "transformed"]
 Strength = int | Literal["random"]
@@ -140,5 +141,6 @@ class Shard:
             "quality": options.quality,
             "subsampling": self.subsampling,
             "shift_version": VERSIONS[options.calibration],
+            "lidar_version": LIDAR_VERSIONS[options.calibration],
             "ssad": __version__,
         }

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Believer, WorldState
+from ssad.core.driving import Believer, Branching, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, Bool, Controller, End, Episode
 from ssad.world.noise import Keys, Noise
+from ssad.world.rare.branching import branch_obstacle, refusal
 from ssad.world.rollout import Loop
 from ssad.world.world import World
 
@@ -25,14 +27,19 @@ class Process(Protocol):
     """B episodes side by side (rows). Their chance comes from a key each, by standard normal numbers at every step.
 
     Attributes:
+        name: Name in errors.
         batch: B.
         steps: Steps after which every episode has ended.
         width: D, how many sums of normal numbers a row has; see `push`.
+        external: Whether code that may have a memory of its own takes part, such as a driver's: then splitting tests
+            that rows branch.
     """
 
+    name: str
     batch: int
     steps: int
     width: int
+    external: bool
 
     def reset(self, keys: Keys) -> None:
         """Restart all rows with these keys [B], without shifted means."""
@@ -47,7 +54,10 @@ class Process(Protocol):
         """Return the closeness of each row to failure, [B], in [0, 1]; 1 where it has failed, and only there."""
 
     def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Return everything that changes, [B, ...]; copy the arrays to keep them."""
+        """Return everything that changes, [B, ...]; copy the arrays to keep them.
+
+        ConfigError: Rows cannot branch.
+        """
 
     def put(self, rows: Rows, states: Mapping[str, npt.NDArray[Any]]) -> None:
         """Set rows to states of `snapshot`, [n, ...]."""
@@ -77,17 +87,15 @@ class Process(Protocol):
 class WorldProcess:
     """A world with noise and its drivers as a `Process`; failure is a collision of the ego.
 
-    Drivers must be stateless: drivers that run inside the world and learned policies are.
+    Any driver can be run from start to end. Rows of drivers with a memory of their own branch if the driver is a
+    `Branching`.
     """
 
     def __init__(self, loop: Loop) -> None:
-        """Wrap a loop over a world. ConfigError: the world has no noise, or a driver is not supported."""
+        """Wrap a loop over a world. ConfigError: the world has no noise."""
         world = loop.simulator
         if not isinstance(world, World) or world.chance is None:
             raise ConfigError("how often a driver fails needs chance: a World with noise")
-        for _, driver in loop.drivers:
-            if isinstance(driver, Believer):
-                raise ConfigError(f"how often {driver.name} fails cannot be estimated: it remembers what it has seen")
         self.loop, self.world, self.noise = loop, world, world.chance
         self.batch = world.batch
         self.steps = max(
@@ -96,13 +104,29 @@ class WorldProcess:
         )
         self._used = used_numbers(world)
         self.width = int(self._used.sum())
-        self._inside = all(driver.controller != Controller.EXTERNAL for _, driver in loop.drivers)
+        external_drivers = [driver for _, driver in loop.drivers if driver.controller == Controller.EXTERNAL]
+        self.external = bool(external_drivers)
+        self.name = " and ".join(dict.fromkeys(driver.name for driver in external_drivers)) or "world"
+        # Only the loop passes a belief on, and lets a selector choose.
+        self._inside = not self.external and not any(
+            isinstance(driver, Believer) or not isinstance(target, int) for target, driver in loop.drivers
+        )
+        history_sensors = [name for name, sensor in loop.sensors.items() if hasattr(sensor, "follow")]
+        obstacles = [branch_obstacle(driver, history_sensors) for _, driver in loop.drivers]
+        self._obstacle = next(filter(None, obstacles), "")
+        self._branching = {
+            f"driver.{number}.": driver
+            for number, driver in enumerate(external_drivers)
+            if isinstance(driver, Branching)
+        }
+        self._forms: dict[str, dict[str, tuple[tuple[int, ...], Any]]] = {}
         self._work = 0.0
         self._pushed = self._recorded = False
 
     def reset(self, keys: Keys) -> None:
-        """Restart all rows."""
-        self.loop.reset()
+        """Restart all rows. What drivers draw at random hangs on the keys too, by the seeds of their episodes."""
+        self.loop.reset(seeds=driver_seeds(keys))
+        self._forms = {}
         self.world.rekey(keys)
         if self._pushed:
             self.push(np.zeros((self.batch, self.width)))
@@ -152,17 +176,53 @@ class WorldProcess:
         return np.where(self.failed(), 1.0, np.minimum(closeness(self.world.state()), 0.999))
 
     def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Return everything that changes except the keys and the means; views on CPU."""
+        """Return everything that changes except the keys and the means; views on CPU.
+
+        Raises:
+            ConfigError: The episodes of a driver cannot branch, or its snapshot is not of the form of `Branching`.
+        """
+        if self._obstacle:
+            raise ConfigError(refusal(self._obstacle))
         names = [array_name for array_name in self.world.names if array_name not in ("noise.key", "noise.push")]
-        return {name: self.world.array(name) for name in names}
+        states = {name: self.world.array(name) for name in names}
+        for prefix, driver in self._branching.items():
+            states |= {prefix + name: value for name, value in self._driver_states(prefix, driver).items()}
+        return states
+
+    def _driver_states(self, prefix: str, driver: Branching) -> dict[str, npt.NDArray[Any]]:
+        """Return the checked snapshot of a driver: arrays [B, ...] of one form since the last reset."""
+        name = self.name
+        snapshot = driver.snapshot()
+        if not isinstance(snapshot, Mapping):
+            raise ConfigError(f"{name}: snapshot() returned a {type(snapshot).__name__}; expected arrays by name")
+        states = {str(key): np.asarray(value) for key, value in snapshot.items()}
+        for key, value in states.items():
+            if value.dtype.hasobject or value.ndim == 0 or len(value) != self.batch:
+                raise ConfigError(
+                    f"{name}: snapshot()['{key}'] has shape {value.shape} and type {value.dtype}; expected numbers, "
+                    f"and a row for each of the {self.batch} episodes"
+                )
+        form = {key: (value.shape, value.dtype) for key, value in states.items()}
+        changed = sorted(key for key, _ in form.items() ^ self._forms.setdefault(prefix, form).items())
+        if changed:
+            raise ConfigError(
+                f"{name}: snapshot()['{changed[0]}'] changed its shape or type in an episode; make it in reset()"
+            )
+        return states
 
     def put(self, rows: Rows, states: Mapping[str, npt.NDArray[Any]]) -> None:
         """Set rows to states of `snapshot`."""
-        for name, value in states.items():
-            current = self.world.array(name)
-            current[rows] = value
-            if self.world.device != "cpu":
-                self.world.put(name, current)
+        for name in self.world.names:
+            if name in states:
+                current = self.world.array(name)
+                current[rows] = states[name]
+                if self.world.device != "cpu":
+                    self.world.put(name, current)
+        for prefix, driver in self._branching.items():
+            driver_states = {name: value.copy() for name, value in self._driver_states(prefix, driver).items()}
+            for name, value in driver_states.items():
+                value[rows] = states[prefix + name]
+            driver.restore(driver_states)
 
     def rekey(self, rows: Rows, keys: Keys) -> None:
         """Give rows an independent future."""
@@ -214,6 +274,11 @@ class WorldProcess:
         return self._work
 
 
+def driver_seeds(keys: Keys) -> list[int]:
+    """Return the seeds, of 32 bits, that drivers find in their episodes where the world has these keys."""
+    return [int(key) & 0xFFFFFFFF for key in keys]
+
+
 class ReplayedWorld(World):
     """World of one scene that replays a given future: keys by step, and shifted means."""
 
@@ -229,7 +294,8 @@ class ReplayedWorld(World):
     ) -> None:
         """Take keys by step, and the means of `Process.push` (none: not shifted)."""
         self._keys = keys
-        super().__init__(episodes, graphs, device=device, noise=noise)
+        (seed,) = driver_seeds(np.array([keys[0]], np.uint64))
+        super().__init__([replace(episode, seed=seed) for episode in episodes], graphs, device=device, noise=noise)
         if means:
             shifts = np.zeros(self.array("noise.push").shape, np.float32)
             shifts[:, used_numbers(self)] = means

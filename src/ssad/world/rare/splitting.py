@@ -5,6 +5,11 @@ survivor from the first moment at which that one exceeded the level, with an ind
 surviving shares, times the share that fails in the end, is an unbiased estimate of the failure probability for any N,
 score and number of discarded particles.
 
+That holds if a copy is one: nothing that decides the future may be missing from snapshots. A process with external
+code is tested twice. Before the first level, every episode is continued from one of its moments in the row of another,
+and must go the same way. After the last one, every particle is run from its start by its keys alone, and must end the
+same.
+
 Source: Cerou and Guyader, "Adaptive multilevel splitting for rare event analysis" (2007); Brehier et al.,
 "Unbiasedness of some generalized adaptive multilevel splitting algorithms" (2016).
 """
@@ -18,6 +23,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import generator
 from ssad.core.types import F64, Bool
 from ssad.metrics.rare_events import RareEstimate, repeated_estimate
 from ssad.world.noise import Keys
@@ -103,6 +110,75 @@ class _History:
         self.process.put(rows, {name: value[branch_steps, parents] for name, value in self.states.items()})
         self.process.rekey(rows, keys)
 
+    def check_branches(self) -> None:
+        """Continue each episode, which has ended, from a moment of its own in another row, and compare each step.
+
+        Raises:
+            ConfigError: An episode went another way.
+        """
+        process, parents = self.process, np.roll(self.rows, 1)
+        last_steps = self.now[parents]
+        now = (generator("branch test").random(process.batch) * last_steps).astype(np.int64)
+        process.put(self.rows, {name: values[now, parents] for name, values in self.states.items()})
+        process.rekey(self.rows, self.keys[0, parents])
+        differs, first_steps = np.zeros(process.batch, bool), []
+        while (running := process.running()).any():
+            rows = np.flatnonzero(running)
+            process.step()
+            now[rows] += 1
+            self.step_counts[rows] += 1
+            is_new = _different(process.snapshot(), self.states, rows, (now[rows], parents[rows])) & ~differs[rows]
+            first_steps += now[rows[is_new]].tolist()
+            differs[rows[is_new]] = True
+        if differs.any():
+            raise ConfigError(
+                f"{process.name}: {differs.sum()} of {process.batch} episodes went another way from a restored "
+                f"snapshot, the first in step {min(first_steps)}: snapshot() and restore(states) must cover all that "
+                "its actions depend on, separately for each episode (ssad.core.driving.Branching); or set "
+                "methods=[monte-carlo]"
+            )
+        process.put(self.rows, {name: values[self.now, self.rows] for name, values in self.states.items()})
+        process.rekey(self.rows, self.keys[0])
+
+    def check_lives(self) -> None:
+        """Run every particle again from its start by its keys, and compare the ends.
+
+        Raises:
+            ConfigError: A particle ended otherwise.
+        """
+        process, step, differs = self.process, 0, np.zeros(self.process.batch, bool)
+        process.reset(self.keys[0])
+        while (running := process.running()).any():
+            changed = np.flatnonzero(self.keys[step] != self.keys[max(step - 1, 0)])
+            process.rekey(changed, self.keys[step, changed])
+            process.step()
+            self.step_counts[running] += 1
+            step += 1
+            # A driver is called for ended rows too, and may go on to change what it remembers of them.
+            rows = np.flatnonzero(running & ~process.running())
+            differs[rows] = _different(process.snapshot(), self.states, rows, (self.now[rows], rows))
+        if differs.any():
+            raise ConfigError(
+                f"{process.name}: {differs.sum()} of {process.batch} branched episodes end otherwise where they are "
+                "driven from the start: snapshot() and restore(states) must cover all that its actions depend on, "
+                "separately for each episode (ssad.core.driving.Branching); or set methods=[monte-carlo]"
+            )
+
+
+def _different(
+    states: Mapping[str, npt.NDArray[Any]],
+    history: Mapping[str, npt.NDArray[Any]],
+    rows: npt.NDArray[np.intp],
+    places: tuple[npt.NDArray[np.int64], npt.NDArray[np.intp]],
+) -> Bool:
+    """Return the rows whose states differ in any bit from those at places (step, row) of a history."""
+    differs = np.zeros(len(rows), bool)
+    for name, values in states.items() if len(rows) else ():
+        current, recorded = (np.ascontiguousarray(array) for array in (values[rows], history[name][places]))
+        equal = current.view(np.uint8).reshape(len(rows), -1) == recorded.view(np.uint8).reshape(len(rows), -1)
+        differs |= ~equal.all(axis=1)
+    return differs
+
 
 def splitting(
     process: Process, random: np.random.Generator, *, repeats: int, kill: float = 0.25, levels: int = 2000
@@ -118,6 +194,9 @@ def splitting(
 
     Returns:
         The estimates.
+
+    Raises:
+        ConfigError: Rows cannot branch, or a branch is no copy.
     """
     particles = process.batch // repeats
     if particles * repeats != process.batch or particles < 2:
@@ -128,6 +207,8 @@ def splitting(
     process.reset(keys)
     history = _History(process, keys)
     history.finish()
+    if process.external:
+        history.check_branches()
     survival, passed_levels = np.ones(repeats), np.zeros(repeats, np.int64)
     particle_count = process.batch
     for _ in range(levels):
@@ -149,6 +230,8 @@ def splitting(
         history.branch(replaced, parents, thresholds[repeat_index], keys=draw_keys(random, len(replaced)))
         particle_count += len(replaced)
         history.finish()
+    if process.external:
+        history.check_lives()
     failed = history.final() >= 1.0
     estimates = survival * failed.reshape(repeats, particles).mean(axis=1)
     work = (

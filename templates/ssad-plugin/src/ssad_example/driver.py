@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,16 @@ class Careful:
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Nothing to forget; a system with a memory begins it anew, one row an episode."""
+
+    def snapshot(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Nothing is remembered; a system with a memory returns its arrays by name, a row for each episode.
+
+        With this and `restore`, `ssad run how-often` measures the system by splitting and importance sampling too.
+        """
+        return {}
+
+    def restore(self, states: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Nothing to set; a system with a memory continues from these arrays."""
 
     def act(self, view: Observation) -> npt.NDArray[np.float32]:
         """Throttle, brake and steer [N, 3] (left is positive) of N egos, ten times a simulated second."""

@@ -21,7 +21,7 @@ class Coin(Kind):
     """Each system tosses a coin."""
 
     name, suite, factors = "coin", CoinSuite, ("system",)
-    columns = (Column("heads", "share of heads", "", "higher"),)
+    columns = (Column("heads", "share of heads", "", "higher", limits=(0.0, 1.0)),)
 
     def cells(self, suite: CoinSuite) -> Iterator[Cell]:
         """One a system."""

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.linear3d import CLEAN, GAINS
+from helpers.run_folder import reseal
 from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
 from ssad.core.errors import SSADError
 from ssad.core.images import read_image
+from ssad.core.jsonl import read_lines
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors.monitored import MonitoredDetector
 from ssad.engine.command import command_of
@@ -26,7 +28,7 @@ from ssad.engine.run import run
 from ssad.experiments.perception import scored_data
 from ssad.experiments.perception.digital import kind as digital
 from ssad.experiments.perception.digital.attack_sheet import magnified
-from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
+from ssad.experiments.perception.digital.kind import Digital, DigitalSuite, _reference_shares
 from ssad.experiments.perception.digital.page import (
     attempts_of,
     effort_table,
@@ -48,10 +50,12 @@ from ssad.experiments.perception.scene_boxes import (
 )
 from ssad.experiments.runs import summary, write_report
 from ssad.experiments.suites import load_suite
+from ssad.metrics.attack_audit import audit
 from ssad.report.load import load_run
 from ssad.report.paper import DIGITAL as PUBLISHED
 from ssad.scenarios.static.digital import scene_attacker
 from ssad.scenarios.static.digital.perturbation import DigitalAttack
+from ssad.scenarios.static.digital.reference_ensemble import REFERENCE_IMAGES
 from ssad.scenarios.static.digital.scene_attacker import SceneAttacker
 from ssad.scenarios.static.digital.spec import AttackSpec
 from ssad.scenarios.static.digital.tally import sum_notes
@@ -105,7 +109,7 @@ def folder(root: Path, shared: Shared) -> Path:
 
 
 def lines(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+    return read_lines(folder / "results.jsonl")
 
 
 def by_attack(folder: Path, detector: str) -> dict[tuple[str | None, float], dict[str, Any]]:
@@ -263,6 +267,7 @@ def test_what_is_there_is_not_run_again_and_what_failed_is_if_asked(
     kept = (out / "results.jsonl").read_text().splitlines()
     gone = [k for k, line in enumerate(kept) if json.loads(line)["attack"] == "fgsm"]
     (out / "results.jsonl").write_text("".join(f"{line}\n" for k, line in enumerate(kept) if k not in gone))
+    reseal(out)
     asked: list[Any] = []
     monkeypatch.setattr(scene_attacker, "run_attack", lambda *given, **named: asked.append(given))
     records = run_digital(Digital().plan(suite_of(root)), out)
@@ -426,6 +431,7 @@ def test_notes_of_scenes_are_put_together() -> None:
         "gradient_error": 0.1,
         "coupling": None,
         "halved": 2,
+        "references": [{"attack": "pgd", "token": "b"}, {"attack": "pgd", "token": "a"}],
     }
     empty = one | dict.fromkeys(("images", "idle", "gradients", "queries", "before", "after", "used", "batch"), 0)
     other = one | {
@@ -438,6 +444,7 @@ def test_notes_of_scenes_are_put_together() -> None:
         "batch": 1,
         "gradient_error": 0.3,
     }
+    del other["references"], empty["references"]  # as older versions have it
     assert sum_notes([one, empty, other]) == {
         "access": "white-box",
         "images": 4,
@@ -452,6 +459,7 @@ def test_notes_of_scenes_are_put_together() -> None:
         "gradient_error": 0.3,
         "coupling": None,
         "halved": 4,
+        "references": [{"attack": "pgd", "token": "a"}, {"attack": "pgd", "token": "b"}],
     }
 
 
@@ -554,3 +562,29 @@ def test_the_papers_table_is_the_papers(data_dir: Path) -> None:
         ]
         numbers = [float(value) for value in line.rstrip("\\").split("&")[-4:]]
         assert numbers == [*scores["FCOS3D"], *scores["PGD"]], attack
+
+
+def test_every_attack_is_compared_with_the_reference_ensemble(root: Path, tmp_path: Path) -> None:
+    weak = "helpers.weak_attacks:"
+    names = ["fgsm", *({"name": name, "options": {"steps": 3}} for name in ("pgd", f"{weak}FlippedChannel"))]
+    suite = suite_of(root, detectors=[LINEAR], attacks=[*names, "square"], sweeps=[], steps=3, replicates=2)
+    records = {record["attack"]: record for record in run_digital(Digital().plan(suite), tmp_path / "run")}
+    for attack in ("fgsm", "pgd", f"{weak}FlippedChannel"):
+        compared = records[attack]["references"]
+        assert 8 <= len({entry["token"] for entry in compared}) == len(compared) <= REFERENCE_IMAGES
+        assert set(compared[0]["references"]) == {"pgd", "square", *(["apgd"] if attack != "fgsm" else [])}
+        assert all(entry["loss"] > entry["loss_before"] for entry in compared)
+    assert records["square"]["references"] == [], "without gradients there is nothing to compare"
+    assert not records["noise"]["references"]
+    loaded = load_digital_run(load_run(tmp_path / "run"))
+    faults = [fault.text for fault in audit(attempts_of(loaded)).faults if fault.rule == "reference"]
+    assert len(faults) == 1, faults
+    assert faults[0].startswith(f"{weak}FlippedChannel on loss full with 3 steps at 5 px raises its loss by")
+    assert Digital().verdict(load_run(tmp_path / "run"))[0].startswith("Audit of the attacks: ")
+
+
+def test_the_images_of_the_ensemble_do_not_depend_on_the_cell() -> None:
+    assert _reference_shares(["a", "b", "c"]) == {"a": 6, "b": 7, "c": 7}
+    many = _reference_shares([str(number) for number in range(50)])
+    assert sum(many.values()) == REFERENCE_IMAGES
+    assert set(many.values()) == {0, 1}

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.run_folder import write_lines
 
 from ssad.experiments.perception.physical.page import (
     PhysicalRun,
@@ -17,6 +18,7 @@ from ssad.experiments.perception.physical.page import (
     main_table,
     margin_table,
     score,
+    summary,
     tiles,
     transfer_table,
 )
@@ -40,7 +42,12 @@ def line(attack: str, carrier: str, ap: float, **changes: Any) -> dict[str, Any]
         "status": "ok",
         "n": 40,
         "drives": 8,
-        "metrics": {"AP50": ap, "AP50_25": ap, "ASR_25": None if attack == "clean" else 1 - ap, "confidence": ap},
+        "metrics": {
+            "AP50": ap,
+            "AP50_25": ap,
+            **({} if attack == "clean" else {"ASR_25": 1 - ap, "n0_25": 38}),
+            "confidence": ap,
+        },
         "intervals": {"AP50": [max(ap - 0.05, 0.0), min(ap + 0.05, 1.0)]},
     }
     found |= changes
@@ -83,7 +90,7 @@ def folder(tmp_path: Path) -> Path:
         "reference": "physical",
     }
     (tmp_path / "run.json").write_text(json.dumps({"kind": "physical", "suite": suite, "cells": []}))
-    (tmp_path / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(tmp_path, lines)
     return tmp_path
 
 
@@ -104,9 +111,9 @@ def test_the_papers_rows_stand_below_ours(folder: Path) -> None:
         "TPA, Town04",
     ]
     text = {row.head[0]: [cell.text for cell in row.cells] for row in rows}
-    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30"]
-    assert text["DAS"] == ["48.00", "48.00", "52.00"]
-    assert text["TPA"] == ["n/a", "n/a", "n/a"], "what was refused has no number"
+    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30", "n/a"]
+    assert text["DAS"] == ["48.00", "48.00", "52.00", "38"]
+    assert text["TPA"] == ["n/a"] * 4, "what was refused has no number"
     random = next(row for row in rows if row.head == ("random patch",)).cells[0]
     assert (random.text, random.interval) == ("94.00", "[85.00, 100.00]"), "mean of two draws, ends of their intervals"
 
@@ -117,12 +124,23 @@ def test_records_that_tell_of_any_class_have_a_column_of_it(folder: Path) -> Non
     lines = [json.loads(one) for one in (folder / "results.jsonl").read_text().splitlines()]
     for one in lines:
         one["metrics"]["ASR_any_25"] = 0.25 if one["attack"] == "das" else None
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     made = main_table(PhysicalRun(load_run(folder)), 0)
-    assert made.columns == ("yolov5n AP50", "yolov5n AP50 > 0.25", "yolov5n ASR", "yolov5n ASR, any class")
+    assert [name.removeprefix("yolov5n ") for name in made.columns[2:]] == ["ASR", "ASR, any class", "n0"]
     text = {row.head[0]: [cell.text for cell in row.cells] for row in made.rows}
-    assert text["DAS"] == ["48.00", "48.00", "52.00", "25.00"]
-    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30", "n/a"]
+    assert text["DAS"] == ["48.00", "48.00", "52.00", "25.00", "38"]
+    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30", "n/a", "n/a"]
+
+
+def test_a_success_rate_stands_beside_its_n0_or_not_at_all(folder: Path) -> None:
+    made = main_table(PhysicalRun(load_run(folder)), 0)
+    assert "n/a where the target is found so in less than 90% of the clean images" in made.note
+    few = line("das", "camouflage", 0.5) | {"metrics": {"AP50": 0.5, "ASR_25": None, "n0_25": 3}}
+    assert [score([few], name).text for name in ("ASR_25", "n0_25")] == ["n/a", "3"]
+    uncounted = few | {"metrics": {"AP50": 0.5, "ASR_25": 0.67}}
+    assert score([uncounted], "ASR_25").text == "n/a"
+    assert score([line("das", "camouflage", 0.5)], "ASR_25").n == 38
+    assert "n0: targets found clean" in summary(load_run(folder)).note
 
 
 def test_the_interval_of_several_draws_covers_drives_and_draws() -> None:
@@ -156,12 +174,12 @@ def test_a_control_that_is_worse_on_average_can_come_nearer(folder: Path) -> Non
         line("grey", "camouflage", 0.60, replicates={"AP50": (0.60 + draws).tolist()}),
         line("random", "camouflage", 0.62, replicates={"AP50": (0.62 - draws).tolist()}),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[3] == "random camouflage"
     assert row.cells[2].mean == pytest.approx(12.0)
     assert row.cells[2].low < 0.0
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines[:2]))
+    write_lines(folder, lines[:2])
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.cells[2].low == pytest.approx(10.0, abs=0.1), "alike in every drive"
 
@@ -176,7 +194,7 @@ def test_attacks_are_compared_draw_by_draw_of_the_same_drives(folder: Path) -> N
         line("adv-patch", "patch", 0.2, replicates={"AP50": (0.2 + draws).tolist()}, **own),
         line("random", "camouflage", 0.1),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = comparison_table(PhysicalRun(load_run(folder))).rows
     assert row.head == ("Oldmarket", "behind", "yolov5n", "TPA", "DAS"), "of one carrier, and no control"
     gap = row.cells[2]
@@ -186,7 +204,7 @@ def test_attacks_are_compared_draw_by_draw_of_the_same_drives(folder: Path) -> N
         "beta limits are close"
     )
     lines[1]["drives"] = 7
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = comparison_table(PhysicalRun(load_run(folder))).rows
     assert np.isnan(row.cells[2].low), "other drives: no pairs"
 
@@ -198,10 +216,10 @@ def test_the_first_screen_shows_the_clean_pictures_of_the_hour_of_the_strongest_
         line("shadow", "light, noon", 0.2),
         line("laser", "light, night, watts 10.0", 0.25),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (tile,) = tiles(PhysicalRun(load_run(folder)))
     assert (tile["worst"], tile["clean"].mean, tile["left"].mean) == ("shadow, noon", 90.0, 20.0)
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines[:2] + lines[3:]))
+    write_lines(folder, lines[:2] + lines[3:])
     (tile,) = tiles(PhysicalRun(load_run(folder)))
     assert (tile["clean"].mean, tile["left"].mean) == (30.0, 25.0)
 
@@ -215,19 +233,19 @@ def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -
         line("random laser", night, 0.94, number=1),
         line("random projector", night, 0.40),
     ]
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[2:] == ("laser, night", "random laser, night")
     assert row.cells[2].mean == pytest.approx(90.0 - 70.0)
     lines[0] = line("laser, searches 4", night, 0.70, source="yolov5n")
-    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    write_lines(folder, lines)
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[2:] == ("laser, searches 4, night", "random laser, night")
 
 
 def test_transfer_and_the_worst_cell(folder: Path) -> None:
-    with (folder / "results.jsonl").open("a") as file:
-        file.write(json.dumps(line("clean", "", 0.91, detector="fcos3d-light")) + "\n")
+    lines = [json.loads(one) for one in (folder / "results.jsonl").read_text().splitlines()]
+    write_lines(folder, [*lines, line("clean", "", 0.91, detector="fcos3d-light")])
     run = PhysicalRun(load_run(folder))
     usual, moved = transfer_table(run).rows
     assert usual.head == ("Oldmarket", "clean", "")
@@ -237,7 +255,7 @@ def test_transfer_and_the_worst_cell(folder: Path) -> None:
     clean, das = grid_table(run).rows
     assert clean.head[4] == "5 m, 180°"
     assert das.head[4] == "5 m, 0°"
-    assert das.cells[2].text == "35.00"
+    assert [cell.text for cell in das.cells[2:]] == ["38", "35.00"]
 
 
 def test_the_page_shows_all_and_says_what_was_refused(folder: Path) -> None:

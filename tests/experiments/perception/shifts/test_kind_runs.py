@@ -19,12 +19,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.run_folder import reseal
 from helpers.sharing import Shared
 from rich.console import Console
 from typer.testing import CliRunner
 
 from ssad.cli import app
 from ssad.core.errors import ConfigError, FormatError, SSADError
+from ssad.core.jsonl import read_lines
 from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.engine.kind import Plan, Resources
@@ -91,7 +93,7 @@ def folder(root: Path, shared: Shared) -> Path:
 
 
 def lines(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+    return read_lines(folder / "results.jsonl")
 
 
 def test_scores_fall_with_what_the_detector_sees(folder: Path) -> None:
@@ -135,6 +137,7 @@ def test_a_stopped_run_goes_on_to_the_same_records(folder: Path, root: Path, tmp
     again = tmp_path / "run"
     shutil.copytree(folder, again)
     (again / "results.jsonl").write_text("".join((folder / "results.jsonl").read_text().splitlines(True)[:3]) + '{"k')
+    reseal(again)
     shutil.rmtree(next((again / "detections").iterdir()) / "fog-3")
     run_detection(plan_detection(suite_of(root)), again, workers=0)
 
@@ -156,6 +159,7 @@ def test_replay_finds_the_boxes_of_a_cell_again_and_says_what_differs(folder: Pa
     ):
         own = json.dumps(record | changed) + "\n"
         (again / "results.jsonl").write_text("".join(x for x in text.splitlines(True) if record["key"] not in x) + own)
+        reseal(again)
         found = CliRunner().invoke(app, ["replay", str(again), record["key"], "--out", str(tmp_path / "out")])
         assert (found.exit_code, verdict in found.output.replace("\n", " ")) == (code, True), found.output
     assert (tmp_path / "out" / f"{record['key']}.jpg").stat().st_size > 10_000
@@ -233,6 +237,7 @@ def test_the_paper_stands_beside_detectors_of_its_kind(folder: Path, tmp_path: P
     kept = [line for line in (copy / "results.jsonl").read_text().splitlines(True) if '"severity":"random"' not in line]
     assert len(kept) == len(lines(folder)) - 2
     (copy / "results.jsonl").write_text("".join(kept).replace(ORACLE, "fcos3d-light"))
+    reseal(copy)
     table = main_table(load_detection_run(load_run(copy)))
     told = {row.head[1]: row for row in table.rows if row.published}
     assert told["gaussian noise"].cells[0].mean == PUBLISHED["gaussian"]["FCOS3D"][0]

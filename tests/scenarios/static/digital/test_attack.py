@@ -16,7 +16,7 @@ from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.detectors import make_detector
 from ssad.scenarios.static.digital import ATTACKS, Budget, default_loss, make_attack, needs, px, run_attack
-from ssad.scenarios.static.digital.apgd import checkpoints
+from ssad.scenarios.static.digital.apgd import MIN_STEPS, checkpoints
 from ssad.scenarios.static.digital.budget import lengths
 from ssad.scenarios.static.digital.check import is_within_budget, remaining_quality
 from ssad.scenarios.static.digital.gradient_check import check_gradient
@@ -76,6 +76,21 @@ def test_every_attack_keeps_its_budget_and_beats_the_clean_image(name: str, norm
     assert is_within_budget(found.images, images, budget)
     if name != "noise":
         assert bool((found.after > found.before).all())
+
+
+@pytest.mark.parametrize("name", ["fgsm", "pgd", "apgd", "cw", "square", "nes", "spsa", "noise"])
+def test_an_attack_spends_its_l2_budget_on_images_whose_values_stop_at_0_and_255(name: str) -> None:
+    images, truth = toy_scene()
+    draws = torch.Generator().manual_seed(0)
+    ends = torch.randint(0, 2, images.shape, generator=draws).float()
+    images = torch.where(torch.rand(images.shape, generator=draws) < 0.4, ends, images)
+    options: dict[str, Any] = {"queries": 60} if name == "square" else {"samples": 4} if name in ("nes", "spsa") else {}
+    budget = Budget(px(40), "l2")
+    attack = make_attack(name, **options)
+    stored = run_attack(attack, ToyDetector(), images, truth, budget, objective=default_loss(name)).images
+    stored_lengths = 255 * lengths(stored - images).flatten()
+    assert bool((stored_lengths <= 40.001).all())
+    assert bool((stored_lengths > 39.0).all())
 
 
 @pytest.mark.parametrize("name", [*WHITE, "noise", "cw-min"])
@@ -258,12 +273,20 @@ def test_all_names_are_listed_with_what_they_need() -> None:
     assert rows.keys() == {*ATTACKS, *PHYSICAL, *LIGHTS, "module:object"}
     assert rows["adv-patch"] == "physical: trains a patch (docs/how-to/paint-a-car.md)"
     assert rows["pgd"] == "white-box, loss full"
+    assert "noise" not in rows["universal"]
+    assert "one change" in rows["universal"]
     assert rows["transfer"].startswith("made in Python: needs surrogate, inner")
     assert [name for name in ATTACKS if needs(name)] == ["transfer", "expected"]
 
 
 def test_checkpoints_shrink() -> None:
     assert sorted(checkpoints(100)) == [22, 41, 57, 70, 80, 87, 93, 99]  # Croce and Hein, section 3
+
+
+def test_apgd_says_that_it_needs_more_steps() -> None:
+    with pytest.warns(UserWarning, match=f"apgd: 10 steps are too few .* take {MIN_STEPS} or more, or pgd"):
+        make_attack("apgd", steps=10)
+    assert make_attack("apgd").steps == MIN_STEPS, "without a warning, which would be an error"
 
 
 def test_pgd_steps_shrink_to_nothing() -> None:

@@ -24,7 +24,7 @@ def live(name: str, severity: int, detector: Any) -> Any:
     return suite.changes.readings["front"]
 
 
-@pytest.mark.parametrize(("name", "steps"), [("pgd", STEPS), ("pgd?steps=2", 2), ("apgd?steps=12", 12)])
+@pytest.mark.parametrize(("name", "steps"), [("pgd", STEPS), ("pgd?steps=2", 2), ("momentum?steps=12", 12)])
 def test_a_name_says_how_many_gradient_steps_a_picture_takes(name: str, steps: int) -> None:
     attack = live(name, 3, ToyDetector())
     assert parse_perturbation(name).family == "digital"

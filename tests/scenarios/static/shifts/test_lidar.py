@@ -158,6 +158,44 @@ def test_the_lidar_is_blind_towards_the_same_sun() -> None:
     assert done.skipped == {"it is night": 1}
 
 
+@pytest.mark.parametrize(("calibration", "rates"), [("physical", None), ("paper", (0.20, 0.73, 1.5625, 3.125, 7.29))])
+@pytest.mark.parametrize("name", ["rain", "snow"])
+def test_rain_and_snow_have_the_rates_of_their_calibration(name: str, calibration: Any, rates: Any) -> None:
+    """Echoes of targets are attenuated by exp(-2 beta R); the published rates are those of 3D_Corruptions_AD."""
+    points = turn(2000)
+    points[:, 4] = np.arange(len(points))  # tells points apart
+    rates = rates or (table.RAIN_RATE if name == "rain" else table.SNOW_RATE)
+    law = table.rain_extinction if name == "rain" else table.snow_extinction
+    for severity, rate in enumerate(rates, 1):
+        out, _ = shift_points(points, SweepFrame("s", "a"), ShiftSpec(name, severity, 0, calibration))
+        before = points[out[:, 4].astype(int)]
+        is_far = ranges(out) > 30.0  # echoes of drops and flakes are nearer
+        beta = np.log(before[is_far, 3] / out[is_far, 3]) / (2 * ranges(before[is_far]))
+        assert np.median(beta) == pytest.approx(law(rate), rel=1e-3)
+
+
+@pytest.mark.parametrize("severity", [1, 5])
+def test_the_published_sun_strikes_a_share_of_the_points_and_blinds_nothing(severity: int) -> None:
+    points, context = turn(20000), SceneContext("s", 0.1, 0.3)
+    spec = ShiftSpec("sunlight", severity, 0, "paper")
+    out, done = shift_points(points, SweepFrame("s", "a"), spec, contexts={"s": context})
+    struck = (out != points).any(1)
+    assert (len(out), done.details["lost"]) == (len(points), 0)
+    assert done.details["noisy"] == struck.sum() == 200 * severity, "1 to 5 % of the points, at night too"
+    noise = (out - points)[struck, :3]
+    # five standard errors of the deviation of 3 x 200 draws and more
+    assert noise.std() == pytest.approx(2.0, rel=0.15)
+    assert (out[:, 3:] == points[:, 3:]).all()
+
+
+def test_fog_is_the_same_in_both_calibrations() -> None:
+    """Both have the published extinctions, .005 to .06 1/m."""
+    published = (0.005, 0.01, 0.02, 0.03, 0.06)
+    for calibration in ("physical", "paper"):
+        betas = [extinction(ShiftSpec("fog", severity, 0, calibration)) for severity in range(1, 6)]
+        assert betas == pytest.approx(published)
+
+
 def test_wrong_points_are_refused() -> None:
     for points in (np.zeros((5, 3)), np.zeros(5), np.zeros((2, 3, 4))):
         with pytest.raises(ConfigError, match="points must be"):

@@ -14,6 +14,7 @@ from ssad.core.nuscenes_names import CLASSES
 from ssad.core.types import F64
 from ssad.datasets.nuscenes.truth import GroundTruth
 from ssad.detectors.on_scenes import SampleBoxes, box_table, match_boxes
+from ssad.metrics.attack_success import attack_success_rate
 from ssad.metrics.detection import CVPR_2019, Matches, filter_boxes, match
 from ssad.metrics.detection_boxes import BoxTable
 
@@ -132,10 +133,10 @@ def target_success(
         if target_classes
         else attacked_labels != truth_boxes.label
     )
-    count = int(is_found.sum())
+    rate = attack_success_rate(is_found, ~is_reached, np.zeros(len(is_found), np.int32))
     return {
-        "targets": count,
-        **({"success": round(float(is_reached[is_found].mean()), 6)} if count else {}),
+        "targets": rate.n0,
+        **({} if rate.value is None else {"success": round(rate.value, 6)}),
         **kept_column,
     }
 

@@ -35,6 +35,7 @@ from ssad.experiments.perception.scored_data import Victims, detectors_of
 from ssad.report.load import Run
 from ssad.report.tables import Table
 from ssad.scenarios.static.digital.perturbation import DigitalAttack
+from ssad.scenarios.static.digital.reference_ensemble import REFERENCE_IMAGES
 from ssad.scenarios.static.digital.spec import AttackSpec
 from ssad.scenarios.static.digital.universal import UniversalFit
 
@@ -61,7 +62,10 @@ class Digital(OpenLoopKind):
     name = "digital"
     families: ClassVar = {"attacks": "digital"}
     suite = DigitalSuite
-    columns = (*OpenLoopKind.columns, Column("drop", "share of the clean mAP that is lost", "", "higher"))
+    columns = (
+        *OpenLoopKind.columns,
+        Column("drop", "share of the clean mAP that is lost", "", "higher", limits=(None, 1.0)),
+    )
     factors = (
         "detector",
         "attack",
@@ -152,7 +156,12 @@ class Digital(OpenLoopKind):
             return [SceneCondition(scene) for scene in scenes]
         batch, source = job.settings["batch"], cell.spec["source"]
         specs = [AttackSpec.of_row(row) for row in cell.spec["attacks"]]
-        return [SceneCondition(scene, DigitalAttack(spec), source, batch) for spec in specs for scene in scenes]
+        shares = _reference_shares(job.settings["scenes"])
+        return [
+            SceneCondition(scene, DigitalAttack(spec, reference_images=shares[scene]), source, batch)
+            for spec in specs
+            for scene in scenes
+        ]
 
     def compared_scenes(self, cell: Cell, job: Job) -> list[SceneCondition]:
         """Return the clean scenes, which every cell is compared with."""
@@ -204,5 +213,17 @@ class Digital(OpenLoopKind):
         return page.summary(run)
 
     def verdict(self, run: Run) -> list[str]:
-        """Return the findings of a run in sentences."""
-        return verdict(run)
+        """Return the findings of a run in sentences, after the faults of its attacks, which call them in question."""
+        return [*page.audit_sentence(run), *verdict(run)]
+
+
+def _reference_shares(scenes: Sequence[str]) -> dict[str, int]:
+    """Return how many images of each scene the reference ensemble attacks: the same for all cells of a run.
+
+    The boxes of a scene are shared by cells on few and on all scenes, so the images must not depend on the cell.
+    """
+    count = len(scenes)
+    return {
+        scene: REFERENCE_IMAGES * (index + 1) // count - REFERENCE_IMAGES * index // count
+        for index, scene in enumerate(scenes)
+    }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -37,7 +37,7 @@ from ssad.experiments.perception.digital.tables import (
     with_detector,
 )
 from ssad.experiments.perception.shifts.page import CLASSES, interval_note, replicates_of
-from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit
+from ssad.metrics.attack_audit import RULES, Attempt, ReferenceComparison, Verdict, audit
 from ssad.report.artefacts import pictures
 from ssad.report.figures import CurvePoint, Panel, panels
 from ssad.report.load import Run
@@ -253,9 +253,18 @@ def attempts_of(run: DigitalRun) -> list[Attempt]:
                 record["change_px"],
                 setting.source or ("the bare detector" if is_unaware else ""),
                 ", ".join(filter(None, group)),
+                tuple(_comparison(entry) for entry in record.get("references") or ()),
             )
         )
     return attempts
+
+
+def _comparison(entry: Mapping[str, Any]) -> ReferenceComparison:
+    """Return a comparison with the reference ensemble as a record holds it."""
+    references = {name: (float(loss), float(quality)) for name, (loss, quality) in entry["references"].items()}
+    return ReferenceComparison(
+        entry["attack"], float(entry["loss_before"]), float(entry["loss"]), float(entry["quality"]), references
+    )
 
 
 def published_attempts() -> list[Attempt]:
@@ -272,6 +281,15 @@ def published_attempts() -> list[Attempt]:
         for attack in DIGITAL_STEPS
         for detector, scores in PUBLISHED[attack].items()
     ]
+
+
+def audit_sentence(found: Run) -> list[str]:
+    """Return a sentence on the faults that the audit of the attacks found; empty if there are none."""
+    faults = audit(attempts_of(load_digital_run(found))).faults
+    if not faults:
+        return []
+    others = f" {len(faults) - 1} more: see the audit." if len(faults) > 1 else ""
+    return [f"Audit of the attacks: {faults[0].detector}: {faults[0].text}.{others}"]
 
 
 def audit_table(verdict: Verdict) -> Table:

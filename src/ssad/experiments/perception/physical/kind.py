@@ -11,6 +11,7 @@ from pydantic import Field
 
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
+from ssad.core.run_records import COUNT, SHARE
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.engine.kind import Cell, Column, Job, Plan, Resources, SuiteBase, find_cell
 from ssad.engine.progress import LiveProgress
@@ -42,7 +43,8 @@ class PhysicalSuite(SuiteBase, TargetTable):
     """One table: detectors x textures on a car, each trained on drives in one town and tested in another.
 
     Attributes:
-        floor: Minimum AP50 of the clean images, below which no attack is reported.
+        floor: Minimum AP50 of the clean images, below which no attack is reported; minimum share of them in which the
+            target is found, below which no ASR at that score is.
         replicates: Replicates of the bootstrap over drives.
     """
 
@@ -59,15 +61,18 @@ class Physical(OpenLoopKind):
     suite = PhysicalSuite
     patience: ClassVar[int | None] = None
     columns = (
-        Column("AP50", "AP50", "", "lower"),
-        Column("AP50_25", "AP50 above 0.25", "", "lower"),
-        Column("AP50_all", "AP50 of the whole class", "", "lower"),
-        Column("AP50_all_25", "AP50 of the whole class above 0.25", "", "lower"),
-        Column("ASR_25", "ASR at 0.25", "", "higher"),
-        Column("ASR_50", "ASR at 0.5", "", "higher"),
-        Column("ASR_any_25", "ASR at 0.25, of any class", "", "higher"),
-        Column("ASR_all_25", "ASR of the whole class at 0.25", "", "higher"),
-        Column("confidence", "mean score", "", "lower"),
+        Column("AP50", "AP50", "", "lower", limits=SHARE),
+        Column("AP50_25", "AP50 above 0.25", "", "lower", limits=SHARE),
+        Column("AP50_all", "AP50 of the whole class", "", "lower", limits=SHARE),
+        Column("AP50_all_25", "AP50 of the whole class above 0.25", "", "lower", limits=SHARE),
+        Column("ASR_25", "ASR at 0.25", "", "higher", limits=SHARE),
+        Column("n0_25", "n0 at 0.25", limits=COUNT),
+        Column("ASR_50", "ASR at 0.5", "", "higher", limits=SHARE),
+        Column("n0_50", "n0 at 0.5", limits=COUNT),
+        Column("ASR_any_25", "ASR at 0.25, of any class", "", "higher", limits=SHARE),
+        Column("ASR_all_25", "ASR of the whole class at 0.25", "", "higher", limits=SHARE),
+        Column("n0_all_25", "n0 of the whole class at 0.25", limits=COUNT),
+        Column("confidence", "mean score", "", "lower", limits=SHARE),
     )
     factors = ("test", "view", "detector", "attack", "carrier", "source")
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ssad.metrics import replicate_difference
+from ssad.metrics.attack_success import N0, rate_note
 from ssad.report.artefacts import pictures
 from ssad.report.figures import HeatMap, heat_maps
 from ssad.report.load import Run
@@ -35,12 +36,14 @@ DETECTORS = {"yolov5": "YoloV5", "yolov3": "YoloV3"}  # how a detector's name be
 BESIDE = {"Oldmarket": "Town04", "Larkhill": "Town03"}  # town of a test -> the paper's that stands in its place
 LIGHT = "light, "  # carriers of light attacks begin so; the hour follows
 CONTROLS = ("random", "noise", "grey", "shuffled")
-SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR", "ASR_any_25": "ASR, any class"}
+SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR", "ASR_any_25": "ASR, any class", "n0_25": "n0"}
 OTHERS = {
     "ASR_50": "ASR at 0.5",
+    "n0_50": "n0 at 0.5",
     "AP50_all": "AP50, whole class",
     "AP50_all_25": "AP50 > 0.25, whole class",
     "ASR_all_25": "ASR, whole class",
+    "n0_all_25": "n0, whole class",
     "confidence": "mean score",
 }
 VICTIM: dict[str, Callable[[tuple[str, str, tuple[str, str]]], str]] = {
@@ -128,13 +131,24 @@ def score(lines: Sequence[Line], metric: str) -> TableCell:
     """Return a metric in percent, the mean over draws of a control, with its interval.
 
     The interval is over drives; of several draws it goes from the lowest to the highest end of theirs, so that it
-    covers drives and draws. Where a draw has none it is the range of the draws.
+    covers drives and draws. Where a draw has none it is the range of the draws. An attack success rate has no value in
+    records without its n0, which tells whether the clean detector finds enough.
     """
-    measured = [line for line in lines if line["metrics"].get(metric) is not None]
+    count_name = N0.get(metric)
+    measured = [
+        line
+        for line in lines
+        if line["metrics"].get(metric) is not None and (count_name is None or count_name in line["metrics"])
+    ]
     if not measured:
         return TableCell(math.nan)
+    if metric in N0.values():
+        return TableCell.value(measured[0]["metrics"][metric], digits=0)
     percentages = [100.0 * float(line["metrics"][metric]) for line in measured]
-    mean, count = math.fsum(percentages) / len(percentages), int(measured[0]["n"])
+    mean, count = (
+        math.fsum(percentages) / len(percentages),
+        int(measured[0]["metrics"][count_name] if count_name else measured[0]["n"]),
+    )
     limits = [interval for line in measured if (interval := (line.get("intervals") or {}).get(metric))]
     # A draw without an interval has too few drives: only the spread of the draws is known.
     if len(limits) < len(measured) > 1:
@@ -172,7 +186,8 @@ def main_table(run: PhysicalRun, number: int) -> Table:
     note = (
         f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
         "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
-        "not found attacked; any class: and no box of any class above 0.25 covers a quarter of them. [a, b]: 95 % "
+        "not found attacked; any class: and no box of any class above 0.25 covers a quarter of them. "
+        f"{rate_note(floor_of(run.run))} [a, b]: 95 % "
         "interval over drives, of several draws of a control from the lowest to the highest end of theirs; a–b: the "
         "range over the draws, where drives are too few for intervals."
     )
@@ -192,6 +207,11 @@ def main_table(run: PhysicalRun, number: int) -> Table:
         note=note,
         source=SOURCE,
     )
+
+
+def floor_of(run: Run) -> float:
+    """Return the floor of a run; runs that do not say it have the default of the suite."""
+    return float(run.suite.get("floor", 0.9))
 
 
 def _place(suite: Mapping[str, Any]) -> str:
@@ -306,7 +326,8 @@ def others_table(run: PhysicalRun) -> Table:
         rows=VICTIM,
         columns={**OTHERS, "delta_e": "colour difference"},
         metric=metric,
-        note="Percent; the colour difference (CIE 1976) is the mean between a texture and the paint that it covers: 0 "
+        note=f"Percent. {rate_note(floor_of(run.run))} The colour difference (CIE 1976) is the mean between a texture "
+        "and the paint that it covers: 0 "
         "for the paint itself, 100 for white on black.",
     )
 
@@ -346,10 +367,10 @@ def grid_table(run: PhysicalRun) -> Table:
             "Trained against": lambda row: row[3][2] if row[3][2] != row[2] else "",
             "Worst cell": lambda row: f"{worst[0]:g} m, {worst[1]:g}°" if (worst := worst_cell(row)) else "",
         },
-        columns={"AP50": "AP50", "ASR_25": "ASR", "worst": "AP50 in the worst cell"},
+        columns={"AP50": "AP50", "ASR_25": "ASR", "n0_25": "n0", "worst": "AP50 in the worst cell"},
         metric=metric,
         note="Percent. The worst cell of distance and azimuth (0° is the front, 90° the left) is the one in which the "
-        "attack does least; of the clean pictures the one in which the detector does.",
+        f"attack does least; of the clean pictures the one in which the detector does. {rate_note(floor_of(run.run))}",
     )
 
 
@@ -525,7 +546,9 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
 
 def summary(stored_run: Run) -> Table:
     """Return the table for the terminal."""
-    return replace(main_table(PhysicalRun(stored_run), 0), note="percent, of the target alone")
+    return replace(
+        main_table(PhysicalRun(stored_run), 0), note=f"Percent, of the target alone. {rate_note(floor_of(found))}"
+    )
 
 
 def section(stored_run: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from ssad.experiments.perception.physical import page as physical
+from ssad.metrics.attack_success import N0
 from ssad.report.load import Run
 from ssad.report.records import Line, metric_of
 from ssad.report.verdict import lines_by
+
+RATE = "ASR_25"
 
 
 def verdict(run: Run) -> list[str]:
@@ -19,11 +23,13 @@ def verdict(run: Run) -> list[str]:
         ]
         attacks = [line for line in lines if not physical.is_control(line["attack"])]
         if not attacks:
+            sentences += _refusal(detector, detector_lines, physical.floor_of(run))
             continue
         strongest = max(attacks, key=_hidden)
         town_text = f" in {strongest['test']}" if len({line["test"] for line in lines}) > 1 else ""
         sentences.append(
-            f"{strongest['attack']} hides {_hidden(strongest):.0%} of the targets from {detector}{town_text}."
+            f"{strongest['attack']} hides {_hidden(strongest):.0%} of the {metric_of(strongest, N0[RATE]):.0f} targets "
+            f"that {detector} finds clean{town_text}."
         )
         controls = [
             line
@@ -38,4 +44,21 @@ def verdict(run: Run) -> list[str]:
 
 
 def _hidden(line: Line) -> float:
-    return metric_of(line, "ASR_25")
+    """Return the attack success rate; NaN in records without its n0."""
+    return metric_of(line, RATE) if N0[RATE] in line["metrics"] else math.nan
+
+
+def _refusal(detector: str, lines: Sequence[Line], floor: float) -> list[str]:
+    """Return the sentence about a detector that finds too few of the clean targets for a success rate."""
+    counts = [
+        (line["metrics"][N0[RATE]], line["n"])
+        for line in lines
+        if N0[RATE] in (line.get("metrics") or {}) and math.isnan(_hidden(line))
+    ]
+    if not counts:
+        return []
+    n0, count = max(counts)
+    return [
+        f"{detector} finds {n0} of {count} clean targets with a score above 0.25, less than {floor:.0%}: attacks on it "
+        "have no success rate."
+    ]

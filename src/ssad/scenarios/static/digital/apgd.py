@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -16,11 +17,16 @@ from ssad.scenarios.static.digital.victim import Victim
 
 INERTIA = 0.75  # weight of the new step; the rest repeats the last one
 PROGRESS = 0.75  # least share of steps that must raise the loss between two checkpoints
+MIN_STEPS = 50
+"""Steps from which on it is as strong as `PGD` with as many, as measured (docs/reference/attacks.md#steps-of-apgd)."""
 
 
 @dataclass(frozen=True, slots=True)
 class APGD:
     """Auto-PGD.
+
+    Its first steps are twice the radius, and each checkpoint at most halves them. With few steps they are still long
+    at the end, and `PGD` is stronger; it warns of fewer than `MIN_STEPS`.
 
     Attributes:
         steps: Gradient steps of each start, including the first gradient.
@@ -36,7 +42,7 @@ class APGD:
     Attacks (ICML 2020), algorithm 1; first step of twice the radius, checkpoints of its section 3.
     """
 
-    steps: int = 10
+    steps: int = MIN_STEPS
     start: Start = "uniform"
     restarts: int = 0
     name: str = "apgd"
@@ -45,6 +51,13 @@ class APGD:
     def __post_init__(self) -> None:
         if self.steps < 2 or self.restarts < 0:
             raise ConfigError("apgd: steps must be 2 or more, restarts 0 or more")
+        if self.steps < MIN_STEPS:
+            warnings.warn(
+                f"apgd: {self.steps} steps are too few for its long first steps, so pgd with as many is stronger; take "
+                f"{MIN_STEPS} or more, or pgd",
+                UserWarning,
+                stacklevel=1,  # one place, so that Python shows it once
+            )
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
         """Run the ascent from every start and keep the best images."""
@@ -86,8 +99,8 @@ class APGD:
                 restart = stalled | unchanged
                 previous_step, previous_best = step_length.clone(), best_loss.clone()
                 step_length = torch.where(restart, step_length / 2, step_length)
+                # The previous images stay, as in the source: the next step still has momentum.
                 images = torch.where(_per_image(restart), best_images, images)
-                previous_images = torch.where(_per_image(restart), best_images, previous_images)
                 gradient = torch.where(_per_image(restart), best_gradient, gradient)
                 loss = torch.where(restart, best_loss, loss)
                 rise_count = torch.zeros_like(rise_count)

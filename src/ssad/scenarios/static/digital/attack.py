@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import torch
@@ -69,6 +69,13 @@ class AttackResult:
     cost: Cost
     gradient_error: float | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
+
+    def rows(self, indices: Sequence[int]) -> AttackResult:
+        """Return the result of some images of the batch."""
+        rows = list(indices)
+        return replace(
+            self, images=self.images[rows], before=self.before[rows], after=self.after[rows], idle=self.idle[rows]
+        )
 
 
 def run_attack(

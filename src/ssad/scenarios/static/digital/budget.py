@@ -13,6 +13,8 @@ from ssad.core.errors import ConfigError
 Norm = Literal["linf", "l2"]
 LEVELS = 255
 _GRID = 1e-3  # tolerance, in code values, of clean images against whole codes
+_WHOLE_BUDGET = 0.999  # share of the radius from which on a change counts as one of the whole radius
+_MAX_ROUNDS = 100  # of a search that ends by itself after a few: each round stops further values at 0 or 1
 
 
 def px(value: float) -> float:
@@ -50,16 +52,33 @@ class Budget:
             raise ConfigError(f"budget: norm '{self.norm}'; choose linf or l2")
 
     def project(self, images: Tensor, clean: Tensor) -> Tensor:
-        """Project images onto the ball and [0, 1]: exact under L-infinity; under L2 the ball, then the range.
+        """Return the nearest images that lie in the ball and in [0, 1].
+
+        Under L2, the nearest image scales the change and then clips it. Values that stop at 0 or 1 leave room in the
+        ball, which goes to the others: an image from outside the ball lands on its border.
 
         Args:
             images: [B, 3, H, W].
             clean: [B, 3, H, W], in [0, 1].
 
         Returns:
-            [B, 3, H, W]. Clipping to [0, 1] never moves values away from the clean ones, so both constraints hold.
+            [B, 3, H, W].
         """
         return self.around(clean, images - clean)
+
+    def to_border(self, clean: Tensor, direction: Tensor) -> Tensor:
+        """Return images that move from the clean ones along a direction as far as the ball and [0, 1] allow.
+
+        Args:
+            clean: [B, 3, H, W], in [0, 1].
+            direction: [B, 3, H, W], of any length; only its sign counts under L-infinity.
+
+        Returns:
+            [B, 3, H, W]. Under L2 their change has the length `radius`, unless every value that moves stops at 0 or 1.
+        """
+        if self.norm == "linf":
+            return self.around(clean, direction.sign().mul_(self.radius))
+        return (direction * self._scale(clean, direction, limit=1e12)).add_(clean).clamp_(0.0, 1.0)
 
     def around(self, clean: Tensor, change: Tensor) -> Tensor:
         """Return the images of `project`, given their change.
@@ -68,7 +87,30 @@ class Budget:
             clean: [B, 3, H, W], in [0, 1].
             change: [B, 3, H, W]; its memory is used up for the result.
         """
-        return self.within(change).add_(clean).clamp_(0.0, 1.0)
+        if self.norm == "linf":
+            return self.within(change).add_(clean).clamp_(0.0, 1.0)
+        return change.mul_(self._scale(clean, change, limit=1.0)).add_(clean).clamp_(0.0, 1.0)
+
+    def _scale(self, clean: Tensor, change: Tensor, *, limit: float) -> Tensor:
+        """Return the factors [B, 1, 1, 1], at most `limit`, by which changes have length `radius` after clipping.
+
+        Clipping bounds value i by its room b_i, so the length of s * change is the root of the sum of
+        min(s |change_i|, b_i)^2. With the values that stop at a given s held at their rooms, the equation has a
+        closed solution, which is never too large; each round stops further values until none is added.
+        """
+        scale = (self.radius / lengths(change).clamp_min(1e-30)).clamp_max(limit)
+        if bool((scale >= limit).all()):
+            return scale
+        size, room = change.abs(), torch.where(change > 0, 1.0 - clean, clean)
+        for _ in range(_MAX_ROUNDS):
+            stopped = size * scale > room
+            squared_rest = self.radius**2 - lengths(torch.where(stopped, room, 0.0)) ** 2
+            free_length = lengths(torch.where(stopped, 0.0, size))
+            larger = (squared_rest.clamp_min(0.0).sqrt() / free_length.clamp_min(1e-30)).clamp_max(limit)
+            if not bool((larger > scale * (1 + 1e-6)).any()):
+                break
+            scale = torch.maximum(scale, larger)
+        return scale
 
     def within(self, change: Tensor) -> Tensor:
         """Project a change onto the ball, in place, since images are large.
@@ -154,7 +196,10 @@ def quantise(images: Tensor, clean: Tensor, budget: Budget) -> Tensor:
     """Round attacked images to code values that keep the budget exactly.
 
     Under L-infinity each value is rounded to the nearest allowed one. Under L2 all values are rounded towards the
-    clean image; then those with the largest rounding error are rounded the other way while the budget lasts.
+    clean image, and what this leaves of the budget is spent on rounding values up: those first that keep most of the
+    direction of the change for the length that they cost. Values beyond one half are rounded up while the budget
+    lasts; the others until the stored change is as long as that of `images`. A change that is shorter than the budget
+    (such as the smallest one that empties an image) stays as short.
 
     Args:
         images: [B, 3, H, W], result of the attack.
@@ -168,32 +213,48 @@ def quantise(images: Tensor, clean: Tensor, budget: Budget) -> Tensor:
         max_change = int(budget.radius * LEVELS + 1e-6)
         image_change = (images.detach() * LEVELS).round_().sub_(clean).clamp_(-max_change, max_change)
         return image_change.add_(clean).clamp_(0, LEVELS).to(torch.uint8)
-    # Contiguous, because the helpers change flat views of it in place.
     exact_change = ((images.detach().double() * LEVELS).clamp_(0, LEVELS) - clean).contiguous()
+    limit = budget.radius * LEVELS
+    length = lengths(exact_change)
+    exact_change *= (limit / length.clamp_min(1e-30)).clamp_max(1.0)
     rounded_change = exact_change.trunc()
-    squared_limit = (budget.radius * LEVELS) ** 2 * (1 + 1e-12)
-    for image_change, image_exact in zip(rounded_change, exact_change, strict=True):
-        _shrink(image_change, squared_limit)
-        _round_up(image_change, image_exact, squared_limit)
+    is_whole = length >= _WHOLE_BUDGET * limit
+    target = torch.where(is_whole, limit, length).flatten().tolist()
+    # Contiguous, because `_round_up` changes flat views of it in place.
+    for image_change, image_exact, image_target in zip(rounded_change, exact_change, target, strict=True):
+        _round_up(image_change.view(-1), image_exact.view(-1), limit**2, image_target**2)
     return (clean + rounded_change).to(torch.uint8)
 
 
-def _shrink(change: Tensor, room: float) -> None:
-    """Take whole steps back, largest first, from a change that is too long by its float's last digits."""
-    while float((change**2).sum()) > room:
-        values = change.view(-1)
-        largest = values.abs().argmax()
-        values[largest] -= values[largest].sign()
+def _round_up(change: Tensor, exact: Tensor, limit: float, target: float) -> None:
+    """Move values of an integer change one step up to `exact`, within limits of its squared length, in place.
 
+    A step of a value c with remainder r lengthens the squared change by 2 c + 1, and its product with the exact
+    change by c + r. The order by their quotient, that is by (2 r - 1) / (2 c + 1), keeps the direction best.
 
-def _round_up(change: Tensor, full: Tensor, room: float) -> None:
-    """Move values of an integer change one step towards `full`, those first that lack most, while there is room."""
-    remainder = (full - change).view(-1)
-    order = remainder.abs().argsort(descending=True, stable=True)
-    order = order[remainder[order].abs() > 0.5]
-    values = change.view(-1)
-    # (|c| + 1)^2 - c^2: growth of the squared length by one step.
-    squared_cost = 2 * values[order].abs() + 1
-    affordable = int((squared_cost.cumsum(0) + (values**2).sum() <= room).sum())
-    selected = order[:affordable]
-    values[selected] += remainder[selected].sign()
+    Args:
+        change: [N] float64 integers, `exact` rounded towards 0.
+        exact: [N] float64.
+        limit: Limit while remainders above one half are rounded up.
+        target: Limit for all others.
+    """
+    remainder = (exact - change).abs()
+    squared_cost = 2 * change.abs() + 1
+    gain = (2 * remainder - 1) / squared_cost
+    candidates = remainder.nonzero().flatten()
+    candidates = candidates[gain[candidates].argsort(descending=True, stable=True)]
+    is_nearer = gain[candidates] > 0
+    steps = exact.sign()
+    squared_length = float((change**2).sum())
+    for group, squared_limit in ((candidates[is_nearer], limit), (candidates[~is_nearer], target)):
+        # The tolerance covers radii whose float is smaller than the length in whole code values.
+        room = squared_limit * (1 + 1e-12) - squared_length
+        affordable = group[squared_cost[group] <= room]
+        while len(affordable):
+            costs = squared_cost[affordable].cumsum(0)
+            count = int((costs <= room).sum())
+            change[affordable[:count]] += steps[affordable[:count]]
+            spent = float(costs[count - 1])
+            room, squared_length = room - spent, squared_length + spent
+            affordable = affordable[count:]
+            affordable = affordable[squared_cost[affordable] <= room]

@@ -13,7 +13,7 @@ from ssad.scenarios.static.digital.victim import Victim
 
 @dataclass(frozen=True, slots=True)
 class FGSM:
-    """Single step of the length of the budget along the steepest direction.
+    """Single step of the length of the budget along the steepest direction, in which values stop at 0 and 1.
 
     Source: Goodfellow et al., Explaining and Harnessing Adversarial Examples (ICLR 2015).
     """
@@ -24,4 +24,4 @@ class FGSM:
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
         """Take one step from the clean images."""
         _, gradient = victim.gradient(victim.clean)
-        return budget.ascend(victim.clean, gradient, victim.clean, budget.radius)
+        return budget.to_border(victim.clean, gradient)

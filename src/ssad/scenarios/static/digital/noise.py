@@ -17,7 +17,7 @@ class RandomNoise:
     """Random noise as large as the budget allows, without queries.
 
     Under L-infinity each value moves up or down by the radius; under L2 the image moves by the radius in a random
-    direction.
+    direction, in which values stop at 0 and 1.
     """
 
     name: str = "noise"
@@ -26,5 +26,4 @@ class RandomNoise:
     def perturb(self, victim: Victim | CleanImages, budget: Budget) -> Tensor:
         """Add random noise of the size of the budget."""
         draws = victim.draw("gaussian", "noise")
-        change = draws.sign() if budget.norm == "linf" else budget.steepest(draws)
-        return budget.project(victim.clean + budget.radius * torch.where(change == 0, 1.0, change), victim.clean)
+        return budget.to_border(victim.clean, torch.where(draws == 0, 1.0, draws))

@@ -31,11 +31,14 @@ class DigitalAttack(Perturbation):
         spec: The attack, its loss, its budget and its aim.
         name: Name in tables and slices.
         severity: Severity that set the radius; 1 if the radius was given.
+        reference_images: Number of images of a recorded scene on which the attack is compared with the reference
+            ensemble.
     """
 
     spec: AttackSpec
     name: str = ""
     severity: int = 1
+    reference_images: int = 0
     family: str = field(default="digital", init=False)
 
     def __post_init__(self) -> None:
@@ -73,7 +76,7 @@ class DigitalAttack(Perturbation):
                 f"{self.spec.name}{f'@{file_name(victim.name)}' if victim.name else ''}/{scene.data.record.name}"
             )
             saved_images = SavedImages(scene.folder / FOLDER / scene_folder)
-        attacker = SceneAttacker(self.spec, scene, victim, victim.name, saved_images)
+        attacker = SceneAttacker(self.spec, scene, victim, victim.name, saved_images, self.reference_images)
         return PerturbedScene(
             attacker.look,
             attacker.tally.notes,

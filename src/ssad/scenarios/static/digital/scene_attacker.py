@@ -22,12 +22,13 @@ from ssad.core.types import U8
 from ssad.datasets.nuscenes.camera_truth import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
-from ssad.scenarios.static.digital import Attack, Budget, make_objective, px, run_attack
+from ssad.scenarios.static.digital import Attack, AttackResult, Budget, make_objective, px, run_attack
 from ssad.scenarios.static.digital.budget import LEVELS
 from ssad.scenarios.static.digital.chosen_object import chosen_first
 from ssad.scenarios.static.digital.defences import RandomResize
 from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
+from ssad.scenarios.static.digital.reference_ensemble import compare_with_references, is_judged
 from ssad.scenarios.static.digital.saved_images import SavedImages
 from ssad.scenarios.static.digital.spec import AttackSpec
 from ssad.scenarios.static.digital.tally import AttackTally
@@ -52,6 +53,8 @@ class SceneAttacker:
         watched: The attacked system; it stores its own errors.
         source: Name of the attacked system; "": images for a sheet, whose attack was checked elsewhere.
         saved: Storage of images until the scene is finished; None: no storage.
+        reference_images: Number of images of the scene on which the attack is compared with the reference ensemble,
+            spread evenly over those with objects under attack.
         attack: The attack with its settings.
         tally: Cost of the attack.
         batch: Images at once; it shrinks if memory does not suffice.
@@ -62,17 +65,24 @@ class SceneAttacker:
     watched: SceneVictim
     source: str = ""
     saved: SavedImages | None = None
+    reference_images: int = 0
     attack: Attack = field(init=False)
     tally: AttackTally = field(init=False)
     batch: int = field(init=False)
+    _reference_tokens: frozenset[str] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self.attack = self.spec.make()
-        defence = getattr(self.watched.detector, "defence", None)
-        if self.spec.draws and isinstance(defence, RandomResize):
-            self.attack = Expected(self.attack, defence, self.spec.draws)
+        self.attack = self._with_draws(self.attack)
         self.tally = AttackTally(self.attack.access)
         self.batch = 1 if self.recorded.device == "cpu" else self.recorded.batch
+
+    def _with_draws(self, attack: Attack) -> Attack:
+        """Return the attack, made to know the random defence of the detector if the spec says so."""
+        defence = getattr(self.watched.detector, "defence", None)
+        if self.spec.draws and isinstance(defence, RandomResize):
+            return Expected(attack, defence, self.spec.draws)
+        return attack
 
     def look(self, frames: Sequence[SensorFrame]) -> list[U8]:
         """Return the attacked images of camera frames; the clean ones once the detector has failed.
@@ -169,6 +179,9 @@ class SceneAttacker:
         )
         batch_tally = AttackTally(self.attack.access)
         batch_tally.add(attacked, active_images, budget)
+        batch_tally.references = self._compare(
+            [frames[row] for row in active], attacked, active_images, intrinsics[active]
+        )
         self.tally.absorb(batch_tally.notes())
         code_values = (attacked.images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
         for row, attacked_image in zip(active, code_values, strict=True):
@@ -176,6 +189,54 @@ class SceneAttacker:
         if saved_images:
             saved_images.write(frames[0].token, result_images[0], batch_tally.notes())
         return result_images
+
+    def _compare(
+        self, frames: Sequence[SensorFrame], attacked: AttackResult, images: Tensor, intrinsics: Tensor
+    ) -> list[dict[str, Any]]:
+        """Compare the attack with the reference ensemble on those of its images that were chosen for it."""
+        rows = [row for row, frame in enumerate(frames) if frame.token in self._tokens_to_compare()]
+        if not rows or not is_judged(self.spec.make()):
+            return []
+        spec, recording = self.spec, self.recorded
+        gradients = max(attacked.cost.gradients, spec.steps * max(spec.draws, 1)) // max(spec.draws, 1)
+        comparisons = compare_with_references(
+            attacked.rows(rows),
+            self.watched.detector,
+            images[rows],
+            [self._truth(frames[row]) for row in rows],
+            Budget(px(spec.radius), spec.norm),
+            objective=spec.loss,
+            keys=[(recording.seed, frames[row].token) for row in rows],
+            intrinsic=intrinsics[rows],
+            aim=spec.aim,
+            precision=spec.precision,
+            gradients=gradients,
+            with_draws=self._with_draws,
+            cache_key=(
+                str(recording.root),
+                recording.version,
+                recording.inputs,
+                recording.device,
+                self.source,
+                spec.classes,
+                spec.becomes,
+                spec.object,
+                spec.draws,
+            ),
+        )
+        return [
+            {"token": frames[row].token, "attack": spec.name, **comparison}
+            for row, comparison in zip(rows, comparisons, strict=True)
+        ]
+
+    def _tokens_to_compare(self) -> frozenset[str]:
+        """Return the tokens of the images on which the attack is compared with the reference ensemble."""
+        if self._reference_tokens is None:
+            frames = _key_frames(self.recorded.data) if self.reference_images else []
+            candidates = [frame for frame in frames if len(self._truth(frame).label)]
+            chosen = _spread_evenly(candidates, self.reference_images) if candidates else []
+            self._reference_tokens = frozenset(frame.token for frame in chosen)
+        return self._reference_tokens
 
     def _tensors(self, frames: Sequence[SensorFrame], images: Sequence[U8]) -> tuple[Tensor, Tensor]:
         """Return images [B, 3, H, W] and intrinsics [B, 3, 3] on the device."""

@@ -64,10 +64,7 @@ class Square:
                 for image_values, image_generator in zip(clean, generators, strict=True)
             ]
         )
-        change = budget.radius * (
-            initial_changes if budget.norm == "linf" else initial_changes / lengths(initial_changes)
-        )
-        images = budget.project(clean + change, clean)
+        images = budget.to_border(clean, initial_changes)
         best = images, victim.loss(images).float()
         proposal_count = self.queries - 2
         for proposal in range(proposal_count):
@@ -77,7 +74,8 @@ class Square:
             change = best[0] - clean
             for image_values, image_generator in zip(change, generators, strict=True):
                 propose(image_values, square_side, budget.radius, image_generator)
-            images = budget.project(clean + change, clean)
+            # A moved mass has the length of the radius before values stop at 0 and 1.
+            images = budget.around(clean, change) if budget.norm == "linf" else budget.to_border(clean, change)
             best = keep_best(best, images, victim.loss(images).float())
         # The clean image counts too: an image that no square makes worse is returned as it is.
         return keep_best((clean, victim.loss(clean).float()), *best)[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor
@@ -28,6 +28,8 @@ class AttackTally:
         gradient_error: of the gradient against finite differences; None: not checked.
         halved: how often a batch was halved for lack of memory.
         coupling: relative change of an image's loss when another one is in its batch; None: not checked.
+        references: comparisons with the reference ensemble, one for each image that was chosen for it (see
+            `ssad.scenarios.static.digital.reference_ensemble`).
         access: of the attack.
     """
 
@@ -44,6 +46,7 @@ class AttackTally:
     halved: int = 0
     gradient_error: float | None = None
     coupling: float | None = None
+    references: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, result: AttackResult, clean: Tensor, budget: Budget) -> None:
         """Count a batch of attacked images."""
@@ -68,6 +71,7 @@ class AttackTally:
         """Count the images of another tally; the checks of gradient and batch stay its own."""
         for name in ("images", "idle", "gradients", "queries", "before", "after", "used", "halved"):
             setattr(self, name, getattr(self, name) + notes[name])
+        self.references += notes.get("references", ())  # absent from images of an older version
         self.change = max(self.change, notes["change"])
         self.batch = min(self.batch or notes["batch"], notes["batch"])
 
@@ -85,7 +89,7 @@ def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Returns:
         access; images and idle; gradients, queries and mean losses before and after, per image; used, the mean
         share of the budget; change_px, the largest change; batch; halved; gradient_error and coupling, the
-        largest, None if not checked.
+        largest, None if not checked; references, the comparisons with the reference ensemble.
     """
     active_notes = [note for note in notes if note["images"]]
     images = sum(note["images"] for note in active_notes)
@@ -114,6 +118,11 @@ def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "halved": sum(note["halved"] for note in active_notes),
         "gradient_error": largest("gradient_error"),
         "coupling": largest("coupling"),
+        # In the order of tokens: that of the scenes may differ between runs.
+        "references": sorted(
+            (comparison for note in notes for comparison in note.get("references", ())),
+            key=lambda comparison: (comparison["attack"], comparison["token"]),
+        ),
     }
 
 
@@ -135,6 +144,7 @@ def sum_members(notes_by_member: Sequence[Sequence[Mapping[str, Any]]]) -> dict[
             total[name] = max(
                 (member_sum[name] for member_sum in member_sums if member_sum[name] is not None), default=None
             )
+        total["references"] = [comparison for member_sum in member_sums for comparison in member_sum["references"]]
         total |= dict.fromkeys(("loss_before", "loss_after", "used"))
         total["idle"] = min(member_sum["idle"] for member_sum in member_sums)
     return total

@@ -57,9 +57,11 @@ def shift_points(
         return _add_noise(cloud, spec, draws)
     if spec.family == "object":
         return _move_objects(cloud, frame, spec, draws)
+    if spec.name == "sunlight" and spec.calibration == "paper":
+        return _add_paper_sun_noise(cloud, spec, draws)
     if spec.name == "sunlight":
         context = (contexts or {}).get(frame.scene, SceneContext(frame.scene))
-        if spec.calibration == "physical" and context.light < NIGHT:
+        if context.light < NIGHT:
             return cloud, ShiftReport(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1})
         return _add_sun_noise(cloud, frame, spec, context, draws)
     if spec.name == "fog":
@@ -170,6 +172,13 @@ def _add_sun_noise(
     return cloud[is_returned], ShiftReport(
         True, {"lost": int((~is_returned).sum()), "noisy": int((is_noisy & is_returned).sum())}
     )
+
+
+def _add_paper_sun_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+    """Add the published noise of 2 m to each coordinate of the published share of points; no sun is in the world."""
+    struck_indices = draws.permutation(len(cloud))[: int(len(cloud) * table.LIDAR_SUN[spec.severity - 1])]
+    cloud[struck_indices, :3] += draws.normal(0, 2.0, (len(struck_indices), 3)).astype(np.float32)
+    return cloud, Applied(len(struck_indices) > 0, {"lost": 0, "noisy": len(struck_indices)})
 
 
 def fog_response(beta: float) -> tuple[F64, F64, F64]:

@@ -97,6 +97,8 @@ LIDAR_IMPULSE: Final[Five] = (1 / 30, 1 / 25, 1 / 20, 1 / 15, 1 / 10)
 # sun: share of points whose range is noise of 2 m [3DC], half angle around the sun without returns, degrees
 LIDAR_SUN: Final[Five] = (0.01, 0.02, 0.03, 0.04, 0.05)
 LIDAR_SUN_CONE: Final[Five] = (2.0, 3.0, 4.0, 5.0, 6.0)
+# rain and snow in the paper's LiDAR, mm/h [3DC, after LISA: Kilic et al. 2021]
+PAPER_LIDAR_RATE: Final[Five] = (0.20, 0.73, 1.5625, 3.125, 7.29)
 # objects in the paper's LiDAR: share along one axis, degrees +-1 [3DC]
 PAPER_LIDAR_SCALE: Final[Five] = (0.04, 0.08, 0.12, 0.16, 0.20)
 PAPER_LIDAR_ROTATION: Final[Five] = (1.0, 3.0, 5.0, 7.0, 9.0)

@@ -42,6 +42,8 @@ CAMERA_ONLY: Final = ("overexposure",)  # no LiDAR twin
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
 VERSIONS: Final[dict[Calibration, int]] = {"physical": 3, "paper": 3}
+# the same of LiDAR points alone; random numbers do not depend on it
+LIDAR_VERSIONS: Final[dict[Calibration, int]] = {"physical": 1, "paper": 2}
 
 
 @dataclass(frozen=True, slots=True)

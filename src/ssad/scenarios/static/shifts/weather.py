@@ -57,16 +57,20 @@ def _scene_times(frames: Sequence[Frame], contexts: Sequence[SceneContext]) -> l
 
 
 def extinction(spec: ShiftSpec) -> float:
-    """Return the extinction of light by the weather, 1/m; the LiDAR twin uses the same."""
+    """Return the extinction of light by the weather, 1/m; the LiDAR twin uses the same.
+
+    In the paper's calibration, rain and snow have the published rates of its LiDAR; its cameras have no extinction.
+    """
     if spec.severity == 0:
         return 0.0
     level = spec.severity - 1
     if spec.name == "fog":
         # Contrast of 5 % at the meteorological optical range: ln(20) is about 3.
         return 3.0 / table.FOG_RANGE[level]
+    is_paper = spec.calibration == "paper"
     if spec.name == "rain":
-        return table.rain_extinction(table.RAIN_RATE[level])
-    return table.snow_extinction(table.SNOW_RATE[level])
+        return table.rain_extinction((table.PAPER_LIDAR_RATE if is_paper else table.RAIN_RATE)[level])
+    return table.snow_extinction((table.PAPER_LIDAR_RATE if is_paper else table.SNOW_RATE)[level])
 
 
 def _view_through_air(
