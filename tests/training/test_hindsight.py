@@ -80,7 +80,7 @@ def test_what_the_driver_of_regulation_157_avoids(own: np.ndarray, other: np.nda
 def test_the_human_stays_behind_a_slower_car_it_has_braked_for(lead: float) -> None:
     memory, state = played(moves(60.0, speed=8.0), moves(60.0 + LONG, speed=lead))
     memory.model = careful_model("cc")
-    assert memory.avoided(state, BOTH).tolist() == [True]
+    assert memory.is_avoidable(state, BOTH).tolist() == [True]
 
 
 @pytest.mark.parametrize(("bend", "avoided"), [(None, False), (54.0, True), (85.0, False), (15.0, False)])

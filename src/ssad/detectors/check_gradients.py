@@ -178,7 +178,7 @@ def check_ripples(trial: CheckCase) -> None:
         ratios.append(2 * weakest_step * slope * shares[weakest_step] / max(mean_rise, 1e-30))
         if ratios[-1] > MAX_RIPPLE_RATIO:
             return
-    trial.need(
+    trial.expect(
         False,
         f"steps of up to 2/255 along the gradient of {name} raise it at least half as much as those along the mean "
         f"gradient of nearby images (gradient masking by rippling: {max(ratios):.2g} times as much)",

@@ -169,7 +169,7 @@ def test_equal_runs_have_the_same_hash_and_are_equal_however_long_they_take(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usual = {name: np.zeros(20) for name in FEATURES}
-    monkeypatch.setattr("ssad.experiments.adversarial.kind.reference", lambda folder, device: usual)
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.load_reference_motions", lambda folder, device: usual)
     settings = ["generators=halton", "budget=8", "grade=false", "scenarios=UnprotectedLeftTurn/00", "systems=autopilot"]
     plan = Adversarial().plan(load_suite("adversarial-quick", settings), check=False)
     folders, hashes, tables = [tmp_path / "fast", tmp_path / "slow"], [], []

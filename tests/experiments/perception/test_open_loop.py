@@ -159,10 +159,10 @@ def test_a_rate_is_held_to_the_floor_of_the_suite_at_its_own_score(
     def sightings(detector: Any, given: Any) -> Iterator[TargetSighting]:
         yield from (seen(0.9), seen(0.1))
 
-    monkeypatch.setattr(LightableClips, "clean", lambda self: iter([]))
-    monkeypatch.setattr(open_loop, "loaded_detector", lambda *given, **options: None)
+    monkeypatch.setattr(RelightableTargetImages, "clean", lambda self: iter([]))
+    monkeypatch.setattr(open_loop, "cached_detector", lambda *given, **options: None)
     monkeypatch.setattr(open_loop, "sightings", sightings)
-    images = LightableClips(tmp_path, 2)
+    images = RelightableTargetImages(tmp_path, 2)
     monkeypatch.setattr(Perception, "scenes", lambda self, cell, job: ())
     monkeypatch.setattr(Perception, "target", lambda *given: TargetCondition(images, Shown(), "sedan"))
     settings = {"detectors": {}, "replicates": 0, "seed": 0, "floor": floor}

@@ -547,7 +547,7 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
 def summary(stored_run: Run) -> Table:
     """Return the table for the terminal."""
     return replace(
-        main_table(PhysicalRun(stored_run), 0), note=f"Percent, of the target alone. {rate_note(floor_of(found))}"
+        main_table(PhysicalRun(stored_run), 0), note=f"Percent, of the target alone. {rate_note(floor_of(stored_run))}"
     )
 
 

@@ -174,11 +174,11 @@ def _add_sun_noise(
     )
 
 
-def _add_paper_sun_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, Applied]:
+def _add_paper_sun_noise(cloud: F32, spec: ShiftSpec, draws: np.random.Generator) -> tuple[F32, ShiftReport]:
     """Add the published noise of 2 m to each coordinate of the published share of points; no sun is in the world."""
     struck_indices = draws.permutation(len(cloud))[: int(len(cloud) * table.LIDAR_SUN[spec.severity - 1])]
     cloud[struck_indices, :3] += draws.normal(0, 2.0, (len(struck_indices), 3)).astype(np.float32)
-    return cloud, Applied(len(struck_indices) > 0, {"lost": 0, "noisy": len(struck_indices)})
+    return cloud, ShiftReport(len(struck_indices) > 0, {"lost": 0, "noisy": len(struck_indices)})
 
 
 def fog_response(beta: float) -> tuple[F64, F64, F64]:
