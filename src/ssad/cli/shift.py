@@ -76,17 +76,17 @@ def shift_folder(
         version: Version of the dataset; None: the only one.
         split: Split whose scenes are written; None: no split.
         scenes: Names of the scenes.
-        workers: See `materialise`.
-        ray: See `materialise`.
+        workers: See `write_shifted_roots`.
+        ray: See `write_shifted_roots`.
         settings: Further fields of `Options`.
 
     Returns:
         The exit code.
 
     Raises:
-        ConfigError: See `materialise`.
-        FormatError: See `materialise`.
-        StoreError: See `materialise`.
+        ConfigError: See `write_shifted_roots`.
+        FormatError: See `write_shifted_roots`.
+        StoreError: See `write_shifted_roots`.
     """
     with NuScenes(source, version) as data:
         scene_names = tuple(scenes) or (tuple(scenes_of_split(source, data.version, split)) if split else ())

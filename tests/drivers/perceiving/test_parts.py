@@ -100,7 +100,9 @@ def test_boxes_are_believed_where_they_are_from_each_ego() -> None:
 
 def test_the_covariance_and_the_velocity_of_boxes_turn_with_the_ego() -> None:
     told: list[Any] = []
-    given = replace(boxes((10.0, 0.0)), spread=np.array([[[4.0, 0.0], [0.0, 1.0]]]), velocity=np.array([[3.0, 0.0]]))
+    given = replace(
+        boxes((10.0, 0.0)), covariance=np.array([[[4.0, 0.0], [0.0, 1.0]]]), velocity=np.array([[3.0, 0.0]])
+    )
     driver = driver_of(lambda view, rows: [given], watch=told.append)
     driver.believe(view_at(0.0, (0.0, 0.0, np.pi / 2)))
     found = next(event.objects for event in told if isinstance(event, PerceptionEvent))

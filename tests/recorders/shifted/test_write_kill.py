@@ -22,10 +22,10 @@ SHIFTS = ("snow", "scale")
 DRIVER = """
 import sys
 from pathlib import Path
-from ssad.recorders.shifted import Options, materialise
+from ssad.recorders.shifted import Options, write_shifted_roots
 if __name__ == "__main__":
     options = Options(Path(sys.argv[1]), Path(sys.argv[2]), "v1.0-mini", ("snow", "scale"), ("random",))
-    materialise(options, workers=int(sys.argv[3]), progress=lambda done, of: print(done, of, flush=True))
+    write_shifted_roots(options, workers=int(sys.argv[3]), progress=lambda done, of: print(done, of, flush=True))
 """
 
 

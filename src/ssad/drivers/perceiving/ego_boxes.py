@@ -56,10 +56,18 @@ def check_boxes(boxes: EgoBoxes, classes: Sequence[str], perceiver: str) -> None
         ConfigError: A column has a wrong shape, a value that is not finite or out of range; the message names it.
     """
     count = np.size(boxes.score)
-    shapes = {"centre": (3,), "size_lwh": (3,), "yaw": (), "velocity": (2,), "label": (), "score": (), "spread": (2, 2)}
+    shapes = {
+        "centre": (3,),
+        "size_lwh": (3,),
+        "yaw": (),
+        "velocity": (2,),
+        "label": (),
+        "score": (),
+        "covariance": (2, 2),
+    }
     for name, shape in shapes.items():
         value = getattr(boxes, name)
-        if value is None and name == "spread":
+        if value is None and name == "covariance":
             continue
         if np.shape(value) != (count, *shape):
             raise ConfigError(f"perceiver {perceiver}: {name} has shape {np.shape(value)}; expected {(count, *shape)}")
