@@ -122,7 +122,7 @@ def between_lanes(graph: LaneGraph, place: Mapping[str, float]) -> bool:
     """
     side = 0.5 * np.array([-math.sin(place["yaw"]), math.cos(place["yaw"])])
     here = np.array([place["x"], place["y"]])
-    return bool(LaneQuery(graph).nearest([here + side, here - side]).inside.all())
+    return bool(LaneQuery(graph).nearest([here + side, here - side]).is_inside.all())
 
 
 def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, device: str = "cpu") -> dict[str, Any]:

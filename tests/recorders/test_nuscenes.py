@@ -156,7 +156,7 @@ def test_a_cast_has_every_class_and_nobody_stands_in_another() -> None:
         kinds.update(body.kind for body in cast.bodies)
         now = cast.at(3.0, np.array([trace.x[30, 0], trace.y[30, 0]]), 80.0)
         assert len(now) > 8
-        still = [s for s in now if s.body.parked and s.body.kind != "bicycle"]
+        still = [s for s in now if s.body.is_parked and s.body.kind != "bicycle"]
         boxes = [(*s.pose[:2, 3], np.arctan2(s.pose[1, 0], s.pose[0, 0]), *s.body.size[:2]) for s in still]
         for i in range(1, len(boxes)):
             assert (obb_distance(boxes[i : i + 1] * i, boxes[:i]) > 0).all(), "parked vehicles keep apart"
@@ -270,7 +270,7 @@ def test_long_vehicles_stand_at_the_kerb() -> None:
         trace = drive_with_autopilot(make_drive(graph, key=("long", number), seconds=1.0), graph)
         with plain_bodies():
             cast = place_objects(trace, graph, cached_street(graph), key=("long", number))
-        parked = [body for body in cast.bodies if body.parked]
+        parked = [body for body in cast.bodies if body.is_parked]
         found.update(body.kind for body in parked)
         wide = [body for body in parked if body.kind not in RACK]
         for body in wide:

@@ -353,9 +353,9 @@ def test_a_prefix_that_freezes_nothing_is_one_line(tmp_path: Path) -> None:
 
 
 def test_other_data_or_first_weights_in_the_same_folder_are_one_line(tmp_path: Path) -> None:
-    train(fresh(), bank(), RECIPE, out=tmp_path, about="a")
+    train(fresh(), bank(), RECIPE, out=tmp_path, metadata="a")
     with pytest.raises(FormatError, match="of other data, other first weights"):
-        train(fresh(), bank(), RECIPE, out=tmp_path, about="b")
+        train(fresh(), bank(), RECIPE, out=tmp_path, metadata="b")
 
 
 def test_pictures_are_read_in_order_and_must_be_of_one_size() -> None:

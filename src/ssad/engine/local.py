@@ -179,9 +179,9 @@ class LocalProcesses:
         self._workers: list[Worker] = []
         self._waiting: list[Task] = []
         self._failed_outcomes: list[TaskOutcome] = []
-        self._started = 0
-        self._looked = time.monotonic()
-        self._plenty = (0, time.monotonic())  # total memory, and the last time at which enough was free
+        self._started_count = 0
+        self._last_check_time = time.monotonic()
+        self._last_ample_memory = (0, time.monotonic())  # total memory, and the last time at which enough was free
 
     @property
     def busy(self) -> int:
@@ -216,8 +216,8 @@ class LocalProcesses:
         for worker in [candidate for candidate in self._workers if current_time > candidate.deadline]:
             outcomes.append(worker.time_out())
             self._remove(worker)
-        if current_time - self._looked > LOOK_S:
-            self._looked = current_time
+        if current_time - self._last_check_time > LOOK_S:
+            self._last_check_time = current_time
             outcomes += self._guard_memory()
         self._assign_tasks()
         return outcomes
@@ -236,9 +236,9 @@ class LocalProcesses:
             thread_count = os.environ.get("OMP_NUM_THREADS", str(self._threads))  # PyTorch asks MKL before OpenMP
             environment = {name: os.environ.get(name, thread_count) for name in THREADS}
             if self._gpus:
-                environment["CUDA_VISIBLE_DEVICES"] = self._gpus[self._started % len(self._gpus)]
+                environment["CUDA_VISIBLE_DEVICES"] = self._gpus[self._started_count % len(self._gpus)]
             self._workers.append(Worker(self._start, environment))
-            self._started += 1
+            self._started_count += 1
             idle += 1
 
     def _guard_memory(self) -> list[TaskOutcome]:
@@ -251,13 +251,13 @@ class LocalProcesses:
         total_memory, free_memory = available_memory()
         current_time = time.monotonic()
         if (
-            free_memory >= SCARCE * total_memory or total_memory != self._plenty[0]
+            free_memory >= SCARCE * total_memory or total_memory != self._last_ample_memory[0]
         ):  # a virtual machine may grow with its use
-            self._plenty = total_memory, current_time
+            self._last_ample_memory = total_memory, current_time
         # A short dip does not kill: the shortage must last. One worker is killed at a time.
-        elif workers_by_memory and not too_large and current_time - self._plenty[1] > SCARCE_S:
+        elif workers_by_memory and not too_large and current_time - self._last_ample_memory[1] > SCARCE_S:
             too_large = [max(workers_by_memory, key=lambda entry: entry[0])]
-            self._plenty = total_memory, current_time
+            self._last_ample_memory = total_memory, current_time
         outcomes = []
         for memory, worker in too_large:
             cause = (

@@ -121,11 +121,11 @@ class _Reader:
             if count := len(self.root.findall(tag)):
                 self.omissions[tag] += count
         build_episode(scenario, graph, seed=0)  # reports any remaining error of the scenario
-        lost = tuple(
+        omissions = tuple(
             f"{message}{f' ({occurrences} times)' if occurrences > 1 else ''}"
             for message, occurrences in self.omissions.items()
         )
-        return ImportedCommonRoad(scenario, graph, is_known, lost)
+        return ImportedCommonRoad(scenario, graph, is_known, omissions)
 
     # ------------------------------------------------------------ the town
 

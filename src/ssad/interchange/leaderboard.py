@@ -82,16 +82,16 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
     root = read_xml(path, limit=MAX_BYTES)
     if root.tag != "routes":
         raise FormatError(f"{path}: not a file of routes: its root is <{root.tag[:40]}>")
-    values, lost, scenarios = AttributeReader(str(path), root), Counter[str](), list[Scenario]()
+    values, omissions, scenarios = AttributeReader(str(path), root), Counter[str](), list[Scenario]()
     towns = town_names()
     for route in root.iterfind("route"):
         route_id, town = values.text(route, "id"), values.text(route, "town")
         points = _points(values, route)
         if route.find("weathers/weather") is not None:
-            lost["weather of a route"] += 1
+            omissions["weather of a route"] += 1
         elements = route.findall("scenarios/scenario")
         if not elements:
-            lost["a route without a scenario"] += 1
+            omissions["a route without a scenario"] += 1
         for element_index, element in enumerate(elements):
             type_name = values.text(element, "type")
             template = Scenario(
@@ -105,14 +105,14 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
             )
             stored = element.find(OWN)
             if stored is None and type_name not in TYPES:
-                lost[f"type {type_name}: {UNPLAYED.get(type_name, 'it is not known here')}"] += 1
+                omissions[f"type {type_name}: {UNPLAYED.get(type_name, 'it is not known here')}"] += 1
                 continue
             if town not in towns:
-                lost[f"town {town} is not imported: its scenarios cannot be built (ssad import map)"] += 1
+                omissions[f"town {town} is not imported: its scenarios cannot be built (ssad import map)"] += 1
                 continue
             try:
                 scenario = (
-                    _scenario_of_item(values, element, template, lost)
+                    _scenario_of_item(values, element, template, omissions)
                     if stored is None
                     else _restored_scenario(values, element, stored, template)
                 )
@@ -122,14 +122,14 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
             except ConfigError as error:
                 raise FormatError(f"{path}: route {route_id[:40]}: {error}") from None
             except SSADError as error:
-                lost[str(error)] += 1
+                omissions[str(error)] += 1
                 continue
             scenarios.append(scenario)
     if not scenarios:
-        reasons = "; ".join(list(lost)[:3]) or "it has no route"
+        reasons = "; ".join(list(omissions)[:3]) or "it has no route"
         raise FormatError(f"{path}: no scenario in it can be played here: {reasons}")
     return tuple(scenarios), tuple(
-        f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in lost.items()
+        f"{message}{f' ({count} times)' if count > 1 else ''}" for message, count in omissions.items()
     )
 
 
@@ -181,7 +181,7 @@ def _scenario_of_item(values: AttributeReader, item: Node, base: Scenario, omiss
     site = ScenarioBuilder(base, graph, route, start, item, values, generator("leaderboard", base.name))
     add_actors(site)
     for child in item:
-        if child.tag not in site.used and child.tag != "trigger_point":
+        if child.tag not in site.used_names and child.tag != "trigger_point":
             omissions[f"{child.tag[:40]} of {type_name}"] += 1
     return replace(base, actors=tuple(site.actors), signals=site.signals, target_speed=site.target_speed)
 

@@ -60,7 +60,7 @@ class ScenarioBuilder:
         item: The element of the file.
         values: Reads the attributes of elements.
         random: Draws what the leaderboard draws.
-        used: Tags of the parameters that were read.
+        used_names: Tags of the parameters that were read.
         actors: Actors added so far.
         signals: States of the traffic lights.
         target_speed: Target speed of the ego, m/s.
@@ -73,7 +73,7 @@ class ScenarioBuilder:
     item: Element
     values: AttributeReader
     random: np.random.Generator
-    used: set[str] = field(default_factory=set)
+    used_names: set[str] = field(default_factory=set)
     actors: list[Actor] = field(default_factory=list)
     signals: SignalPlan = field(default_factory=SignalPlan)
     target_speed: float = SPEED
@@ -97,7 +97,7 @@ class ScenarioBuilder:
 
     def _bounded(self, tag: str, key: str, default: float, low: float, high: float) -> float:
         element = self.item.find(tag)
-        self.used.add(tag)
+        self.used_names.add(tag)
         if element is None:
             return default
         value = self.values.number(element, key)
@@ -108,7 +108,7 @@ class ScenarioBuilder:
     def word(self, tag: str, default: str, allowed: Sequence[str] = ()) -> str:
         """Return the text `value` of a child. FormatError if it is not allowed."""
         element = self.item.find(tag)
-        self.used.add(tag)
+        self.used_names.add(tag)
         value = default if element is None else self.values.text(element, "value")
         if allowed and value not in allowed:
             raise self.values.error(tag, f"'{value[:40]}' is not one of {', '.join(allowed)}")
@@ -121,7 +121,7 @@ class ScenarioBuilder:
     def lane_at(self, tag: str) -> LanePosition:
         """The lane under a place of the file. FormatError where it is missing, RouteError off the road."""
         element = self.item.find(tag)
-        self.used.add(tag)
+        self.used_names.add(tag)
         if element is None:
             raise self.values.error(self.item, f"'{self.item.get('type')}' has no {tag}")
         # The file has CARLA's left-handed frame. 0.0 - y instead of -y avoids a negative zero.

@@ -94,7 +94,7 @@ class PositionReader:
             omissions: Counter of the features that are not carried over.
             starts: Name of an entity -> its position at the start.
         """
-        self.values, self.graph, self.lost, self.starts = values, graph, omissions, starts
+        self.values, self.graph, self.omissions, self.starts = values, graph, omissions, starts
         self._hand = -1.0 if mirrored else 1.0
         self._open: set[str] = set()
         self._kinds: dict[str, Callable[[Element], Pose]] = {
@@ -173,7 +173,7 @@ class PositionReader:
         road_length = float(graph.length[sections].sum())
         if not -1.0 <= s <= road_length + 1.0:
             raise self.values.error(element, f"s is {s:g} m; lane {lane} of road {road} has {road_length:.1f} m")
-        self.lost["positions by road and s are taken along the lane, not along the road's reference line"] += 1
+        self.omissions["positions by road and s are taken along the lane, not along the road's reference line"] += 1
         for section in sections.tolist():
             length = float(graph.length[section])
             if s <= length or section == sections[-1]:

@@ -23,7 +23,7 @@ class TriggerReader:
     """The triggers of a document; triggers without a counterpart are counted in `omissions`."""
 
     def __init__(self, places: PositionReader, entities: Mapping[str, Entity], omissions: Counter[str]) -> None:
-        self.values, self.places, self.entities, self.lost = places.values, places, entities, omissions
+        self.values, self.places, self.entities, self.omissions = places.values, places, entities, omissions
         self.ego = next(entity for entity in entities.values() if entity.ego)
         self._order = [
             name for name, candidate in entities.items() if not candidate.ego and candidate.placed
@@ -62,7 +62,9 @@ class TriggerReader:
                 if state not in ("runningState", "completeState", "startTransition"):
                     unread.append(f"{condition_type.tag} {state}")
                 elif delay and self.values.text(condition_type, "storyboardElementRef") != entity.event:
-                    self.lost[f"the delay of the trigger of '{label}' after another event than the one before"] += 1
+                    self.omissions[
+                        f"the delay of the trigger of '{label}' after another event than the one before"
+                    ] += 1
                 elif delay:
                     delays.append(PhaseTrigger("after", delay))
                     completed += state == "completeState"
@@ -78,14 +80,14 @@ class TriggerReader:
                 alternatives.append(sequence)
         # Our writer gives each delay for a running and for a completed event; other files may have only the latter.
         if delays and completed == len(delays):
-            self.lost[f"the delay of the trigger of '{label}' is counted from where the event before begins"] += 1
+            self.omissions[f"the delay of the trigger of '{label}' is counted from where the event before begins"] += 1
         required = [sequence for sequence in alternatives if sequence != (PhaseTrigger("always"),)] or (
             [] if delays else alternatives
         )
         for unread_tag in unread:
-            self.lost[f"{unread_tag} of the trigger of '{label}'"] += 1
+            self.omissions[f"{unread_tag} of the trigger of '{label}'"] += 1
         if len(required) > 1:
-            self.lost[f"all but the first of the {len(required)} conditions of the trigger of '{label}'"] += 1
+            self.omissions[f"all but the first of the {len(required)} conditions of the trigger of '{label}'"] += 1
         if required or delays:
             return (*delays[:1], *(required[0] if required else ()))
         return None if unread else (PhaseTrigger("always"),)
@@ -110,11 +112,11 @@ class TriggerReader:
                 return None
             if self.values.text(condition_type, "freespace", "false") == "true":
                 value += 0.5 * (MODELS[self.ego.model].length + MODELS[other_entities[0].model].length)
-                self.lost[
+                self.omissions[
                     "distances between bodies are taken as those between their centres, half the lengths added"
                 ] += 1
             if distance_type == "longitudinal":
-                self.lost["distances along the road are taken as straight ones"] += 1
+                self.omissions["distances along the road are taken as straight ones"] += 1
             if other_entities[0].name not in self._order:
                 return None
             return PhaseTrigger("ego_distance", value, self._order.index(other_entities[0].name))
@@ -135,7 +137,7 @@ class TriggerReader:
                 self.places.start(entity.name, within=condition_type),
             )
             tolerance = self.values.number(condition_type, "tolerance", value)
-            self.lost[f"a place that the ego reaches is taken as its distance from '{entity.name}'"] += 1
+            self.omissions[f"a place that the ego reaches is taken as its distance from '{entity.name}'"] += 1
             gap = math.dist((target.x, target.y), (start.x, start.y))
             return PhaseTrigger("ego_distance", gap + tolerance, self._order.index(entity.name))
         return None

@@ -252,9 +252,9 @@ def _suppress_output() -> Iterator[None]:
 
 def _scenario(program: ScenicProgram, drive: Any, name: str, seed: int) -> SampledScenario:
     rows = np.stack(drive.rows)
-    lost: list[str] = []
+    omissions: list[str] = []
     ego = rows[:, 0]
-    key_points, speed = _route(program, ego, lost)
+    key_points, speed = _route(program, ego, omissions)
     ego_route = route_along(program.graph, key_points)
     end_time = STEP * (len(rows) + 100)
     start_pose = Pose(*ego[0, :3].tolist())
@@ -279,8 +279,8 @@ def _scenario(program: ScenicProgram, drive: Any, name: str, seed: int) -> Sampl
             and max(abs(extent - model_extent) for extent, model_extent in zip(size, _model_size(model), strict=True))
             > 0.01
         ):
-            lost.append(f"the body of a {size[0]:.3g} x {size[1]:.3g} m object becomes '{model}'")
-    return SampledScenario(scenario, str(drive.result.terminationReason), tuple(dict.fromkeys(lost)))
+            omissions.append(f"the body of a {size[0]:.3g} x {size[1]:.3g} m object becomes '{model}'")
+    return SampledScenario(scenario, str(drive.result.terminationReason), tuple(dict.fromkeys(omissions)))
 
 
 def _model_size(model: str) -> tuple[float, float]:
@@ -299,7 +299,7 @@ def _actor(drive: Any, rows: F64, index: int, until: float) -> Actor:
     return Actor(drive.names[index], drive.models[index], Pose(*kept_rows[0][1:]), trajectory=kept_rows)
 
 
-def _route(program: ScenicProgram, ego: F64, lost: list[str]) -> tuple[tuple[Pose, ...], float]:
+def _route(program: ScenicProgram, ego: F64, omissions: list[str]) -> tuple[tuple[Pose, ...], float]:
     """Return the key points of the ego's route, and its speed at the start, m/s."""
     distances = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ego[:, :2], axis=0).T))])
     start = Pose(*ego[0, :3].tolist())
@@ -312,7 +312,7 @@ def _route(program: ScenicProgram, ego: F64, lost: list[str]) -> tuple[tuple[Pos
                 extended = (*route, *_key_points_ahead(program.graph, route[-1], extension)[1:]) if extension else route
                 if route_along(program.graph, extended).length < 1.5 * distances[-1] + extension + 10.0:
                     return extended, float(ego[0, 3])
-        lost.append("the way of the ego, which leaves its lanes: its lane is its route")
+        omissions.append("the way of the ego, which leaves its lanes: its lane is its route")
     return _key_points_ahead(program.graph, start), float(ego[0, 3])
 
 

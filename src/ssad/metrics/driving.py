@@ -180,8 +180,8 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
         raise ValueError(f"trace {trace.key}: no rows")
     events = collision_events(trace)
     counts = {name: int(((trace.contact[events] & kind) != 0).sum()) for name, kind in COLLISIONS.items()}
-    off_road_metres, driven = off_road_distance(trace), float(trace.driven[-1])
-    off_road_fraction = min(off_road_metres / driven, 1.0) if driven > 0.0 else 0.0
+    off_road_metres, driven_length = off_road_distance(trace), float(trace.driven[-1])
+    off_road_fraction = min(off_road_metres / driven_length, 1.0) if driven_length > 0.0 else 0.0
     completion = min(max(float(trace.route_complete[-1]) / 100.0, 0.0), 1.0)
     deviation = _mean(trace.route_distance[1:])
     # bodies may touch between two rows
@@ -197,7 +197,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
         route_completion=completion,
         route_following=1.0 - min(deviation / DIVISORS["DR"], 1.0) if math.isfinite(deviation) else math.nan,
         time=(len(trace.contact) - 1) * float(trace.dt),
-        driven=driven,
+        driven=driven_length,
         acceleration=mean_acceleration(trace),
         yaw_velocity=mean_yaw_velocity(trace),
         lane_invasions=int(trace.lane_invasion.sum()),

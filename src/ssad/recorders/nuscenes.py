@@ -172,7 +172,7 @@ def attributes_of(placed_object: PlacedObject) -> tuple[str, ...]:
         return ("cycle.with_rider",) if body.style == "ridden" else ("cycle.without_rider",)
     if body.kind in ("traffic_cone", "barrier"):
         return ()
-    return ("vehicle.parked",) if body.parked else ("vehicle.moving",) if moving else ("vehicle.stopped",)
+    return ("vehicle.parked",) if body.is_parked else ("vehicle.moving",) if moving else ("vehicle.stopped",)
 
 
 def ego_at(trace: EpisodeTrace, time: float) -> F64:

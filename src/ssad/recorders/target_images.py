@@ -301,7 +301,7 @@ def _accept_views(
                 "target_size": [round(extent, 3) for extent in target.size],
                 "objects": objects,
             }
-            yield slot, row | viewpoint.about, rendering.image[index]
+            yield slot, row | viewpoint.description, rendering.image[index]
 
 
 def label_of(kind: str) -> int | None:
@@ -344,16 +344,16 @@ def _follower(viewpoint: Viewpoint) -> F64:
 
 
 def _annotate(
-    stage: RenderScene, view: View, picture: Rendering, index: int, nearby_objects: Sequence[PlacedObject]
+    scene: RenderScene, view: View, picture: Rendering, index: int, nearby_objects: Sequence[PlacedObject]
 ) -> tuple[list[dict[str, Any]], str]:
     """Return the annotation of an image, and the reason why the image is of no use ("" if it is of use)."""
-    labels = label_image(stage, view, picture, index)
+    labels = label_image(scene, view, picture, index)
     placed_by_tag = {placed.body.tag: placed for placed in nearby_objects}
     is_target = labels.tag == TARGET
     extents = labels.box[:, 2:] - labels.box[:, :2]
     if not is_target.any() or labels.share[is_target][0] < MIN_VISIBLE_SHARE:
         return [], "hidden"
-    if labels.inside[is_target][0] < MIN_VISIBLE_SHARE or extents[is_target].min() < SMALL:
+    if labels.image_share[is_target][0] < MIN_VISIBLE_SHARE or extents[is_target].min() < SMALL:
         return [], "cut or small"
     target_distance = float(np.linalg.norm(placed_by_tag[TARGET].pose[:3, 3] - view.pose[:3, 3]))
     # A wall or post right before the camera leaves too little of the street to see.
@@ -614,15 +614,17 @@ def _unknown(path: Path, error: Exception) -> FormatError:
     return FormatError(f"{path}: not the clips of this version {error_text}; record them again")
 
 
-def _recording_from_description(about: Mapping[str, Any], folder: Path, device: str) -> TargetRecording:
+def _recording_from_description(description: Mapping[str, Any], folder: Path, device: str) -> TargetRecording:
     """The recording that `TargetRecording.identity` describes."""
     settings: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in about.items() if name != "clips"
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in description.items()
+        if name != "clips"
     }
-    settings["images"] = tuple((town, count) for town, count in about["images"])
-    if about["target"] is not None:
-        size = about["target"]["size"]
-        target_settings = {name: value for name, value in about["target"].items() if name != "kind"}
-        target_class: Any = STANDING[about["target"]["kind"]] if "kind" in about["target"] else TargetCar
+    settings["images"] = tuple((town, count) for town, count in description["images"])
+    if description["target"] is not None:
+        size = description["target"]["size"]
+        target_settings = {name: value for name, value in description["target"].items() if name != "kind"}
+        target_class: Any = STANDING[description["target"]["kind"]] if "kind" in description["target"] else TargetCar
         settings["target"] = target_class(**target_settings | {"size": None if size is None else tuple(size)})
-    return TargetRecording(folder, **settings | {"mode": about["clips"], "device": device})
+    return TargetRecording(folder, **settings | {"mode": description["clips"], "device": device})

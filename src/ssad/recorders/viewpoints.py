@@ -40,7 +40,7 @@ class Viewpoint:
         camera: Pose [4, 4], x right, y down, z forward.
         target: Pose [4, 4].
         weather: Weather and hour.
-        about: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation,
+        description: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation,
             degrees.
     """
 
@@ -48,7 +48,7 @@ class Viewpoint:
     camera: F64
     target: F64
     weather: SceneWeather
-    about: dict[str, Any]
+    description: dict[str, Any]
 
 
 def look_at(position: F64, point: F64) -> F64:
@@ -209,7 +209,7 @@ def has_room(target: ObjectBody, viewpoint: Viewpoint, nearby_objects: Sequence[
     return bool((obb_distance(target_box, boxes) > 0.1).all() and (camera_distance[is_tall] > 0.6).all())
 
 
-def has_free_sight(stage: RenderScene, viewpoints: Sequence[Viewpoint], *, batch: int, height: float = 2 * AIM) -> Bool:
+def has_free_sight(scene: RenderScene, viewpoints: Sequence[Viewpoint], *, batch: int, height: float = 2 * AIM) -> Bool:
     """Return whether nothing of the street lies between target (at a height, m) and camera, [N]: as the target sees it.
 
     A camera inside a house sees out of it, for walls have one side; who looks at it from outside sees the wall.
@@ -225,7 +225,7 @@ def has_free_sight(stage: RenderScene, viewpoints: Sequence[Viewpoint], *, batch
             views.append(
                 View(camera, look_at(target_point, camera_position), (), SceneWeather(fog=6.0 / (distances[-1] + 20.0)))
             )
-        depth_maps = render(stage, views, scale=1, quality=PLAIN, linear=False).depth
+        depth_maps = render(scene, views, scale=1, quality=PLAIN, linear=False).depth
         is_free += [
             bool((depth_map >= distance + 0.3).all()) for depth_map, distance in zip(depth_maps, distances, strict=True)
         ]

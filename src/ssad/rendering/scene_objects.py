@@ -79,8 +79,10 @@ FEWER = 0.4  # times as many cars, against all else, where streets are "any": a 
 
 def thin_shares(shares: Mapping[str, float], streets: str) -> dict[str, float]:
     """Shares of bodies, of the sum 1; fewer cars for "any" (see `FEWER`)."""
-    found = {body: share * (FEWER if streets == "any" and body in CARS else 1.0) for body, share in shares.items()}
-    return {body: share / sum(found.values()) for body, share in found.items()}
+    shares_by_kind = {
+        body: share * (FEWER if streets == "any" and body in CARS else 1.0) for body, share in shares.items()
+    }
+    return {body: share / sum(shares_by_kind.values()) for body, share in shares_by_kind.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +98,8 @@ class ObjectBody:
         meshes: Numbers of its meshes: one, or those of a cycle of `STRIDE` m.
         track: [T, 4] x, y, yaw, z at steps of the world, or [1, 4] if it is static.
         active: [T] whether it is present.
-        driven: [T] distance covered so far, m.
-        parked: Whether it is a vehicle without a driver.
+        is_driven: [T] distance covered so far, m.
+        is_parked: Whether it is a vehicle without a driver.
     """
 
     tag: int
@@ -108,8 +110,8 @@ class ObjectBody:
     meshes: tuple[int, ...]
     track: F64
     active: Bool
-    driven: F64
-    parked: bool = False
+    is_driven: F64
+    is_parked: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +179,7 @@ class SceneObjects:
     meshes: LazyMeshes = field(default_factory=LazyMeshes)
     bodies: list[ObjectBody] = field(default_factory=list)
 
-    def at(self, time: float, around: F64, reach: float) -> list[PlacedObject]:
+    def at(self, time: float, centre: F64, reach: float) -> list[PlacedObject]:
         """Return the bodies within `reach` (m) of a place [2] at a time (s), interpolated between steps."""
         placed = []
         for body in self.bodies:
@@ -199,18 +201,22 @@ class SceneObjects:
                 lower_state[2] + fraction * yaw_change,
                 lower_state[3],
             )
-            if np.hypot(x - around[0], y - around[1]) > reach:
+            if np.hypot(x - centre[0], y - centre[1]) > reach:
                 continue
             speed = (
                 float(np.hypot(upper_state[0] - lower_state[0], upper_state[1] - lower_state[1])) / self.dt
                 if upper_step > lower_step
                 else 0.0
             )
-            walked = float(body.driven[lower_step] + fraction * (body.driven[upper_step] - body.driven[lower_step]))
+            walked = float(
+                body.is_driven[lower_step] + fraction * (body.is_driven[upper_step] - body.is_driven[lower_step])
+            )
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
             placed.append(
-                PlacedObject(body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, lit=not body.parked))
+                PlacedObject(
+                    body, pose, speed, SceneObject(mesh, pose, body.paint, body.tag, is_lit=not body.is_parked)
+                )
             )
         return placed
 
@@ -529,7 +535,7 @@ def _add_sidewalk_bodies(
                     _sidewalk_track, graph, int(lane), s0=float(distance), speed=speed, steps=steps, dt=population.dt
                 )
                 for index, walker_lateral in zip(group, (lateral, lateral - 0.8 * np.sign(lateral)), strict=False):
-                    track = make_track(aside=walker_lateral)
+                    track = make_track(lateral=walker_lateral)
                     population.add(walkers[index], track)
                     if index in pushed:
                         population.add(
@@ -604,7 +610,7 @@ def _add_signs(
 
 
 def _sidewalk_track(
-    graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float
+    graph: LaneGraph, lane: int, *, s0: float, speed: float, lateral: float, steps: int, dt: float
 ) -> F64:
     """Track of somebody who walks along a sidewalk, back and forth."""
     length = float(graph.length[lane]) - 2.0
@@ -616,8 +622,8 @@ def _sidewalk_track(
     is_reversed = is_outward == (speed < 0)
     return np.stack(
         [
-            lane_states[:, 0] - aside * np.sin(lane_states[:, 2]),
-            lane_states[:, 1] + aside * np.cos(lane_states[:, 2]),
+            lane_states[:, 0] - lateral * np.sin(lane_states[:, 2]),
+            lane_states[:, 1] + lateral * np.cos(lane_states[:, 2]),
             lane_states[:, 2] + np.pi * is_reversed,
             np.full(steps, KERB),
         ],

@@ -139,8 +139,8 @@ def town_version(graph: LaneGraph) -> str:
 
 def scenario_json(scenario: Scenario) -> dict[str, Any]:
     """Return a scenario as plain data, as it stands in YAML, with its defaults written out."""
-    plain: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
-    return plain
+    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
+    return data
 
 
 def build_requested_episode(request: EpisodeRequest) -> Episode:

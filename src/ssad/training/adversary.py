@@ -202,7 +202,7 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
         "adversary training", plan.ego, plan.literal, plan.off_road, *(episode.key for episode in episodes)
     )[:16]
     state = train_policy(
-        model, learning, plan.out, validate=validate, report=report, seconds=plan.seconds, about=fingerprint
+        model, learning, plan.out, validate=validate, report=report, seconds=plan.seconds, metadata=fingerprint
     )
     if state["steps"] < learning.steps:
         report(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
@@ -216,7 +216,7 @@ def run_adversary_training(plan: AdversaryPlan, *, report: Say = print) -> Itera
         data=f"{description}; ego {plan.ego}",
         command=command_of(plan),
         test=measure_all(plan),
-        about={"ego": plan.ego},
+        metadata={"ego": plan.ego},
     )
 
 

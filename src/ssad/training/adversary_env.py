@@ -172,9 +172,9 @@ class AdversaryEnv(SharedAttributes, VecEnv):  # type: ignore[misc]  # stable-ba
             self.world.take(selected & ~is_taken, Controller.EXTERNAL, policy=_ADVERSARY)
         self._adversaries = adversary
 
-    def _observe(self, who: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
+    def _observe(self, agent_indices: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.float32]:
         """[num_envs, 24]; zeros where there is no adversary."""
         # The sensor needs a valid agent in every row; rows without an adversary are zeroed below.
-        agents = np.stack([np.arange(self.num_envs), np.maximum(who, 0)], 1).astype(np.int32)
+        agents = np.stack([np.arange(self.num_envs), np.maximum(agent_indices, 0)], 1).astype(np.int32)
         rows = SENSORS["adversary"](self.world, agents)
-        return np.where((who >= 0)[:, None], rows, 0.0).astype(np.float32)
+        return np.where((agent_indices >= 0)[:, None], rows, 0.0).astype(np.float32)

@@ -228,7 +228,7 @@ def _run(plan: DetectorPlan, recipe: Recipe, device: str, share: ProcessRank, re
         report=report,
         share=share,
         seconds=plan.seconds,
-        about=fingerprint,
+        metadata=fingerprint,
     )
     if share.rank:
         return

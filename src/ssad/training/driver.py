@@ -173,7 +173,7 @@ def run_driver_training(plan: DriverPlan, *, report: Say = print) -> Iterator[st
         validate=validate,
         report=report,
         seconds=plan.seconds,
-        about=fingerprint,
+        metadata=fingerprint,
     )
     if state["steps"] < learning.steps:
         report(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")

@@ -69,7 +69,7 @@ def train(
     report: Callable[[str], None] = lambda line: None,
     share: ProcessRank = ProcessRank(),
     seconds: float | None = None,
-    about: str = "",
+    metadata: str = "",
 ) -> Any:
     """Train a detector on a set of pictures.
 
@@ -85,7 +85,7 @@ def train(
         report: Called with a line about progress.
         share: The part of the work of this process.
         seconds: Stop after the epoch in which this time runs out, s; it can be resumed.
-        about: What else the result depends on (data, first weights); it must be the same when the training is resumed.
+        metadata: What else the result depends on (data, first weights); it must be the same when training resumes.
 
     Returns:
         The detector to use: the average of the weights, if one is kept.
@@ -117,7 +117,7 @@ def train(
     per_epoch = _common_count(
         len(order(len(image_set), local_batch, seed=0, epoch=0, weights=frequencies)), share, target_device
     )
-    epoch, step, time_spent, fastest = _resume(out / LAST_CHECKPOINT, detector, average, optimizer, recipe, about)
+    epoch, step, time_spent, fastest = _resume(out / LAST_CHECKPOINT, detector, average, optimizer, recipe, metadata)
     start_time = time.monotonic()
     while epoch < (last_epoch := _common_count(recipe.last_epoch(epoch, time_spent, fastest), share, target_device)):
         total_steps = per_epoch * last_epoch
@@ -173,7 +173,7 @@ def train(
                 "step": step,
                 "spent": time_spent,
                 "quickest": fastest,
-                "about": about,
+                "about": metadata,
                 "recipe": safeio.dump_json(recipe_data(recipe)),
             }
             _save(out, state, row)
@@ -228,19 +228,19 @@ def perturb_images(
     detector, budget = step.detector, Budget(px(recipe.radius))
     generator = torch.Generator(images.device).manual_seed(seed32("adversarial training", *key))
     noise = 2 * torch.rand(images.shape, generator=generator, device=images.device) - 1
-    attacked = budget.project(images + budget.start(noise, "uniform"), images)
+    attacked_images = budget.project(images + budget.start(noise, "uniform"), images)
     step_length = budget.radius * min(1.25, 2.5 / recipe.attack_steps)
     training_modes = [(module, module.training) for module in detector.modules()]
     for module, _ in training_modes:
         # Attack steps must not update running statistics.
         module.training = module.training and not isinstance(module, nn.modules.batchnorm._BatchNorm)
     for _ in range(recipe.attack_steps):
-        variable = attacked.detach().requires_grad_()
+        variable = attacked_images.detach().requires_grad_()
         (gradient,) = torch.autograd.grad(torch.stack(list(step(variable, truth).values())).sum(), variable)
-        attacked = budget.project(attacked + step_length * budget.steepest(gradient), images)
+        attacked_images = budget.project(attacked_images + step_length * budget.steepest(gradient), images)
     for module, mode in training_modes:
         module.training = mode
-    return attacked
+    return attacked_images
 
 
 def _common_count(count: int, share: ProcessRank, device: torch.device) -> int:
@@ -346,13 +346,13 @@ def write_row(out: Path, row: dict[str, Any]) -> None:
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
 
 
-def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
+def read_last(path: Path, recipe: Recipe, metadata: str) -> dict[str, Any] | None:
     """The state from which an interrupted training goes on.
 
     Args:
         path: The file that the training wrote.
         recipe: The recipe of this training.
-        about: Data, first weights and number of GPUs of this training.
+        metadata: Data, first weights and number of GPUs of this training.
 
     Returns:
         The state; None if there is none.
@@ -366,7 +366,7 @@ def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
         return None
     if state["recipe"] != safeio.dump_json(recipe_data(recipe)):
         raise FormatError(f"{path}: of another recipe; choose another folder, or delete it")
-    if state.get("about", "") != about:
+    if state.get("about", "") != metadata:
         raise FormatError(
             f"{path}: of other data, other first weights or another number of GPUs; choose another folder, or delete it"
         )
@@ -374,10 +374,10 @@ def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
 
 
 def _resume(  # noqa: PLR0917
-    path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe, about: str
+    path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe, metadata: str
 ) -> tuple[int, int, float, float]:
     """Epoch and step to go on with, the time that epochs took, s, and that of the quickest."""
-    state = read_last(path, recipe, about)
+    state = read_last(path, recipe, metadata)
     if state is None:
         return 0, 0, 0.0, math.inf
     try:

@@ -140,11 +140,11 @@ def rest_times(
     return durations
 
 
-def _lane_heights(pose: F32, used: Bool, lanes: Sequence[Lanes]) -> F32:
+def _lane_heights(pose: F32, is_used: Bool, lanes: Sequence[Lanes]) -> F32:
     """[B, K] height of the lane under each object, NaN where it is on none that goes its way; 0 without bridges."""
-    heights = np.zeros(used.shape, np.float32)
+    heights = np.zeros(is_used.shape, np.float32)
     for current_town in dict.fromkeys(town_lanes for town_lanes in lanes if town_lanes.hilly):
-        scene, row = np.nonzero(used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
+        scene, row = np.nonzero(is_used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
         lane, s, _ = current_town.match(pose[scene, row].astype(np.float64))
         heights[scene, row] = current_town.height(lane, s)
     return heights
@@ -156,7 +156,7 @@ def _infer_forecasts(  # noqa: PLR0917
     kind: I32,
     half: F32,
     gives_way: Bool,
-    used: Bool,
+    is_used: Bool,
     lanes: Sequence[Lanes],
     forecasts: F32 | None,
 ) -> tuple[F32, F32, I32]:
@@ -165,7 +165,7 @@ def _infer_forecasts(  # noqa: PLR0917
     junction_info = np.tile(np.array([FAR, FAR, float(TurnRank.STRAIGHT), 0.0], np.float32), (*kind.shape, 1))
     signal = np.full(kind.shape, -1, np.int32)
     for current_town in dict.fromkeys(lanes):
-        scene, row = np.nonzero(used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
+        scene, row = np.nonzero(is_used & np.array([town_lanes is current_town for town_lanes in lanes])[:, None])
         poses, expected_speed = pose[scene, row].astype(np.float64), speed[scene, row].astype(np.float64)
         lane, s, lateral = current_town.match(poses)
         lane[kind[scene, row] == AgentKind.WALKER] = -1
@@ -274,10 +274,10 @@ class Lanes:
         cost = distance[valid] + 4.0 * (1.0 - alignment[valid])
         valid = valid[np.lexsort((segment_rows[valid], cost, owner[valid]))]
         valid = valid[np.concatenate([[True], np.diff(owner[valid]) != 0])[: len(valid)]]
-        matched = owner[valid]
-        lane[matched] = grid.seg_lane[segment_rows[valid]]
-        along[matched] = grid.seg_s[segment_rows[valid]] + share[valid] * np.sqrt(squared_length[valid])
-        lateral[matched] = np.copysign(distance[valid], dx[valid] * py[valid] - dy[valid] * px[valid])
+        matched_lanes = owner[valid]
+        lane[matched_lanes] = grid.seg_lane[segment_rows[valid]]
+        along[matched_lanes] = grid.seg_s[segment_rows[valid]] + share[valid] * np.sqrt(squared_length[valid])
+        lateral[matched_lanes] = np.copysign(distance[valid], dx[valid] * py[valid] - dy[valid] * px[valid])
         return lane, along, lateral
 
     def height(self, lane: npt.NDArray[np.int64], s: F64) -> F64:

@@ -508,8 +508,8 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     parts["beside"] = [table.beside for table in pool.tables]
     parts["ahead"] = [table.ahead for table in pool.tables]
     for name, array_type in array_types(Roads).items():
-        joined = np.concatenate(parts[name])
-        if len(joined) == 0:  # a town without signals
-            joined = np.zeros((1, *joined.shape[1:]), joined.dtype)
-        setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=array_type.dtype, device=device))
+        joined_tables = np.concatenate(parts[name])
+        if len(joined_tables) == 0:  # a town without signals
+            joined_tables = np.zeros((1, *joined_tables.shape[1:]), joined_tables.dtype)
+        setattr(roads, name, wp.array(np.ascontiguousarray(joined_tables), dtype=array_type.dtype, device=device))
     return roads

@@ -139,15 +139,15 @@ def unroll(
     controls = controls.reshape(steps, *[1] * (len(shape) - len(control_shape)), *control_shape, width).expand(
         steps, *shape, width
     )
-    driven = _drive(state, controls, bodies, dt / substeps, substeps)
+    states = _drive(state, controls, bodies, dt / substeps, substeps)
     if not bool(bodies.walker.any()):  # Skip the walkers' half of the work where there is none.
-        return driven
+        return states
     walked = _walk(state, controls, bodies, dt)
     walker = bodies.walker
     return MotionState(
-        torch.where(walker[..., None], walked.pose, driven.pose),
-        torch.where(walker, walked.speed, driven.speed),
-        torch.where(walker, walked.wheel, driven.wheel),
+        torch.where(walker[..., None], walked.pose, states.pose),
+        torch.where(walker, walked.speed, states.speed),
+        torch.where(walker, walked.wheel, states.wheel),
     )
 
 

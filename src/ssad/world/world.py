@@ -96,7 +96,7 @@ class World:
         # A pair of agents is stored as one int32 code, with two more bits for its flags.
         if self.batch * self.agents**2 >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents are too many for one world")
-        self.believed = 0  # room for objects of a belief in each scene
+        self.belief_capacity = 0  # room for objects of a belief in each scene
         self._views: dict[str, npt.NDArray[Any]] = {}
         self.arrays = State()
         shape = (self.batch, self.agents, HORIZON)
@@ -127,8 +127,8 @@ class World:
         row_count = self.agents + believed
         if self.batch * self.agents * row_count >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents and {believed} objects are too many")
-        previous_arrays = {name: self.array(f"seen.{name}").copy() for name in _SEEN} if self.believed else {}
-        self.believed = believed
+        previous_arrays = {name: self.array(f"seen.{name}").copy() for name in _SEEN} if self.belief_capacity else {}
+        self.belief_capacity = believed
         for name, array_type in _SEEN.items():
             shape = {
                 "believes": (self.batch,),
@@ -438,9 +438,12 @@ class World:
 
     def remove(self, agents: Bool) -> None:
         """Remove agents [B, A] from their scenes until these restart, including agents that follow a trajectory."""
-        removed, controller = np.asarray(agents, bool), self.array("controller")
-        on_trajectory = removed & (controller == Controller.TRAJECTORY)  # would be back in the next step
-        for name, mask, value in (("active", removed, Presence.ABSENT), ("controller", on_trajectory, Controller.NONE)):
+        is_removed, controller = np.asarray(agents, bool), self.array("controller")
+        on_trajectory = is_removed & (controller == Controller.TRAJECTORY)  # would be back in the next step
+        for name, mask, value in (
+            ("active", is_removed, Presence.ABSENT),
+            ("controller", on_trajectory, Controller.NONE),
+        ):
             current = self.array(name)
             self.put(name, np.where(mask, int(value), current).astype(current.dtype))
 
@@ -488,7 +491,7 @@ class World:
                     belief_arrays, previous, self.dt * (step - self.array("seen.told"))
                 )
             object_count = belief_arrays["kind"].shape[1]
-            if object_count > self.believed:
+            if object_count > self.belief_capacity:
                 # Round up, so that a slowly growing belief does not record the launches again each time.
                 self._make_room(-(-object_count // 16) * 16)
             for name, value in belief_arrays.items():
@@ -603,19 +606,19 @@ class World:
         if any(name.startswith("noise.") for name in snapshot.arrays) != bool(self._noisy):
             raise ConfigError("snapshot does not fit this world: only one of them has noise")
         saved_rows = max(np.shape(snapshot.arrays.get("seen.kind", self.array("pose")))[1] - self.agents, 0)
-        if saved_rows > self.believed:
+        if saved_rows > self.belief_capacity:
             self._make_room(saved_rows)
         for name, value in snapshot.arrays.items():
             current = self.array(name)
-            restored = value
+            arrays = value
             if name.startswith("seen.") and value.ndim > 1 and current.shape[1] > value.shape[1]:
-                restored = current.copy()  # there is more room by now
-                restored[:, : value.shape[1]] = value
+                arrays = current.copy()  # there is more room by now
+                arrays[:, : value.shape[1]] = value
                 if name == "seen.kind":
-                    restored[:, value.shape[1] :] = AgentKind.NONE
-            if current.shape != restored.shape:
+                    arrays[:, value.shape[1] :] = AgentKind.NONE
+            if current.shape != arrays.shape:
                 raise ConfigError(f"snapshot does not fit this world: {name} has shape {value.shape}")
-            self.put(name, restored)
+            self.put(name, arrays)
         if "seen.believes" not in snapshot.arrays:
             self.put("seen.believes", np.zeros(self.batch, np.int32))
         self._forget()

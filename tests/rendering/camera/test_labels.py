@@ -81,7 +81,7 @@ def test_the_box_is_the_projection(x: float, y: float) -> None:
     assert labels.box[0].tolist() == [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     assert labels.pixels[0] == len(rows)
     assert labels.share[0] > 0.99
-    assert labels.inside[0] == 1.0
+    assert labels.image_share[0] == 1.0
 
 
 @pytest.mark.parametrize(("x", "y"), [(5.0, 0.0), (11.0, 1.1)])
@@ -116,7 +116,7 @@ def test_half_hidden_is_half_visible(x: float) -> None:
     assert labels.tag.tolist() == [1, 2]
     assert labels.share[0] == pytest.approx(0.5, abs=0.03)
     assert labels.share[1] > 0.97
-    assert labels.inside.tolist() == [1.0, 1.0]
+    assert labels.image_share.tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("number", range(len(BODIES)))
@@ -147,14 +147,14 @@ def test_the_part_outside_the_picture_does_not_count_as_hidden() -> None:
     assert labels.share[0] > 0.98
     width = FOCAL / x
     flank = FOCAL * (0.64 - (0.64 * x - 1) / (x + 0.5))  # from the border to where the flank ends
-    assert labels.inside[0] == pytest.approx(flank / (flank + width), abs=0.03)
+    assert labels.image_share[0] == pytest.approx(flank / (flank + width), abs=0.03)
 
 
 def test_a_thing_beside_the_camera_is_cut_at_the_near_plane() -> None:
     labels, _ = seen(at(1.0, 2.2, mesh=2))
     assert len(labels) == 1
     assert 0.9 < labels.share[0] <= 1.0
-    assert 0.0 < labels.inside[0] < 0.6
+    assert 0.0 < labels.image_share[0] < 0.6
 
 
 def test_what_is_behind_or_beside_has_no_label() -> None:
@@ -187,7 +187,7 @@ def test_nothing_there() -> None:
         labels = label_image(stage(), view, empty_picture())
         assert len(labels) == 0
         assert labels.box.shape == (0, 4)
-        assert labels.share.shape == labels.inside.shape == labels.pixels.shape == (0,)
+        assert labels.share.shape == labels.image_share.shape == labels.pixels.shape == (0,)
     assert visible_share(stage(), View(CAMERA, EYE), empty_picture()) == {}
 
 

@@ -93,10 +93,10 @@ def test_a_near_miss_is_found_and_becomes_a_hit() -> None:
     assert miss.agent == 1
     # bodies of 4 m x 2 m overlap as long as centres are within 3 m of each other on both ways
     assert 0.6 < miss.late < 1.5
-    rows = perturb_motion(trace, miss, shift=0.0, aside=0.0)
+    rows = perturb_motion(trace, miss, shift=0.0, lateral=0.0)
     apart = np.hypot(rows[:, 1] - 8.0 * step, rows[:, 2])
     assert apart.min() < 3.7
     before = np.hypot(40.0 - 8.0 * step, -52.0 + 8.0 * step)
     assert before.min() > 6.0
-    later = perturb_motion(trace, miss, shift=1.0, aside=0.0)
+    later = perturb_motion(trace, miss, shift=1.0, lateral=0.0)
     assert (np.hypot(later[:, 1] - 8.0 * step, later[:, 2])).min() > apart.min() + 1.0

@@ -136,8 +136,8 @@ def test_it_acts_on_recorded_scenes(tiny_set: Path, tmp_path: Path) -> None:
                 perturbation.on_scene(recorded, victim)
             continue
         presentation = perturbation.on_scene(recorded, victim)
-        assert presentation.look is not None
-        images = presentation.look(frames)
+        assert presentation.load_images is not None
+        images = presentation.load_images(frames)
         assert [image.shape for image in images] == [image.shape for image in clean], name
         assert {image.dtype for image in images} == {np.dtype(np.uint8)}
         assert dict(presentation.notes()) is not None

@@ -137,14 +137,14 @@ class Yolo(Adapter):
             dense.logit,
             assignment.label,
             assignment.extra["box"].to(scale) * scale,
-            self._padded(dense.size),
+            self._padded_size(dense.size),
         )
         loss_reduction: Reduction = reduction
         if self.spec.rule == "v3":
             return losses_v3(loss_inputs, grid, box_loss=self.spec.box_loss, reduction=loss_reduction)
         return losses_v5(loss_inputs, grid, reduction=loss_reduction)
 
-    def _padded(self, size: tuple[int, int]) -> tuple[int, int]:
+    def _padded_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return height and width of the network's input."""
         height, width = resized_size(size, self.input_width)
         return -(-height // MULTIPLE) * MULTIPLE, -(-width // MULTIPLE) * MULTIPLE

@@ -75,9 +75,9 @@ def camera_perceiver(
     """
     options: dict[str, Any] = {"weights": weights} | ({} if input_width is None else {"input_width": input_width})
     min_score = tracking_settings(detector).low if threshold is None else threshold
-    eyes = CameraPerceiver(detector, _rig_cameras(cameras, width), threshold=min_score, **options)
-    _ = eyes.detector  # so that a wrong name fails here
-    return eyes
+    perceiver = CameraPerceiver(detector, _rig_cameras(cameras, width), threshold=min_score, **options)
+    _ = perceiver.detector  # so that a wrong name fails here
+    return perceiver
 
 
 def perfect_perceiver(

@@ -194,7 +194,9 @@ class Adversarial(ScenarioKind):
             trials,
             budget=spec["budget"],
             batch=spec["batch"],
-            after=lambda rollout_count: time_by_rollouts.update({rollout_count: time.process_time() - start_time}),
+            on_batch_end=lambda rollout_count: time_by_rollouts.update(
+                {rollout_count: time.process_time() - start_time}
+            ),
         )
         reference_motion = load_reference_motions(job.folder, job.device)
         saved = [

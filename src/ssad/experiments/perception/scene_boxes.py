@@ -41,7 +41,7 @@ from ssad.detectors.mono3d.multi_camera import DetectedBoxes
 from ssad.detectors.on_scenes import AT_ONCE, SampleBoxes, detect_with, match_boxes, score_figures
 from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.digital.defences import Defence, Defended
-from ssad.scenarios.static.perturbation import Look, Perturbation, PerturbedScene, RecordedScene
+from ssad.scenarios.static.perturbation import ImageLoader, Perturbation, PerturbedScene, RecordedScene
 
 FOLDER = "detections"
 CAMERAS = 6  # of a sample, as nuScenes has them
@@ -110,8 +110,8 @@ class SceneCondition:
             victim = next((detector for detector in detectors if detector.name == self.source), None)
             victim = victim or MonitoredDetector(system_of(examination, self.source), self.source)
         presentation = self.perturbation.on_scene(recorded_scene(examination, data, self), victim)
-        if victim is not None and presentation.look is not None:
-            presentation.look = _share_failures(presentation.look, victim, detectors)
+        if victim is not None and presentation.load_images is not None:
+            presentation.load_images = _share_failures(presentation.load_images, victim, detectors)
         return presentation
 
 
@@ -130,7 +130,9 @@ def recorded_scene(examination: Examination, data: NuScenes, condition: SceneCon
     )
 
 
-def _share_failures(perturb_images: Look, victim: MonitoredDetector, detectors: Sequence[MonitoredDetector]) -> Look:
+def _share_failures(
+    perturb_images: ImageLoader, victim: MonitoredDetector, detectors: Sequence[MonitoredDetector]
+) -> ImageLoader:
     """Return a function of images after which a failure of the victim is one of all detectors."""
 
     def look_and_pass(frames: Sequence[SensorFrame]) -> Sequence[U8]:
@@ -197,7 +199,7 @@ def find_boxes(examination: Examination, scene: SceneCondition, detectors: Seque
             examination.root,
             dataset.scene(scene.scene),
             device=examination.device,
-            load_images=presentation.look,
+            load_images=presentation.load_images,
             ahead=presentation.ahead,
             at_once=samples_at_once(presentation),
         )

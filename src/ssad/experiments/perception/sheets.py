@@ -51,8 +51,10 @@ def detection_sheet(examination: Examination, split: str, perturbations: Sequenc
             condition = SceneCondition(scene.record.name, perturbation)
             recorded = replace(recorded_scene(examination, dataset, condition), folder=None)
             presentation = perturbation.on_scene(recorded, detector[0])
-            assert presentation.look is not None
-            tiles.append(draw_tile(detector, scene, frame, presentation.look([frame])[0], title=perturbation.name))
+            assert presentation.load_images is not None
+            tiles.append(
+                draw_tile(detector, scene, frame, presentation.load_images([frame])[0], title=perturbation.name)
+            )
     while len(tiles) % COLUMNS:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[start : start + COLUMNS], 1) for start in range(0, len(tiles), COLUMNS)]

@@ -249,8 +249,11 @@ def fallen_tree(style: str, size: Point, *, generator: np.random.Generator, deta
         start = spine[2] + (0.15 + 0.8 * trunk_share) * (spine[4] - spine[2])
         bough_angle = np.pi * (bough_index % 6 + turn_share) / 6.0  # from one side over the top to the other
         span_share = 0.55 + 0.45 * length_share
-        rise, aside = 0.85 * height * span_share * np.sin(bough_angle), 0.46 * width * span_share * np.cos(bough_angle)
-        end = start + np.array([0.18 * length * (0.4 + length_share), aside, rise])
+        rise, lateral = (
+            0.85 * height * span_share * np.sin(bough_angle),
+            0.46 * width * span_share * np.cos(bough_angle),
+        )
+        end = start + np.array([0.18 * length * (0.4 + length_share), lateral, rise])
         end[2] = min(end[2], 0.9 * height)
         path = np.stack([start, 0.5 * (start + end) + [0.0, 0.0, 0.04 * height], end])
         parts.append(
@@ -350,7 +353,7 @@ class _AnimalShape:
         tail: Path as for the trunk.
         ear: x, z, length, width, m.
         narrow: Ratio of width to height of trunk and head.
-        apart: Distance of the legs from the plane of symmetry, m.
+        leg_spacing: Distance of the legs from the plane of symmetry, m.
         coats: Linear RGB of each.
     """
 
@@ -362,7 +365,7 @@ class _AnimalShape:
     tail: Path
     ear: tuple[float, float, float, float]  # x, z, length, width
     narrow: float
-    apart: float
+    leg_spacing: float
     coats: tuple[Point, ...]
 
 
@@ -389,7 +392,7 @@ BEASTS: Mapping[str, _AnimalShape] = {
         tail=((-0.34, 0.54, 0.03), (-0.47, 0.60, 0.026), (-0.55, 0.70, 0.014)),
         ear=(0.35, 0.80, 0.10, 0.05),
         narrow=0.85,
-        apart=0.085,
+        leg_spacing=0.085,
         coats=((0.22, 0.12, 0.05), (0.03, 0.026, 0.022), (0.42, 0.29, 0.14), (0.10, 0.06, 0.035)),
     ),
     "deer": _AnimalShape(
@@ -414,7 +417,7 @@ BEASTS: Mapping[str, _AnimalShape] = {
         tail=((-0.60, 0.95, 0.03), (-0.67, 0.88, 0.028), (-0.68, 0.80, 0.01)),
         ear=(0.52, 1.41, 0.15, 0.06),
         narrow=0.75,
-        apart=0.095,
+        leg_spacing=0.095,
         coats=((0.23, 0.125, 0.06), (0.28, 0.16, 0.08), (0.16, 0.10, 0.06)),
     ),
     "cow": _AnimalShape(
@@ -434,7 +437,7 @@ BEASTS: Mapping[str, _AnimalShape] = {
         tail=((-0.92, 1.28, 0.03), (-1.0, 1.0, 0.022), (-0.99, 0.62, 0.025), (-0.98, 0.45, 0.045)),
         ear=(0.98, 1.35, 0.18, 0.09),
         narrow=0.9,
-        apart=0.20,
+        leg_spacing=0.20,
         coats=((0.60, 0.58, 0.54), (0.60, 0.58, 0.54), (0.20, 0.085, 0.035), (0.32, 0.20, 0.10)),
     ),
     "horse": _AnimalShape(
@@ -460,7 +463,7 @@ BEASTS: Mapping[str, _AnimalShape] = {
         tail=((-0.84, 1.40, 0.05), (-0.98, 1.22, 0.08), (-1.0, 0.85, 0.085), (-0.98, 0.55, 0.04)),
         ear=(0.92, 1.97, 0.14, 0.05),
         narrow=0.8,
-        apart=0.15,
+        leg_spacing=0.15,
         coats=((0.12, 0.045, 0.02), (0.025, 0.02, 0.018), (0.22, 0.10, 0.04), (0.45, 0.43, 0.40)),
     ),
 }
@@ -505,7 +508,9 @@ def animal(style: str, size: Point, *, generator: np.random.Generator, detail: i
             path = [(x + side * swing_share * 0.35 * (leg_top - z), z, ring_radius) for x, z, ring_radius in leg]
             shoulder = (path[0][0], leg_top + 0.9 * path[0][2], 0.35 * path[0][2])
             path = _smooth_path([shoulder, *path], subdivision)
-            parts.append(_tapered_body(path, coat_material, max(limb_segments, 4), 0.9).moved(y=side * shape.apart))
+            parts.append(
+                _tapered_body(path, coat_material, max(limb_segments, 4), 0.9).moved(y=side * shape.leg_spacing)
+            )
             if style != "dog":
                 x, _, ring_radius = path[-1]
                 hoof = tube(
@@ -514,7 +519,7 @@ def animal(style: str, size: Point, *, generator: np.random.Generator, detail: i
                     material=HOOF,
                     segments=limb_segments,
                 )
-                parts.append(hoof.moved(y=side * shape.apart))
+                parts.append(hoof.moved(y=side * shape.leg_spacing))
     x, z, ear_length, ear_width = shape.ear
     ring_radius = shape.head[1][2]
     ear_spread = 0.75 if style in ("cow", "deer") else 0.35

@@ -120,7 +120,7 @@ def nearby_lights(
         ),
     }
     for name, (kernel_struct, (rows, circles)) in tables.items():
-        starts, indices = _grid(circles, len(views))
+        starts, indices = _circles_by_cell(circles, len(views))
         table = rows if len(rows) else np.zeros(1, rows.dtype)
         setattr(light_tables, f"{name}s", wp.array(table, dtype=kernel_struct, device=scene.device))
         setattr(light_tables, f"{name}_start", wp.array(starts, dtype=int, device=scene.device))
@@ -265,7 +265,7 @@ def struct_array(row_type: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
     return np.array(rows, dtype) if rows else np.zeros(1, dtype)
 
 
-def _grid(places: F64, views: int) -> tuple[I32, I32]:
+def _circles_by_cell(places: F64, views: int) -> tuple[I32, I32]:
     """List the circles (view, x, y, radius; m from the eye) that touch each cell of the grid of each view.
 
     Returns:

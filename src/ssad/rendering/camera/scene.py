@@ -125,8 +125,8 @@ class SceneObject:
         tag: Number that identifies it in masks and boxes.
         layers: Textures that it wears, the lowest first; faces outside all panels (windows, lamps, tyres) never
             wear any.
-        lit: Whether its lamps are on; at night they light the scene.
-        hidden: Whether it is invisible; it still casts its shadow.
+        is_lit: Whether its lamps are on; at night they light the scene.
+        is_hidden: Whether it is invisible; it still casts its shadow.
     """
 
     mesh: int
@@ -134,8 +134,8 @@ class SceneObject:
     paint: tuple[float, float, float] = (0.5, 0.5, 0.5)
     tag: int = 0
     layers: tuple[TextureLayer, ...] = ()
-    lit: bool = True
-    hidden: bool = False
+    is_lit: bool = True
+    is_hidden: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +193,8 @@ def collect_objects(objects_by_view: Sequence[Sequence[SceneObject]]) -> ObjectT
         np.array([entry.pose for entry in flat_objects], np.float64).reshape(-1, 4, 4),
         np.array([entry.paint for entry in flat_objects], np.float32).reshape(-1, 3),
         np.array([entry.tag for entry in flat_objects], np.int32),
-        np.array([entry.lit for entry in flat_objects], bool),
-        np.array([entry.hidden for entry in flat_objects], bool),
+        np.array([entry.is_lit for entry in flat_objects], bool),
+        np.array([entry.is_hidden for entry in flat_objects], bool),
     )
 
 
@@ -225,10 +225,10 @@ class RenderScene:
         if not parts:
             raise ConfigError("a stage needs a street or a mesh")
         vertices, faces, normals, uvs, material, surfaces = [], [], [], [], [], []
-        listed = [street.order.astype(np.int32)] if street is not None else []
+        listed_faces = [street.order.astype(np.int32)] if street is not None else []
         firsts, counts, centres, radii = [], [], [], []
         vertex_base = face_base = material_base = 0
-        list_position = len(listed[0]) if listed else 0
+        list_position = len(listed_faces[0]) if listed_faces else 0
         for part_index, part in enumerate(parts):
             # Parts share one buffer: indices are shifted by the entries before them.
             vertices.append(part.vertices)
@@ -238,7 +238,7 @@ class RenderScene:
             material.append(part.material + material_base)
             surfaces += [surface(entry) for entry in part.materials]
             if street is None or part_index > 0:
-                listed.append(np.arange(face_base, face_base + len(part.faces), dtype=np.int32))
+                listed_faces.append(np.arange(face_base, face_base + len(part.faces), dtype=np.int32))
                 firsts.append(list_position)
                 counts.append(len(part.faces))
                 lower, upper = part.bounds()
@@ -272,7 +272,7 @@ class RenderScene:
         self._cache: dict[Any, Any] = {}
         surface_rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
         self.surfaces = to_device(surface_rows, matter.Surface)
-        self.listed = to_device(np.concatenate(listed), wp.int32)
+        self.listed = to_device(np.concatenate(listed_faces), wp.int32)
         self.geometry = kernels.Geometry()
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
             setattr(self.geometry, name, getattr(self, name))
@@ -291,15 +291,15 @@ class RenderScene:
             body.areas(),
             body.corners().mean(1),
         )
-        found = {}
+        lights_by_kind = {}
         for name in LAMPS:
             weight = areas * np.isin(
                 body.material,
                 [material_index for material_index, material_name in enumerate(names) if material_name == name],
             )
             total = float(weight.sum())
-            found[name] = (weight @ middles / max(total, 1e-12), total)
-        return found
+            lights_by_kind[name] = (weight @ middles / max(total, 1e-12), total)
+        return lights_by_kind
 
     def ground_cover(self, mesh: int) -> tuple[F64, F64, float, float]:
         """Return the ground that a mesh covers.

@@ -143,7 +143,7 @@ def _shop_front(w: float, ground: float, front: Wall, materials: TownMaterials) 
             )
     parts.append(flat(front.quads(door_centre - 0.5, 0.05, 1.0, 2.2, 0.05), materials.shop[0], levels=VISIBLE))
     colour = materials.pick("awning")
-    board, board_back = (front.quads(0.2, ground - 0.85, w - 0.4, 0.55, away) for away in (0.12, 0.0))
+    board, board_back = (front.quads(0.2, ground - 0.85, w - 0.4, 0.55, distance) for distance in (0.12, 0.0))
     parts.append(flat(board, colour, levels=VISIBLE))
     parts.append(
         flat(np.stack([board[:, 3], board[:, 2], board_back[:, 2], board_back[:, 3]], axis=1), colour, levels=NEAR)

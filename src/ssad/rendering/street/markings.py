@@ -70,8 +70,8 @@ def _paint_lines(triangles: TriangleBuilder, graph: LaneGraph, lane: int, materi
         if marking == Marking.BROKEN:
             _paint_dashes(triangles, edge, inset, material)
         elif marking == Marking.DOUBLE:
-            for aside in (-LINE, LINE):
-                _paint_strip(triangles, edge, aside, material)
+            for lateral in (-LINE, LINE):
+                _paint_strip(triangles, edge, lateral, material)
         else:
             _paint_strip(triangles, edge, inset, material)
 
@@ -213,13 +213,13 @@ def _paint_wear(triangles: TriangleBuilder, graph: LaneGraph, lane: int, materia
     """Lighter wheel tracks, repaired patches and manholes on a lane."""
     rng = materials.generator
     for share in (0.27, 0.73):
-        _paint_strip(triangles, lane_edge(graph, lane, share), 0.0, materials.worn, width=0.5, z=0.5 * WEAR)
+        _paint_strip(triangles, lane_edge(graph, lane, share), 0.0, materials.worn_paint, width=0.5, z=0.5 * WEAR)
     length = float(graph.length[lane])
     for _ in range(rng.poisson(length / 45.0)):
         x, y, yaw, width = graph.at(lane, float(rng.uniform(2.0, max(2.1, length - 6.0))))
         patch_length, patch_width = rng.uniform(1.0, 4.0), rng.uniform(0.6, 0.8 * width)
-        aside = rng.uniform(-0.5, 0.5) * (width - patch_width)
-        lower, upper = aside - patch_width / 2, aside + patch_width / 2
+        lateral = rng.uniform(-0.5, 0.5) * (width - patch_width)
+        lower, upper = lateral - patch_width / 2, lateral + patch_width / 2
         patch = np.array([[[0.0, lower], [patch_length, lower], [patch_length, upper], [0.0, upper]]])
         _add_polygons(triangles, place((x, y, yaw), patch), materials.patch, z=WEAR, levels=NEAR)
     angles = np.arange(8) * np.pi / 4

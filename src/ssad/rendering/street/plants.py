@@ -110,12 +110,18 @@ def leaves(
 
 
 def _leaf_triangles(  # noqa: PLR0917
-    place: F64, out: F64, side: F64, half: F64 | float, turns: tuple[float, ...], normal: F64, material: npt.ArrayLike
+    place: F64,
+    outward: F64,
+    side: F64,
+    half: F64 | float,
+    turns: tuple[float, ...],
+    normal: F64,
+    material: npt.ArrayLike,
 ) -> TrianglePiece:
-    """A triangle about each place [n, 3]: across `out` (unit), its corners turned from `side`, `half` m away."""
+    """A triangle about each place [n, 3]: across `outward` (unit), its corners turned from `side`, `half` m away."""
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     cosines, sines = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
-    corners = place[:, None] + half * (cosines * side[:, None] + sines * cross(out, side)[:, None])
+    corners = place[:, None] + half * (cosines * side[:, None] + sines * cross(outward, side)[:, None])
     faces = np.arange(3 * len(place), dtype=np.int32).reshape(-1, 3)
     return smooth(corners.reshape(-1, 3), faces, normal, material, levels=NEAR)
 

@@ -26,9 +26,9 @@ DETACHED = ("house", "bungalow")
 class _PlotBuilder:
     """Shared state of plot building: geometry, free ground, materials and common pieces."""
 
-    soup: TriangleBuilder
-    site: FreeGround
-    look: TownMaterials
+    triangles: TriangleBuilder
+    ground: FreeGround
+    materials: TownMaterials
     hedges: list[TrianglePiece]
     fences: list[TrianglePiece]
     bins: TrianglePiece
@@ -90,7 +90,7 @@ def _place_building(
     plot_builder: _PlotBuilder, plots: Plots, pose: Pose, *, kind: str, size: tuple[float, float, float]
 ) -> bool:
     """One building of a size (front, depth, distance from the sidewalk), if there is room."""
-    builder, site, materials = plot_builder.soup, plot_builder.site, plot_builder.look
+    builder, site, materials = plot_builder.triangles, plot_builder.ground, plot_builder.materials
     width, depth, setback = size
     is_detached = kind in DETACHED
     yard_depth = 3.0 if is_detached else 0.5
@@ -130,11 +130,11 @@ def _lay_slab(
     z: float = FLAT,
 ) -> bool:
     """Paved ground on the earth, where no road is; nothing else is put there."""
-    site, ground_points = plot_builder.site, footprint(pose, x, y)
+    site, ground_points = plot_builder.ground, footprint(pose, x, y)
     if (site.ground.at(site.ground.road, ground_points) < 0.1).any():
         return False
     corners = place(pose, np.array([[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]]))
-    plot_builder.soup.add(
+    plot_builder.triangles.add(
         flat(np.column_stack([corners, np.full(4, z)])[None], material, levels=ALL), corners.mean(axis=0)
     )
     site.occupy(ground_points)
@@ -143,7 +143,7 @@ def _lay_slab(
 
 def _lay_garden(plot_builder: _PlotBuilder, plots: Plots, pose: Pose, size: tuple[float, float, float]) -> None:
     """Drive, path, and a fence or hedge towards the street of a detached house."""
-    builder, site, materials = plot_builder.soup, plot_builder.site, plot_builder.look
+    builder, site, materials = plot_builder.triangles, plot_builder.ground, plot_builder.materials
     width, _, setback = size
     rng = materials.generator
     drive_on_left = rng.random() < 0.5
@@ -179,7 +179,7 @@ def _lay_garden(plot_builder: _PlotBuilder, plots: Plots, pose: Pose, size: tupl
 
 def _fill_open_plot(plot_builder: _PlotBuilder, plots: Plots, side: Side, arc_length: float) -> float:
     """A car park or a small park instead of a building; gives the length used, m."""
-    builder, site, materials = plot_builder.soup, plot_builder.site, plot_builder.look
+    builder, site, materials = plot_builder.triangles, plot_builder.ground, plot_builder.materials
     rng = materials.generator
     stall_count = int(rng.integers(4, 9))
     width, depth = 2.6 * stall_count + 1.0, 11.5

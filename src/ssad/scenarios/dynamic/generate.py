@@ -106,14 +106,14 @@ class Trials:
         Raises:
             SSADError: A scenario cannot be built or driven.
         """
-        driven: list[Base] = []
+        driven_traces: list[Base] = []
         for start in range(0, len(scenarios), SCENES):
             chunk = scenarios[start : start + SCENES]
             episodes = [build_episode(scenario, graph, seed=seed) for scenario, graph, seed in chunk]
             traces, _ = self._drive(episodes, {scenario.town: graph for scenario, graph, _ in chunk}, {})
             chunk_rows = zip(episodes, chunk, traces, strict=True)
-            driven += [Base(episode, graph, trace) for episode, (_, graph, _), trace in chunk_rows]
-        return driven
+            driven_traces += [Base(episode, graph, trace) for episode, (_, graph, _), trace in chunk_rows]
+        return driven_traces
 
     def run(self, proposals: Sequence[tuple[Base, Proposal]]) -> list[Outcome]:
         """Drive proposals, each in its base's town and with its seed; a proposal that cannot be built fails."""
@@ -188,7 +188,7 @@ def search(
     budget: int,
     batch: int = BATCH,
     known: Sequence[Sequence[Outcome]] = (),
-    after: Callable[[int], None] = lambda requested: None,
+    on_batch_end: Callable[[int], None] = lambda requested: None,
 ) -> list[list[Outcome]]:
     """Run a generator until each base has used its budget or no more proposals come.
 
@@ -199,7 +199,7 @@ def search(
         budget: Rollouts of each base.
         batch: Rollouts of each base per round.
         known: Outcomes of each base from an interrupted search; these are not driven again.
-        after: Called after each round with the number of rollouts requested for each base so far.
+        on_batch_end: Called after each round with the number of rollouts requested for each base so far.
 
     Returns:
         For each base its outcomes, in the order in which they were proposed.
@@ -247,7 +247,7 @@ def search(
         generator.tell(batch_outcomes)
         for base_index, outcomes in enumerate(batch_outcomes):
             collected[base_index] += outcomes
-        after(requested)
+        on_batch_end(requested)
     return collected
 
 

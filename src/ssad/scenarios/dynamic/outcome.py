@@ -117,13 +117,13 @@ def _peak_effort(trace: EpisodeTrace, agents: Sequence[int]) -> tuple[float | No
     """Return the largest acceleration m/s^2 and jerk m/s^3 of vehicles, and whether all respected their limits."""
     lag = max(1, round(WINDOW / trace.dt))
     max_acceleration, max_jerk, within_limits = 0.0, 0.0, True
-    measured = False
+    efforts = False
     for agent in agents:
         present_rows = np.flatnonzero(trace.active[:, agent])
         speed = trace.speed[present_rows, agent].astype(np.float64)
         if len(speed) <= lag:
             continue
-        measured = True
+        efforts = True
         body = model(trace.models[agent])
         longitudinal = (speed[lag:] - speed[:-lag]) / (lag * trace.dt)
         yaw_rate = np.asarray(wrap_angle(np.diff(trace.yaw[present_rows, agent].astype(np.float64)))) / trace.dt
@@ -137,4 +137,4 @@ def _peak_effort(trace: EpisodeTrace, agents: Sequence[int]) -> tuple[float | No
             and lateral.max() <= TOLERANCE * GRIP
             and jerk.max(initial=0.0) <= TOLERANCE * MAX_JERK
         )
-    return (max_acceleration, max_jerk, within_limits) if measured else (None, None, None)
+    return (max_acceleration, max_jerk, within_limits) if efforts else (None, None, None)

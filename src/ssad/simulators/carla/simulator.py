@@ -335,7 +335,7 @@ class Carla(MirroredSimulator):
                     and controllers[agent_index] == Controller.AUTOPILOT
                     and not is_walker
                 ):
-                    if active[agent_index] == Presence.AWAKE and agent_index not in self._traffic.driven:
+                    if active[agent_index] == Presence.AWAKE and agent_index not in self._traffic.driven_bodies:
                         command = partial(self._traffic.take, agent_index, self._bodies[agent_index], self._episode)
                         self._call(f"hand {agent.name} to its Traffic Manager", command)
                     continue
@@ -405,7 +405,7 @@ class Carla(MirroredSimulator):
             raise ConfigError(f"{self.server}: it tells places that are no numbers")
         return placements.astype(np.float32)
 
-    def _remove_departed(self, controllers: I32, before: I32) -> None:
+    def _remove_departed(self, controllers: I32, previous_controllers: I32) -> None:
         """Remove background traffic at the end of its route, and from CARLA all agents that left the mirror."""
         world = self.mirror
         removed = np.zeros((1, self.agents), bool)

@@ -148,10 +148,15 @@ def _shape(answer: Answer, part: slice, *, reverse: bool) -> _Shape | None:
     ):
         return None
     xy = np.stack([column["x"], column["y"]], axis=1)
-    moved = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 1e-3])
-    if moved.sum() < 2:
+    shifted_xy = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 1e-3])
+    if shifted_xy.sum() < 2:
         return None
-    xy, z, yaw, width = xy[moved], column["z"][moved], np.unwrap(column["yaw"][moved]), column["width"][moved]
+    xy, z, yaw, width = (
+        xy[shifted_xy],
+        column["z"][shifted_xy],
+        np.unwrap(column["yaw"][shifted_xy]),
+        column["width"][shifted_xy],
+    )
     arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     if arc_length[-1] < SHORT:
         return None

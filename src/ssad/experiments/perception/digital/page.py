@@ -396,18 +396,18 @@ def tiles(run: DigitalRun) -> list[dict[str, Any]]:
     return entries
 
 
-def summary(found: Run) -> Table:
+def summary(stored_run: Run) -> Table:
     """Return the table for the terminal: percent, and the verdict of the audit."""
-    run = load_digital_run(found)
+    run = load_digital_run(stored_run)
     verdict = audit(attempts_of(run))
     lines = ["percent", verdict.text, *(f"{fault.detector}: {fault.text}" for fault in verdict.faults[:5])]
     lines += filter(None, [short_of(run).strip()])
     return replace(main_table(run), note="\n".join(lines))
 
 
-def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+def section(stored_run: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """Return the page of a digital run and its tables."""
-    run = load_digital_run(found)
+    run = load_digital_run(stored_run)
     verdict = audit(attempts_of(run))
     main_rows, losses, effort = main_table(run), lost_table(run), effort_table(run)
     all_cells, class_scores, audit_rows = every_table(run), class_table(run), audit_table(verdict)
@@ -416,7 +416,7 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
     distances = distance_table(run)
     page = render(
         TEMPLATE,
-        found,
+        stored_run,
         verdict=sentences,
         others=other_tables,
         distances=distances,
@@ -431,7 +431,7 @@ def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Ta
         tiles=tiles(run),
         plot=curves(run, "radius"),
         plot_steps=curves(run, "steps"),
-        pictures=pictures(found.folder),
+        pictures=pictures(stored_run.folder),
         samples=max(int(r.get("n", 0)) for r in run.records.values()),
         scenes=run.scenes,
         failures=[

@@ -119,18 +119,18 @@ class NearMisses:
         )
         shift, offset = random.standard_normal(2) if proposal_count >= len(misses) else (0.0, 0.0)
         name = base.trace.names[misses[miss_index].agent]
-        rows = perturb_motion(base.trace, misses[miss_index], shift=SHIFT * shift, aside=ASIDE * offset)
+        rows = perturb_motion(base.trace, misses[miss_index], shift=SHIFT * shift, lateral=ASIDE * offset)
         return Proposal(with_motion(self._frozen[k], name, rows), adversaries=(name,))
 
 
-def perturb_motion(trace: EpisodeTrace, miss: NearMiss, *, shift: float, aside: float) -> F64:
+def perturb_motion(trace: EpisodeTrace, miss: NearMiss, *, shift: float, lateral: float) -> F64:
     """The motion [T, 4] of who was missed, scaled in time so that both are at the place at about the same time.
 
     Args:
         trace: The recorded drive.
         miss: The near miss.
         shift: s by which it then comes later than the ego.
-        aside: m to the left of where it drove.
+        lateral: m to the left of where it drove.
     """
     recorded_path = TimedPath.of(trace, miss.agent)
     start_time = float(recorded_path.time[0])
@@ -141,5 +141,5 @@ def perturb_motion(trace: EpisodeTrace, miss: NearMiss, *, shift: float, aside: 
     blend = np.clip((recorded_path.time - start_time) / 2.0, 0.0, 1.0)
     return recorded_path.rows(
         np.interp(warped_time, recorded_path.time, recorded_path.distance) + overshoot,
-        aside * blend * blend * (3.0 - 2.0 * blend),
+        lateral * blend * blend * (3.0 - 2.0 * blend),
     )

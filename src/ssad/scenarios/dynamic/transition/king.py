@@ -58,7 +58,7 @@ class _Chain:
         change: [K, 2] change of effort and steering at the knots, added to the recorded controls.
         ego: The ego's box and presence [T + 1, 6] in the last rollout.
         weight: Weight of the costs of the road and other agents.
-        tried: Rollouts so far.
+        tried_count: Rollouts so far.
     """
 
     base: int
@@ -66,7 +66,7 @@ class _Chain:
     change: F64
     ego: F64
     weight: float = 1.0
-    tried: int = 0
+    tried_count: int = 0
 
 
 class King:
@@ -124,11 +124,11 @@ class King:
         for base_index, base_outcomes in enumerate(outcomes):
             for chain_index, outcome in enumerate(base_outcomes):
                 chain = self._chains[base_index][chain_index]
-                chain.tried += 1
+                chain.tried_count += 1
                 is_hopeless = outcome.gap is None or outcome.gap > HOPELESS
-                if is_hopeless and chain.tried >= 2:
+                if is_hopeless and chain.tried_count >= 2:
                     self._abandoned[base_index].add(chain.agent)
-                if outcome.trace is None or outcome.is_valid or chain.tried >= (2 if is_hopeless else PATIENCE):
+                if outcome.trace is None or outcome.is_valid or chain.tried_count >= (2 if is_hopeless else PATIENCE):
                     self._chains[base_index][chain_index] = self._new_chain(base_index)
                     continue
                 chain.ego = resample_trace(outcome.trace)[0]

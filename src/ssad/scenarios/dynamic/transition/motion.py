@@ -61,12 +61,12 @@ class TimedPath:
         """Speed along the path [T], m/s."""
         return np.asarray(np.gradient(self.distance, self.step))
 
-    def rows(self, distance: F64, aside: F64 | float = 0.0) -> F64:
+    def rows(self, distance: F64, lateral: F64 | float = 0.0) -> F64:
         """Return time, x, y and yaw [T, 4] at other distances along the path, with lateral offsets.
 
         Args:
             distance: [T] m along the path, non-decreasing; extrapolated straight beyond its end.
-            aside: [T] m to the left of the path.
+            lateral: [T] m to the left of the path.
         """
         path_distance, last_pose = self.distance, self.path[-1]
         # np.interp needs increasing abscissas; a standing vehicle repeats its distance.
@@ -76,7 +76,7 @@ class TimedPath:
         )
         overshoot = np.maximum(distance - path_distance[-1], 0.0)
         x, y = x + overshoot * np.cos(last_pose[2]), y + overshoot * np.sin(last_pose[2])
-        offset = np.broadcast_to(np.asarray(aside, np.float64), distance.shape)
+        offset = np.broadcast_to(np.asarray(lateral, np.float64), distance.shape)
         x, y = x - offset * np.sin(yaw), y + offset * np.cos(yaw)
         step_ahead = np.maximum(np.gradient(distance), 0.02)  # a standing vehicle does not turn
         turn = np.arctan2(np.gradient(offset), step_ahead)

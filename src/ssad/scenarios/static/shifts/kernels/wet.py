@@ -316,7 +316,7 @@ def blend_wet(
     image: wp.array(dtype=wp.uint32),
     ground: wp.array3d(dtype=float),
     shine: wp.array3d(dtype=wp.vec4),
-    usual: wp.array3d(dtype=float),
+    typical: wp.array3d(dtype=float),
     dark: wp.array(dtype=float),
     linear: wp.array(dtype=int),
     codes: wp.array(dtype=wp.uint8),
@@ -349,7 +349,7 @@ def blend_wet(
         w1 = image[i + 1]
         w2 = image[i + 2]
         if g0 + g1 + g2 > 0.0:
-            mean_light = usual[b, y / 32, wp.min(quad / 8, usual.shape[2] - 1)]
+            mean_light = typical[b, y / 32, wp.min(quad / 8, typical.shape[2] - 1)]
             darkening = dark[b]
             p0 = wet_pixel(
                 pixel_of(w0, w1, w2, 0),
