@@ -44,13 +44,13 @@ def rear(clip: RelightableImage) -> tuple[float, float]:
     picture = clip.lit()
     back = -0.5 * clip.target.length
     on_it = ((picture.position[..., 0] - back).abs() < 0.3) & (picture.normal[..., 0] < -0.7)
-    surface = render(clip.scene, [clip.clip.view], surface=True).surface
+    surface = render(clip.scene, [clip.view.view], surface=True).surface
     assert surface is not None
     (top, left), (high, wide) = picture.corner, picture.radiance.shape[:2]
     light = surface.irradiance[0, top : top + high, left : left + wide][on_it.numpy()].mean(-1)
     whole = picture.radiance[on_it].mean(-1)
     sun = picture.sun[on_it].mean(-1) / whole.clamp_min(1e-9)
-    return float(sun.median()), float(np.median(light)) / per_lux(clip.clip.view.weather)
+    return float(sun.median()), float(np.median(light)) / per_lux(clip.view.view.weather)
 
 
 def flood(clip: RelightableImage) -> SceneEdit:
@@ -78,7 +78,7 @@ def scores(
     def shown() -> Any:
         for clip in clips:
             image = torch.from_numpy(clip.render(edit(clip))).to(pictures.device).permute(2, 0, 1)[None].float() / 255
-            yield drive_of(clip.clip.row), image, pictures.lit_truth(clip)
+            yield drive_of(clip.view.row), image, pictures.lit_truth(clip)
 
     metrics = target_scores(list(sightings(detector, shown())), replicates=0)["metrics"]
     return {name: metrics[name] for name in ("AP50", "confidence")}
@@ -109,7 +109,7 @@ def main() -> None:
         row: dict[str, Any] = {
             "hour": hour,
             "pictures": len(clips),
-            "drives": len({drive_of(clip.clip.row) for clip in clips}),
+            "drives": len({drive_of(clip.view.row) for clip in clips}),
             "sunlit": float((sun > SUNLIT).mean()),
             "sun": float(sun.max()),
             "lux": float(np.median(lux)),

@@ -86,46 +86,52 @@ class _TargetDrive:
     """A drive to take images of.
 
     Attributes:
-        clips: Settings of the recording.
+        recording: Settings of the recording.
         key: Key of all random draws.
         trace: The drive.
-        cast: Bodies of the drive.
-        stage: Street and bodies, ready to be rendered.
+        population: Bodies of the drive.
+        scene: Street and bodies, ready to be rendered.
         targets: Bodies that play the target in turn.
         places: Possible places of a standing target.
     """
 
-    clips: TargetRecording
+    recording: TargetRecording
     key: tuple[object, ...]
     trace: EpisodeTrace
-    cast: SceneObjects
-    stage: RenderScene
+    population: SceneObjects
+    scene: RenderScene
     targets: tuple[ObjectBody, ...]
     places: tuple[Place, ...] = ()
 
 
-def _prepare(clips: TargetRecording, town: str, key: tuple[object, ...]) -> _TargetDrive:
+def _prepare(recording: TargetRecording, town: str, key: tuple[object, ...]) -> _TargetDrive:
     graph = load_town(town)
-    street = drive_street(graph, clips.streets, key=("clips", *key))
+    street = drive_street(graph, recording.streets, key=("clips", *key))
     trace = drive_with_autopilot(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
-    population = place_objects(trace, graph, street, key=key, many_signs=clips.streets == "any")
+    population = place_objects(trace, graph, street, key=key, many_signs=recording.streets == "any")
     places: tuple[Place, ...] = ()
-    if isinstance(clips.target, TargetSign):
-        targets: tuple[ObjectBody, ...] = (_sign(population, clips.target),)
+    if isinstance(recording.target, TargetSign):
+        targets: tuple[ObjectBody, ...] = (_sign(population, recording.target),)
         route_points = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
         free_ground = GroundOccupancy(street)
         occupy_standing(population, free_ground)
         free_spots = free_places(graph, route_points, free_ground, key=("target", *key))
         places = tuple((*place, plate_height(targets[0])) for place in free_spots)
-    elif clips.target is not None:
-        targets = (_body_of_target(population, clips.target),)
+    elif recording.target is not None:
+        targets = (_body_of_target(population, recording.target),)
     else:
-        target_count = TARGETS if clips.mode == "orbit" else 1
+        target_count = TARGETS if recording.mode == "orbit" else 1
         targets = tuple(
             _draw_target(population, generator("clips target", *key, index)) for index in range(target_count)
         )
     return _TargetDrive(
-        clips, key, trace, population, RenderScene(street, population.meshes, device=clips.device), targets, places
+        recording,
+        key,
+        trace,
+        population,
+        RenderScene(street, population.meshes, device=recording.device),
+        targets,
+        places,
     )
 
 
@@ -170,7 +176,7 @@ def _viewpoint_rounds(
     stage_set: _TargetDrive, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
 ) -> Iterator[list[tuple[int, Viewpoint]]]:
     """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
-    recording, key = stage_set.clips, stage_set.key
+    recording, key = stage_set.recording, stage_set.key
     rng = generator("clips shots", *key)
     if recording.mode == "drive":
         weather = draw_weather(("clips", *key))
@@ -203,7 +209,7 @@ def _viewpoint_rounds(
                 views = orbiting_viewpoints(stage_set.trace, weather, (cell[0], cell[1], cell[2]), rng)
             proposals += [(index, viewpoint) for viewpoint in islice(views, attempts)]
         sight_free = has_free_sight(
-            stage_set.stage,
+            stage_set.scene,
             [viewpoint for _, viewpoint in proposals],
             batch=batch_size(recording.device),
             height=height,
@@ -267,12 +273,12 @@ def _accept_views(
     stage_set: _TargetDrive, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
 ) -> Iterator[tuple[int, dict[str, Any], U8]]:
     """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
-    recording = stage_set.clips
+    recording = stage_set.recording
     camera = _camera(recording.size)
     candidates: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
     for slot, viewpoint in shots:
         target = stage_set.targets[slot % len(stage_set.targets)]
-        surrounding = stage_set.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+        surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
         if not has_room(target, viewpoint, surrounding):
             skipped["crowded"] += 1
             continue
@@ -281,9 +287,9 @@ def _accept_views(
         candidates.append((slot, viewpoint, view, surrounding))
     batch = batch_size(recording.device)
     for start in range(0, len(candidates), batch):
-        rendering = render(stage_set.stage, [view for _, _, view, _ in candidates[start : start + batch]], linear=False)
+        rendering = render(stage_set.scene, [view for _, _, view, _ in candidates[start : start + batch]], linear=False)
         for index, (slot, viewpoint, view, surrounding) in enumerate(candidates[start : start + batch]):
-            objects, reject_reason = _annotate(stage_set.stage, view, rendering, index, surrounding)
+            objects, reject_reason = _annotate(stage_set.scene, view, rendering, index, surrounding)
             if reject_reason:
                 skipped[reject_reason] += 1
                 continue
@@ -329,7 +335,7 @@ def _view(
     target = stage_set.targets[n % len(stage_set.targets)]
     target_object = SceneObject(target.meshes[0], viewpoint.target, target.paint, TARGET)
     noise_seed = int(digest("clips noise", *stage_set.key, n)[:7], 16)
-    lamps = own_lamps(_follower(viewpoint), viewpoint.weather) if stage_set.clips.mode == "drive" else ()
+    lamps = own_lamps(_follower(viewpoint), viewpoint.weather) if stage_set.recording.mode == "drive" else ()
     focus_point = float(viewpoint.target[0, 3]), float(viewpoint.target[1, 3])
     other_parts = (SceneObject(mesh, viewpoint.target, target.paint) for mesh in target.meshes[1:])
     scene_objects = (target_object, *other_parts, *(placed.scene_object for placed in nearby_objects))
@@ -452,33 +458,33 @@ def record_all(
     return [recording.out for recording in recordings]
 
 
-def _check_same_recording(clips: TargetRecording) -> None:
+def _check_same_recording(recording: TargetRecording) -> None:
     """StoreError: the folder holds another recording."""
-    annotations_file = clips.out / "annotations" / "all.json"
-    if annotations_file.is_file() and not clips.parts.is_claimed:
+    annotations_file = recording.out / "annotations" / "all.json"
+    if annotations_file.is_file() and not recording.parts.is_claimed:
         data = safeio.read_json(annotations_file)
         info = data.get("info") if isinstance(data, dict) else None
-        if not isinstance(info, dict) or not is_same_request(info.get("recording"), clips.identity()):
-            raise StoreError(f"{clips.out}: holds another recording; choose another folder")
+        if not isinstance(info, dict) or not is_same_request(info.get("recording"), recording.identity()):
+            raise StoreError(f"{recording.out}: holds another recording; choose another folder")
 
 
-def _write_pages(clips: TargetRecording, tasks: Sequence[tuple[TargetRecording, str, int, int, str]]) -> None:
+def _write_pages(recording: TargetRecording, tasks: Sequence[tuple[TargetRecording, str, int, int, str]]) -> None:
     """annotations/{train,test,all}.json of parts that are all there."""
     splits = {
-        "train": [entry_task for entry_task in tasks if entry_task[1] not in clips.held_out],
-        "test": [entry_task for entry_task in tasks if entry_task[1] in clips.held_out],
+        "train": [entry_task for entry_task in tasks if entry_task[1] not in recording.held_out],
+        "test": [entry_task for entry_task in tasks if entry_task[1] in recording.held_out],
         "all": tasks,
     }
     for split, split_tasks in splits.items():
         rows: list[dict[str, Any]] = []
         reject_counts: Counter[str] = Counter()
         for task in split_tasks:
-            part_page = clips.parts.page(task[4])
+            part_page = recording.parts.page(task[4])
             rows += part_page["images"]
             reject_counts.update(part_page["skipped"])
         counts = Counter(CLASSES[entry["label"]] for row in rows for entry in row["objects"] if not entry["crowd"])
         split_info = {
-            "recording": clips.identity(),
+            "recording": recording.identity(),
             "split": split,
             "towns": sorted({entry_task[1] for entry_task in split_tasks}),
             "images": len(rows),
@@ -487,7 +493,7 @@ def _write_pages(clips: TargetRecording, tasks: Sequence[tuple[TargetRecording, 
             "skipped": reject_counts,
         }
         page = safeio.dump_json(coco_data(CLASSES, rows, split_info)) + "\n"
-        safeio.write_atomic(clips.out / "annotations" / f"{split}.json", page)
+        safeio.write_atomic(recording.out / "annotations" / f"{split}.json", page)
 
 
 @dataclass(frozen=True, slots=True)
@@ -602,9 +608,9 @@ def recorded_views(
             target_pose = np.array(row["target_pose"])
             weather = hour(SceneWeather(**row["light"]), float(np.arctan2(target_pose[1, 0], target_pose[0, 0])))
             viewpoint = Viewpoint(row["time"], np.array(row["pose"]), target_pose, weather, {})
-            surrounding = stage_set.cast.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
+            surrounding = stage_set.population.at(viewpoint.time, viewpoint.camera[:2, 3], 150.0)
             view = _view(stage_set, row["slot"], viewpoint, surrounding, _camera(recording.size))
-            yield RecordedView(row["file_name"], row, stage_set.stage, view, objects)
+            yield RecordedView(row["file_name"], row, stage_set.scene, view, objects)
     except (KeyError, TypeError) as error:
         raise _unknown(path, error) from None
 

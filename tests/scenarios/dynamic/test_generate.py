@@ -83,7 +83,7 @@ def test_a_search_goes_on_from_what_is_known(bases: list[Base]) -> None:
         generator = generator_factory("random")(bases, seeds=[1, 2], budget=8)
         counting = Counting(lambda: make_system("blind"), make_system)
         Counting.driven = []
-        return search(generator, bases, counting, budget=budget, batch=4, known=known), sum(Counting.driven)
+        return search(generator, bases, counting, budget=budget, batch=4, known_outcomes=known), sum(Counting.driven)
 
     whole, driven = run(())
     assert driven == 16

@@ -105,9 +105,9 @@ class V3Level(nn.Module):
     def __init__(self, inputs: int, coarser: int, width: int, outputs: int) -> None:
         super().__init__()
         self.lateral = ConvUnit(coarser, width, smooth=False) if coarser else None
-        joined = inputs + (width if coarser else 0)
+        joined_channels = inputs + (width if coarser else 0)
         self.body = nn.Sequential(
-            ConvUnit(joined, width, smooth=False),
+            ConvUnit(joined_channels, width, smooth=False),
             ConvUnit(width, 2 * width, kernel=3, smooth=False),
             ConvUnit(2 * width, width, smooth=False),
             ConvUnit(width, 2 * width, kernel=3, smooth=False),

@@ -367,8 +367,8 @@ def project_boxes(
     if shift is not None:
         local = local * shift[:, None]
     direction = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]) @ to_camera[:3, :3].T
-    moving = np.column_stack([velocity, np.zeros(len(yaw))]) @ to_camera[:3, :3].T
-    return _detections(local, size, camera_yaw(direction), kind, moving[:, [0, 2]], camera)
+    camera_velocity = np.column_stack([velocity, np.zeros(len(yaw))]) @ to_camera[:3, :3].T
+    return _detections(local, size, camera_yaw(direction), kind, camera_velocity[:, [0, 2]], camera)
 
 
 def _detections(  # noqa: PLR0917  # columns

@@ -565,7 +565,7 @@ def develop_at(
     count, height, width = radiance.shape[:3]
     rectangles = _rectangles(pixels, (count, height, width))
     window = ChangedWindow.of(rectangles, radiance.shape[:3], sensor, quality=quality, subsampling=subsampling)
-    developed = window.develop(window.crop(radiance), exposure, None if noise is None else window.crop(noise))
+    developed_parts = window.develop(window.crop(radiance), exposure, None if noise is None else window.crop(noise))
     image_index = pixels // (height * width)
     corner = torch.tensor([[rows[0], columns[0]] for rows, columns in window.coded], device=pixels.device)[image_index]
-    return developed[image_index, :, pixels // width % height - corner[:, 0], pixels % width - corner[:, 1]]
+    return developed_parts[image_index, :, pixels // width % height - corner[:, 0], pixels % width - corner[:, 1]]

@@ -187,7 +187,7 @@ def search(
     *,
     budget: int,
     batch: int = BATCH,
-    known: Sequence[Sequence[Outcome]] = (),
+    known_outcomes: Sequence[Sequence[Outcome]] = (),
     on_batch_end: Callable[[int], None] = lambda requested: None,
 ) -> list[list[Outcome]]:
     """Run a generator until each base has used its budget or no more proposals come.
@@ -198,7 +198,7 @@ def search(
         trials: Test bench that drives the proposals.
         budget: Rollouts of each base.
         batch: Rollouts of each base per round.
-        known: Outcomes of each base from an interrupted search; these are not driven again.
+        known_outcomes: Outcomes of each base from an interrupted search; these are not driven again.
         on_batch_end: Called after each round with the number of rollouts requested for each base so far.
 
     Returns:
@@ -208,7 +208,7 @@ def search(
         ConfigError: The generator deviates from the known outcomes, exceeds the batch, or omits a base.
     """
     collected: list[list[Outcome]] = [[] for _ in bases]
-    known = known or [[] for _ in bases]
+    known_outcomes = known_outcomes or [[] for _ in bases]
     requested = 0
     while requested < budget:
         batch_size = min(batch, budget - requested)
@@ -224,7 +224,11 @@ def search(
         requested += max(map(len, proposals))
         # A resumed search replays known outcomes, so the generator reaches the same state.
         batch_outcomes = [
-            list(known[base_index][len(collected[base_index]) : len(collected[base_index]) + len(base_proposals)])
+            list(
+                known_outcomes[base_index][
+                    len(collected[base_index]) : len(collected[base_index]) + len(base_proposals)
+                ]
+            )
             for base_index, base_proposals in enumerate(proposals)
         ]
         for base_index, base_proposals in enumerate(proposals):

@@ -408,12 +408,14 @@ class Carla(MirroredSimulator):
     def _remove_departed(self, controllers: I32, previous_controllers: I32) -> None:
         """Remove background traffic at the end of its route, and from CARLA all agents that left the mirror."""
         world = self.mirror
-        removed = np.zeros((1, self.agents), bool)
+        is_removed = np.zeros((1, self.agents), bool)
         route = world.state().route[0]
         at_end = world.array("progress")[0] >= route[:, 1] - 3
-        removed[0] = at_end & (controllers == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
-        if removed.any():
-            world.remove(removed)
+        is_removed[0] = (
+            at_end & (controllers == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
+        )
+        if is_removed.any():
+            world.remove(is_removed)
         for agent_index in list(self._bodies):
             if world.array("active")[0, agent_index] == Presence.ABSENT:
                 self._destroy(agent_index)

@@ -62,7 +62,7 @@ def test_light_on_a_recorded_target(clips: tuple[Path, dict[str, RelightableImag
     before, after = clip.render().astype(int), clip.render(light.edit(values, target)).astype(int)
     picture = clip.lit()
     quick = picture.show(light.change(value_tensors(values), picture, target))[0].permute(1, 2, 0).numpy() * 255
-    x, y, w, h = next(one["bbox"] for one in clip.clip.objects if one["target"])
+    x, y, w, h = next(one["bbox"] for one in clip.view.objects if one["target"])
     own = (slice(int(y), int(y + h)), slice(int(x), int(x + w)))
     assert np.abs(quick[own] - after[own]).mean() < 6
     if hour == "night":

@@ -107,7 +107,7 @@ def main_table(run: DigitalRun) -> Table:
         return [TableRow.of_published(*published_row)] if published_row else []
 
     note = f"Percent; each camera image is attacked by itself, its stored 8-bit picture is scored; {interval_note(run)}"
-    note += run.about_flat
+    note += run.note_on_2d
     if any(published_scores(run, setting) for setting in run.rows):
         note += (
             f" Shaded rows: {SOURCE}; ours are other pictures and other detectors, so the share of the clean score "
@@ -320,7 +320,11 @@ def curves(run: DigitalRun, axis: Literal["radius", "steps"], metric: str = "mAP
     groups: dict[Setting, set[float]] = {}
     for setting in run.settings:
         value = setting[3] if axis == "radius" else setting[4]
-        if setting.plain and setting.attack not in ("", "noise", "ensemble") and (axis == "steps" or value <= FURTHEST):
+        if (
+            setting.is_plain
+            and setting.attack not in ("", "noise", "ensemble")
+            and (axis == "steps" or value <= FURTHEST)
+        ):
             groups.setdefault(_setting_at(setting, axis, 0), set()).add(value)
     plots = []
     for group, values in groups.items():

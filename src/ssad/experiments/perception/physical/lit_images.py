@@ -33,19 +33,19 @@ class RelightableImage:
     """A recorded image at an hour.
 
     Attributes:
-        clip: The image.
+        view: The image.
         scene: Its street and bodies, and `BLIND`.
         cards: Index of `BLIND` in the scene.
     """
 
-    clip: RecordedView
+    view: RecordedView
     scene: RenderScene
     cards: int
 
     @property
     def target(self) -> TargetSize:
         """Size of the target."""
-        length, width, height = self.clip.row["target_size"]
+        length, width, height = self.view.row["target_size"]
         return TargetSize(length, width, height)
 
     def render(self, edit: SceneEdit = NO_EDIT) -> U8:
@@ -57,21 +57,21 @@ class RelightableImage:
                 key,
                 lambda: RenderScene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device),
             )
-        view = edit.on(self.clip.view, TARGET, cards=range(first_card, first_card + len(edit.cards)))
+        view = edit.on(self.view.view, TARGET, cards=range(first_card, first_card + len(edit.cards)))
         rendering = render_with(scene, [view], edit.textures, edit.masks)
         # Detectors see recordings through JPEG, so edited images must pass through it as well.
         return decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
 
     def projected(self, edit: SceneEdit) -> TexturableImage:
         """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
-        rendering = render(self.scene, [edit.on(self.clip.view, TARGET)])
+        rendering = render(self.scene, [edit.on(self.view.view, TARGET)])
         visible = visible_part(rendering)
         corner = int(visible["corner"][0]), int(visible["corner"][1])
         image = decode_image(encode_jpeg(rendering.image[0], QUALITY, "420"))
         return TexturableImage(
-            self.clip.file,
-            self.clip.row,
-            self.clip.objects,
+            self.view.file,
+            self.view.row,
+            self.view.objects,
             image,
             corner,
             visible["radiance"],
@@ -81,14 +81,14 @@ class RelightableImage:
 
     def lit(self, device: str | torch.device = "cpu") -> LitImage:
         """Return the image as a function of the light on its target."""
-        rows, columns = _part(self.clip)
-        return render_lit_image(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
+        rows, columns = _part(self.view)
+        return render_lit_image(self.scene, self.view.view, TARGET, rows, columns, blind=self.cards, device=device)
 
 
-def _part(clip: RecordedView) -> tuple[slice, slice]:
+def _part(view: RecordedView) -> tuple[slice, slice]:
     """The rows and columns around the target that light on it can change: its box, and half as much to each side."""
-    (x, y, box_width, box_height) = next(annotation["bbox"] for annotation in clip.objects if annotation["target"])
-    height, width = clip.view.camera.height, clip.view.camera.width
+    (x, y, box_width, box_height) = next(annotation["bbox"] for annotation in view.objects if annotation["target"])
+    height, width = view.view.camera.height, view.view.camera.width
     half_extent = max(box_width, box_height) / 2 + MARGIN / 2
     slices = []
     for start, extent, limit in ((y, box_height, height), (x, box_width, width)):
@@ -186,7 +186,7 @@ class RelightableTargetImages(RecordedTargetImages):
         """
         for lit_image in self.images_at(hour):
             tensor = torch.from_numpy(lit_image.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
-            yield drive_of(lit_image.clip.row), tensor, self.lit_truth(lit_image)
+            yield drive_of(lit_image.view.row), tensor, self.lit_truth(lit_image)
 
     def images_at(self, hour: str) -> tuple[RelightableImage, ...]:
         """Return the images at an hour; they are kept, since scenes take longer to make than images.
@@ -196,6 +196,6 @@ class RelightableTargetImages(RecordedTargetImages):
         """
         return _cached_images(self.folder, hour, self.count, self.device)
 
-    def lit_truth(self, clip: RelightableImage) -> Truth:
+    def lit_truth(self, image: RelightableImage) -> Truth:
         """Return the truth of an image at an hour."""
-        return target_truth(clip.clip.row, clip.clip.objects, self.classes)
+        return target_truth(image.view.row, image.view.objects, self.classes)

@@ -83,7 +83,7 @@ class TargetAttacks:
     def sheet(
         self,
         detector: str,
-        clips: RelightableTargetImages,
+        images: RelightableTargetImages,
         *,
         textures: Mapping[str, TextureSpec],
         sides: Sequence[float | None],
@@ -93,15 +93,15 @@ class TargetAttacks:
 
         Args:
             detector: Whose boxes are drawn.
-            clips: Of the recording.
+            images: Of the recording.
             textures: By title.
             sides: One view from each (azimuth in degrees); None: the first view.
             clean: Title of the pictures as they were recorded.
         """
         victim = self.detector(detector)
         # A count beyond every recording counts its images.
-        all_images = replace(clips, count=len(replace(clips, count=1 << 30).rows()))
-        rows = all_images.rows()
+        whole_recording = replace(images, count=len(replace(images, count=1 << 30).rows()))
+        rows = whole_recording.rows()
         view_numbers = [index for side in sides for index in _from(rows, side)] or [0]
 
         def select(pictures: Iterator[tuple[str, Tensor, Truth]]) -> list[tuple[str, Tensor, Truth]]:
@@ -111,9 +111,11 @@ class TargetAttacks:
                 if view_index in view_numbers
             ]
 
-        textured_views = {title: select(self.texture(spec).on_target(all_images)) for title, spec in textures.items()}
+        textured_views = {
+            title: select(self.texture(spec).on_target(whole_recording)) for title, spec in textures.items()
+        }
         sheets = []
-        for index, (_, image, truth) in enumerate(select(all_images.clean())):
+        for index, (_, image, truth) in enumerate(select(whole_recording.clean())):
             titled_images = [
                 (clean, image),
                 *((title, selected[index][1]) for title, selected in textured_views.items()),

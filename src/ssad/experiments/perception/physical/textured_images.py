@@ -272,7 +272,7 @@ def texturable_images(
         if file in missing_files:
             safeio.make_folder(cache_folder)
             # The views come in the order of the rows, so the next one belongs to this row.
-            safeio.save_npz(cache_folder / f"{file}.npz", _cached_images(next(missing_views), layers))
+            safeio.save_npz(cache_folder / f"{file}.npz", _render_visible_part(next(missing_views), layers))
         cached = safeio.load_npz(cache_folder / f"{file}.npz")
         image = read_image(folder / "images" / file)
         corner = int(cached["corner"][0]), int(cached["corner"][1])
@@ -319,7 +319,7 @@ def cache_texture_images(
         # All sets of layers in one pass: building the scene of a view costs more than rendering it.
         for cache_folder, layers in zip(cache_folders, variants, strict=True):
             if not (cache_folder / f"{recorded.file}.npz").is_file():
-                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _cached_images(recorded, layers))
+                safeio.save_npz(cache_folder / f"{recorded.file}.npz", _render_visible_part(recorded, layers))
 
 
 def _cache_folder(folder: Path, layers: Sequence[TextureLayer | TextureDecal], split: str) -> Path:
@@ -344,8 +344,8 @@ def visible_part(picture: Rendering) -> dict[str, Any]:
     }
 
 
-def _cached_images(clip: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
-    return visible_part(render(clip.scene, [clip.with_layers(*layers)]))
+def _render_visible_part(view: RecordedView, layers: Sequence[TextureLayer | TextureDecal]) -> dict[str, Any]:
+    return visible_part(render(view.scene, [view.with_layers(*layers)]))
 
 
 def _span(places: Any, limit: int) -> tuple[int, int]:

@@ -168,7 +168,7 @@ def on_grid(focal: wp.vec4, p: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def seen_at(light: wp.array3d(dtype=wp.vec3), b: int, x: float, y: float) -> wp.vec3:
+def light_at_position(light: wp.array3d(dtype=wp.vec3), b: int, x: float, y: float) -> wp.vec3:
     """Return the light at a position of the quarter grid, interpolated between columns, clamped at the border."""
     row = wp.clamp(int(wp.floor(y)), 0, light.shape[1] - 1)
     left = wp.floor(x - 0.5)
@@ -258,7 +258,7 @@ def mirror(
                 for tap_index in range(9):
                     tap_offset = float(tap_index - 4) * 0.25
                     share = 1.0 - tap_offset * tap_offset * 0.8
-                    reflection += seen_at(light, b, position[0], position[1] + blur * tap_offset) * share
+                    reflection += light_at_position(light, b, position[0], position[1] + blur * tap_offset) * share
                     weight += share
                 reflection = reflection / weight
             world_point = wp.transform_point(to_world[b], ray * ground_depth)
