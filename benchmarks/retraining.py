@@ -11,7 +11,8 @@
 4. All drive what was found in the other towns, but nobody what was found against the same seed: an ego collides in that
    by selection. They also drive natural traffic and the pre-crash set as they are, and are attacked anew.
 
-Each base scenario is a cluster, its value the mean over seeds; differences are paired by base.
+Each base scenario is a cluster, in natural traffic each route; its value is the mean over seeds, and differences are
+paired by base.
 """
 
 from __future__ import annotations
@@ -262,7 +263,8 @@ def own(name: str) -> int:
 
 
 def cases(values: dict[str, list[Any]], column: int | None = None) -> dict[str, Any]:
-    """A mean over seeds for each scenario; clusters are base scenarios."""
+    """Return a mean over seeds for each scenario; its cluster is the base scenario, or the route of natural traffic."""
+    from benchmarks.avoidable import cluster
     from ssad.metrics import CaseValue
 
     found = {}
@@ -271,22 +273,28 @@ def cases(values: dict[str, list[Any]], column: int | None = None) -> dict[str, 
         if not kept:
             continue
         base = "/".join(name.split("/")[:-1]) if "-ego-" in name else name
-        found[name] = CaseValue(float(np.mean(kept)), base, name)
+        found[name] = CaseValue(float(np.mean(kept)), cluster(base), name)
     return found
 
 
 def table(data: dict[str, Any]) -> list[str]:
     """What each arm does where, and how much less than before and than the control."""
     from ssad.metrics import Estimate, estimate, paired_difference
+    from ssad.metrics.intervals import MIN_ROUTES
 
     def text(found: Estimate, *, sign: bool = False) -> str:
         form = "+.3f" if sign else ".3f"
+        if found.method == "range":
+            return f"{found.mean:{form}} ({found.low:{form}} to {found.high:{form}} over {found.clusters} clusters)"
         return f"{found.mean:{form}} [{found.low:{form}}, {found.high:{form}}]"
 
     def line(what: str, part: dict[str, Any], column: int | None = None) -> str:
         arms = {arm: cases(part[arm], column) for arm in ARMS}
-        shown = [text(estimate(arms[arm].values(), "bounded")) for arm in ARMS]
-        differences = [text(paired_difference(arms["after"], arms[arm]), sign=True) for arm in ("before", "control")]
+        shown = [text(estimate(arms[arm].values(), "bounded", min_clusters=MIN_ROUTES)) for arm in ARMS]
+        differences = [
+            text(paired_difference(arms["after"], arms[arm], min_clusters=MIN_ROUTES), sign=True)
+            for arm in ("before", "control")
+        ]
         wins = sum(
             (mean_of(part["after"], s, column) or 0.0) < (mean_of(part["before"], s, column) or 0.0)
             for s in range(data["size"]["seeds"])
