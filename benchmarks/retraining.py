@@ -121,7 +121,7 @@ def found_files(out: Path, part: str, size: Size) -> list[str]:
 
 def hunt(out: Path, size: Size, generator: str, seed: int, part: str) -> None:
     """Search the bases that fall to one ego, and save the distinct collisions."""
-    from ssad.experiments.adversarial.search_scores import MOVING, distinct
+    from ssad.experiments.adversarial.search_scores import MOVING, distinct_collisions
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 
@@ -135,7 +135,7 @@ def hunt(out: Path, size: Size, generator: str, seed: int, part: str) -> None:
     for base, row in zip(bases, rows, strict=True):
         good = [o for o in row if o.valid and o.ego_speed is not None and o.ego_speed > MOVING]
         hits += bool(good)
-        for n, outcome in enumerate(distinct(good)[:3]):
+        for n, outcome in enumerate(distinct_collisions(good)[:3]):
             made.append(scenario_of(outcome, base, name=f"{base.scenario.name}/{generator}-{n}-ego-{seed}"))
     if made:
         save_scenarios(out / "found" / f"{part}-{generator}-{seed}.yaml", made)
@@ -148,13 +148,13 @@ def search_all(
 ) -> tuple[list[Any], list[Any]]:
     """Bases that a system survives and a generator can change, and the outcomes of each."""
     from ssad.drivers import make_system
-    from ssad.experiments.adversarial.found_collisions import refusal
+    from ssad.experiments.adversarial.found_collisions import refusal_reason
     from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
 
     trials = Trials(lambda: make_system(system), make_system)
     factory = generator_factory(generator)
     bases = [trials.base(scenario, graphs[scenario.town], seed=seed) for scenario in scenarios]
-    bases = [base for base in bases if base.trace.end != "collision" and not refusal(factory, base.episode)]
+    bases = [base for base in bases if base.trace.end != "collision" and not refusal_reason(factory, base.episode)]
     if not bases:
         return [], []
     made = factory(bases, seeds=[seed] * len(bases), budget=budget)
@@ -218,9 +218,9 @@ def work(out: Path, size: Size, function: Callable[..., None], arguments: tuple[
     """One task; its processor time, s."""
     import torch
 
-    from ssad.core.machine import quiet_warp
+    from ssad.core.machine import start_warp_quietly
 
-    quiet_warp()
+    start_warp_quietly()
     torch.set_num_threads(1)
     began = time.process_time()
     function(out, size, *arguments)

@@ -359,27 +359,27 @@ def _has_replay(compared_run: ComparedRun, line: Mapping[str, Any]) -> bool:
 
 
 def _rows(
-    first: Run, second: Run, title: str, own: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
+    first: Run, second: Run, title: str, pairs: Mapping[str, Mapping[str, Any]], other: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[TableRow]:
     """Yield the differences of one subject: of all shared cells if the metrics are means, then of each group."""
     if first.kind == "driving":
-        groups = {EVERYTHING: list(own)} | {
-            group: [name for name in own if own[name]["group"] == group]
-            for group in dict.fromkeys(line["group"] for line in own.values())
+        groups = {EVERYTHING: list(pairs)} | {
+            group: [name for name in pairs if pairs[name]["group"] == group]
+            for group in dict.fromkeys(line["group"] for line in pairs.values())
         }
         for group, names in groups.items():
             first_group_lines, second_group_lines = (
-                {cell_name: lines[cell_name] for cell_name in names if cell_name in lines} for lines in (own, other)
+                {cell_name: lines[cell_name] for cell_name in names if cell_name in lines} for lines in (pairs, other)
             )
             if set(first_group_lines) & set(second_group_lines):
                 for symbol in SHOWN:
                     yield _driving_row(title, group, symbol, first_group_lines, second_group_lines)
         return
     same_seed = first.suite.get("seed") == second.suite.get("seed")
-    for name in own:
+    for name in pairs:
         if name in other:
-            for metric in _common_metrics(first, own[name], other[name]):
-                yield _score_row(title, name, metric, own[name], other[name], paired=same_seed)
+            for metric in _common_metrics(first, pairs[name], other[name]):
+                yield _score_row(title, name, metric, pairs[name], other[name], paired=same_seed)
 
 
 def _driving_row(

@@ -7,9 +7,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from ssad.core.errors import ConfigError, unknown_name
-from ssad.core.safeio import home
+from ssad.core.safeio import home_folder
 from ssad.core.types import Scenario
-from ssad.scenarios.dynamic.catalog import SCENARIOS
+from ssad.scenarios.dynamic.catalogue import SCENARIOS
 from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"
@@ -52,13 +52,15 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
     if Path(ref).is_dir():  # last: a results folder called like a set must not hide it
         return _from_path(Path(ref))
     if ref.partition("/")[0] in IMPORTED:
-        raise ConfigError(f"scenario '{ref}' is not in {home() / 'scenarios'}; import it: ssad import routes FOLDER")
+        raise ConfigError(
+            f"scenario '{ref}' is not in {home_folder() / 'scenarios'}; import it: ssad import routes FOLDER"
+        )
     raise unknown_name("scenario", ref, [*set_names(), *SCENARIOS, *scenarios_by_name])
 
 
 def set_files() -> dict[str, Path]:
     """Return set name -> YAML file: the imported sets, then the shipped ones."""
-    imported_files = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
+    imported_files = {path.stem: path for path in sorted((home_folder() / "scenarios").glob("*.yaml"))}
     return imported_files | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *UNSELECTED, *TRAINING)}
 
 

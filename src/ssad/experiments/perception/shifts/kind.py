@@ -20,7 +20,7 @@ from ssad.experiments.perception.shifts import page
 from ssad.experiments.perception.shifts.verdict import verdict
 from ssad.report.load import Run
 from ssad.report.tables import Table
-from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, Calibration, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, Calibration, ShiftSpec, deal_severities
 from ssad.scenarios.static.shifts.perturbation import Shift
 
 Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
@@ -90,7 +90,7 @@ class Detection(OpenLoopKind):
         if shift is None or severity != "random" or calibration == "paper":
             return [shifted_scene(shift, severity, calibration, scene) for scene in tokens]
         spec = ShiftSpec(shift, seed=cell.seed, calibration=calibration)
-        severity_by_token = dealt_severities(spec, tokens.values())
+        severity_by_token = deal_severities(spec, tokens.values())
         return [shifted_scene(shift, severity_by_token[token], calibration, scene) for scene, token in tokens.items()]
 
     def sheet(
