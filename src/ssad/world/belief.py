@@ -227,7 +227,7 @@ class Lanes:
         turn_rank = np.where(
             np.abs(heading_change) < TURN,
             TurnRank.STRAIGHT,
-            np.where(heading_change > 0, TurnRank.LEFT, TurnRank.RIGHT),
+            np.where((heading_change > 0) ^ bool(graph.left_hand[0]), TurnRank.LEFT, TurnRank.RIGHT),
         )
         distance, rank_ahead = np.where(in_junction, 0.0, FAR), np.where(in_junction, turn_rank, 0).astype(np.float64)
         successor = np.maximum(self._next, 0)

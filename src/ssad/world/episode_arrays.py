@@ -154,6 +154,7 @@ def _junctions(
     inside = np.zeros(count, bool)
     on_lane = route.lane >= 0
     inside[on_lane] = graph.junction[route.lane[on_lane]] >= 0
+    near_side = 1.0 if graph.left_hand[0] else -1.0
     entry_distance, exit_distance = np.full(count, FAR), np.full(count, FAR)
     turn_rank = np.zeros(count)
     edges = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
@@ -164,7 +165,7 @@ def _junctions(
         turn_kind = (
             int(TurnRank.STRAIGHT)
             if abs(heading_change) < TURN
-            else (TurnRank.LEFT if heading_change > 0 else TurnRank.RIGHT)
+            else (TurnRank.RIGHT if heading_change * near_side > 0 else TurnRank.LEFT)
         )
         if first_inside > 0 and int(route.lane[first_inside - 1]) in signed_lanes:
             turn_kind += TurnRank.YIELD
@@ -473,7 +474,7 @@ def _tables(graphs: Sequence[LaneGraph], pool: _Pool) -> RoadTables:
         lane=np.concatenate([shifted(table.lane, table.town) for table in pool.tables]),
         left=np.concatenate([shifted(graph.left, graph.name) for graph in graphs]),
         right=np.concatenate([shifted(graph.right, graph.name) for graph in graphs]),
-        side=np.concatenate([np.sign(graph.lane_id).astype(np.int32) for graph in graphs]),
+        side=np.concatenate([np.where(graph.forward, -1, 1).astype(np.int32) for graph in graphs]),
         junction=np.concatenate([graph.junction >= 0 for graph in graphs]),
     )
 
@@ -489,7 +490,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
         parts["lane_junction"].append((graph.junction >= 0).astype(np.int32))
         parts["cell_first"].append(grid.cell_offset + entries)
         parts["cell_segment"].append(grid.cell_seg + segments)
-        parts["grid"].append(np.array([[*grid.origin, 1.0 / CELL, 0.0]]))
+        parts["grid"].append(np.array([[*grid.origin, 1.0 / CELL, float(graph.turn_on_red[0])]]))
         parts["grid_size"].append(np.array([[grid.nx, grid.ny, cells]]))
         parts["signal_first"].append(np.array([signals]))
         parts["signal_program"].append(signal_programs(graph))

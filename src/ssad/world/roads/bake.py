@@ -16,15 +16,18 @@ from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
+from ssad.world.roads.import_page import import_page
 from ssad.world.roads.lane_links import Key, LaneLinks
 from ssad.world.roads.lane_sampling import LaneSampler, LaneSamples
 from ssad.world.roads.signals import Approaches, place_signals, place_signs
 from ssad.world.roads.thinning import thin
-from ssad.world.roads.xodr import MAX_BYTES, Lane, Network, read_network
+from ssad.world.roads.xodr import MAX_BYTES, Lane, Network, local_coordinates, read_network
 
 NARROW = 0.05  # m; a lane that never gets wider is not there
 SHORT = 0.1  # m; shorter pieces of lane are passed over
 JOIN = 1.0  # m, most between the end of a lane and the start of its successor
+JOIN_MARGIN = 0.1  # m beyond half the width of a lane across which one that would end is joined
+WIDE = 100.0  # m; a wider lane is a mistake
 BESIDE = 0.5  # m between the end of a lane and an unlinked start that is worth a word
 SAME_WAY = 0.7  # cosine between two lanes of the same direction
 DEFAULT_SPEED = 50.0 / 3.6  # m/s, where a map says nothing
@@ -78,33 +81,59 @@ def bake(
     return _assemble(name or path.stem, network, shapes, sampler, account)
 
 
-def import_map(path: Path, name: str | None, home: Path) -> Path:
-    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, atomically; a copy of the file is stored beside it.
+def import_map(
+    path: Path,
+    name: str | None,
+    home: Path,
+    *,
+    report: ImportReport | None = None,
+    strict: bool = False,
+    turn_on_red: bool | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, atomically.
+
+    A copy of the file is stored beside it, with the coordinates of the town, and a page with the report and a picture
+    from above.
 
     Args:
         path: The file; a town that is baked already (.npz) is copied.
         name: Name of the town; None: that of the file.
         home: Parent of the towns' folder.
+        report: Filled with what came in, what was left out, and what is doubtful.
+        strict: Refuse a file with doubts.
+        turn_on_red: Turns to the near side are allowed on red; None: as the file suggests.
+        progress: Called with the name of each stage when it begins.
 
     Returns:
         Path of the lane graph.
 
     Raises:
-        MapError: See `bake`.
+        MapError: See `bake`; or the file is doubtful, if `strict`.
     """
     town_name = name or Path(path).stem
     if not town_name or town_name.startswith(".") or set(town_name) & set('/\\:*?"<>|\0'):
         raise MapError(f"'{town_name}' cannot be the name of a town; use letters, digits, _ and -")
     target = Path(home) / "towns" / f"{town_name}.npz"
-    baked = Path(path).suffix == ".npz"
-    graph = replace(load_graph(path), name=town_name) if baked else bake(path, town_name)
+    account = ImportReport(str(path)) if report is None else report
+    is_baked = Path(path).suffix == ".npz"
+    graph = (
+        replace(load_graph(path), name=town_name)
+        if is_baked
+        else bake(path, town_name, report=account, progress=progress)
+    )
+    if strict:
+        account.refuse_doubts(MapError)
+    if turn_on_red is not None:
+        graph = replace(graph, turn_on_red=np.array([turn_on_red]))
     source = Path(path).with_suffix(".xodr")
     xodr_bytes = read_bytes(source, limit=MAX_BYTES) if source.is_file() else None
     save_graph(graph, target)
     if xodr_bytes is not None:
-        write_atomic(target.with_suffix(".xodr"), xodr_bytes)
+        write_atomic(target.with_suffix(".xodr"), xodr_bytes if is_baked else local_coordinates(xodr_bytes))
     else:
         target.with_suffix(".xodr").unlink(missing_ok=True)  # remove the source of an earlier map of this name
+    write_atomic(target.with_suffix(".html"), import_page(graph, account))
     return target
 
 
@@ -135,7 +164,9 @@ def _shapes(network: Network, keys: list[Key], samples: LaneSamples, report: Imp
     np.maximum.at(widest, lane, width)
     lengths = np.zeros(lane_count)
     lengths[counts > 0] = arc_length[first[1:][counts > 0] - 1]
-    is_present = (widest >= NARROW) & (counts >= 2) & (lengths >= SHORT)
+    is_finite = np.ones(lane_count, bool)
+    is_finite[lane[~(np.isfinite(xy).all(1) & np.isfinite(z) & (width <= WIDE))]] = False
+    is_present = is_finite & (widest >= NARROW) & (counts >= 2) & (lengths >= SHORT)
     wrapped_yaw = np.asarray(wrap_angle(yaw), np.float64)
     shapes: dict[Key, _Shape] = {}
     selected = thin(first, arc_length, smooth_tangent, width)
@@ -144,7 +175,9 @@ def _shapes(network: Network, keys: list[Key], samples: LaneSamples, report: Imp
         shapes[keys[index]] = _Shape(xy[part], z[part], wrapped_yaw[part], width[part], arc_length[part])
     for index in np.flatnonzero(~is_present).tolist():
         kind = _lane(network, keys[index]).kind
-        if kind != LaneType.NONE:
+        if not is_finite[index]:
+            report.doubt(f"a lane is wider than {WIDE:g} m or has no finite shape; it is left out", _place(keys[index]))
+        elif kind != LaneType.NONE:
             limit = f"narrower than {NARROW:g} m" if widest[index] < NARROW else f"shorter than {SHORT:g} m"
             report.omit(f"lanes of kind {kind.name.lower()} that are {limit}", _place(keys[index]))
     for index in np.flatnonzero(samples.folded).tolist():
@@ -191,6 +224,9 @@ def _assemble(
         line=[(shape.xy, shape.s) for shape in shape_list],
         crosswalks=crosswalks,
         lights=dict(zip(network.signal_places, signal_poses.tolist(), strict=True)),
+        forward=np.array([lane.forward for lane in lane_entries]),
+        left_hand=network.left_hand,
+        stop_lines=sampler.places([line for road in network.roads.values() for line in road.stop_lines])[:, :2],
     )
     graph = LaneGraph(
         name=name,
@@ -216,6 +252,10 @@ def _assemble(
         crosswalk_xy=np.concatenate([np.zeros((0, 2)), *crosswalks]),
         **place_signals(approaches),
         **place_signs(approaches),
+        forward=approaches.forward,
+        origin=np.array(network.origin),
+        left_hand=np.array([network.left_hand]),
+        turn_on_red=np.array([network.turn_on_red]),
     )
     _describe(graph, network, report)
     return graph
@@ -279,24 +319,33 @@ def _paint(network: Network, key: Key) -> tuple[Marking, Marking]:
 
 
 def _following_lanes(links: LaneLinks, key: Key, shapes: dict[Key, _Shape], report: ImportReport) -> list[Key]:
-    """Return the lanes that begin where a lane ends, passing through lanes without area (sections of no length)."""
-    successors, queue, visited = [], [key], {key}
+    """Return the lanes that begin where a lane ends, passing through lanes without area (sections of no length).
+
+    A lane that would end otherwise goes on across a step of up to half a lane, as where it splits in two.
+    """
+    gaps: list[tuple[float, Key]] = []
+    queue, visited = [key], {key}
     while queue:
         for candidate in links.following(queue.pop()):
             if candidate in visited:
                 continue
             visited.add(candidate)
-            if candidate not in shapes:
+            if candidate in shapes:
+                gaps.append((float(np.hypot(*(shapes[candidate].xy[0] - shapes[key].xy[-1]))), candidate))
+            else:
                 queue.append(candidate)
-                continue
-            gap = float(np.hypot(*(shapes[candidate].xy[0] - shapes[key].xy[-1])))
-            if gap <= JOIN:
-                successors.append(candidate)
-            elif links.lane(key).kind == LaneType.DRIVING == links.lane(candidate).kind:
-                report.doubt(
-                    f"linked lanes whose ends are more than {JOIN:g} m apart are not joined",
-                    f"{_place(key)} to {_place(candidate)}: {gap:.1f} m",
-                )
+    successors = [candidate for gap, candidate in gaps if gap <= JOIN]
+    is_driving = links.lane(key).kind == LaneType.DRIVING
+    for gap, candidate in gaps:
+        if gap <= JOIN or not is_driving or links.lane(candidate).kind != LaneType.DRIVING:
+            continue
+        place = f"{_place(key)} to {_place(candidate)}: {gap:.1f} m"
+        half_width = 0.5 * max(float(shapes[key].width[-1]), float(shapes[candidate].width[0]))
+        if not any(near <= JOIN for near, _ in gaps) and gap <= half_width + JOIN_MARGIN:
+            successors.append(candidate)
+            report.note("lanes are joined across a step aside", place)
+        else:
+            report.doubt(f"linked lanes whose ends are more than {JOIN:g} m apart are not joined", place)
     return successors
 
 

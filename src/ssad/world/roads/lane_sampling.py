@@ -31,6 +31,7 @@ class LaneSamples:
 
     Attributes:
         first: Samples of lane i are first[i]:first[i+1] [L+1], in the direction of traffic.
+        s: Position along the road [P], m.
         xy: [P, 2], m.
         z: [P], m.
         yaw: Direction of the traffic [P], rad.
@@ -41,6 +42,7 @@ class LaneSamples:
     """
 
     first: Index
+    s: F64
     xy: F64
     z: F64
     yaw: F64
@@ -137,6 +139,7 @@ class LaneSampler:
         folded[lane[(along < 0.0) & (np.abs(outer - inner) > 0.1)]] = True
         return LaneSamples(
             first,
+            s[sample][order],
             xy[order],
             (height + t * np.tan(np.clip(tilt, -1.0, 1.0)))[order],
             yaw[order],

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from ssad.core.errors import FormatError, MapError
 from ssad.core.import_report import ImportReport
 from ssad.core.lane_graph import Marking, SignKind
-from ssad.core.safeio import MIB, read_xml
+from ssad.core.safeio import MIB, parse_xml, read_xml
 from ssad.core.types import LaneType
 from ssad.world.roads.reference_line import CLOTHOID, CURVE, PlanPiece
 
@@ -27,7 +28,8 @@ MAX_COORDINATE = 1.0e8  # m; projected coordinates reach 2e7
 MAX_EXTENT = 1.0e6  # m from the middle of a map to its furthest road
 MAX_LENGTH = 1.0e5  # m, of one road
 MAX_TOTAL = 1.0e6  # m, of all roads: bounds the work of the reader
-MAX_CURVATURE = 10.0  # 1/m
+MAX_TURN = 200.0  # rad, of one piece of a reference line
+MAX_COEFFICIENT = 1.0e30  # of a polynomial, which may be of a piece of a nanometre
 FAR = 1.0e4  # m; beyond it, float32 coordinates are coarser than a millimetre, and the origin is shifted
 PLANS = ("line", "arc", "spiral", "poly3", "paramPoly3")
 TRAFFIC_LIGHTS = frozenset({"1000001", "1000009", "1000010", "1000011"})  # for vehicles, by shape of their lenses
@@ -69,6 +71,8 @@ COUNTRIES: Final = {
     "swe": "se",
     "jpn": "jp",
 }
+GERMAN: Final = frozenset({"de", "deu", "germany"})
+_PLAN = "road/planView/geometry"
 STENCIL = "Stencil"  # names of paint on the road, to which CARLA's maps give the type of a sign, begin with it
 
 _KINDS = {
@@ -251,6 +255,11 @@ class Network:
         signs: Kind of each sign by id.
         signal_places: Position of each signal of any kind by id.
         origin: What is added to x and y to get the coordinates of the file's projection, m.
+        shift: What was subtracted from the coordinates in the file, m.
+        road_names: Number of each road by its id in the file.
+        left_hand: Most roads have left-hand traffic.
+        turn_on_red: Turns to the near side are allowed on red: unless traffic keeps to the left, or the signals carry
+            the code of a country that forbids them.
     """
 
     roads: dict[int, MapRoad]
@@ -260,6 +269,10 @@ class Network:
     signs: dict[str, SignKind] = field(default_factory=dict)
     signal_places: dict[str, Placement] = field(default_factory=dict)
     origin: tuple[float, float] = (0.0, 0.0)
+    shift: tuple[float, float] = (0.0, 0.0)
+    road_names: dict[str, int] = field(default_factory=dict)
+    left_hand: bool = False
+    turn_on_red: bool = True
 
 
 class _Reader:
@@ -268,12 +281,21 @@ class _Reader:
         self.report = report
         self.road_ids: dict[str, int] = {}
         self.junction_ids: dict[str, int] = {}
+        self.left_hand = False
         self.origin = ((0.0, 0.0), (0.0, 0.0))  # subtracted from the file's coordinates; added by its header
 
     def fail(self, location: str, problem: str) -> NoReturn:
         raise MapError(f"{self.path}: {location}: {problem}; correct the map and import it again")
 
-    def number(self, element: Element, name: str, location: str, default: float | None = None) -> float:
+    def number(
+        self,
+        element: Element,
+        name: str,
+        location: str,
+        default: float | None = None,
+        *,
+        limit: float = MAX_COORDINATE,
+    ) -> float:
         text = element.get(name)
         if text is None:
             if default is not None:
@@ -283,8 +305,8 @@ class _Reader:
             value = float(text)
         except ValueError:
             self.fail(location, f"<{element.tag} {name}='{text[:30]}'> is not a number")
-        if not math.isfinite(value) or abs(value) > MAX_COORDINATE:
-            self.fail(location, f"<{element.tag} {name}='{text[:30]}'> is not finite or beyond {MAX_COORDINATE:g}")
+        if not math.isfinite(value) or abs(value) > limit:
+            self.fail(location, f"<{element.tag} {name}='{text[:30]}'> is not finite or beyond {limit:g}")
         return value
 
     def whole(self, element: Element, name: str, location: str) -> int:
@@ -334,6 +356,10 @@ class _Reader:
             roads=_split_at_contacts(roads),
             junctions=junctions,
             origin=(shift_x + offset_x, shift_y + offset_y),
+            shift=(shift_x, shift_y),
+            road_names=self.road_ids,
+            left_hand=self.left_hand,
+            turn_on_red=self.turn_on_red(road_elements),
         )
 
     def root(self) -> Element:
@@ -341,13 +367,8 @@ class _Reader:
             root = read_xml(self.path, limit=MAX_BYTES)
         except FormatError as error:
             raise MapError(f"{error}; give a complete OpenDRIVE file (.xodr)") from None
-        namespace, _, name = root.tag.rpartition("}")
-        if name != "OpenDRIVE":
+        if _without_namespace(root).tag != "OpenDRIVE":
             self.fail(f"<{str(root.tag)[:40]}>", "the root element is not <OpenDRIVE>")
-        if namespace:
-            for element in root.iter():
-                if isinstance(element.tag, str):
-                    element.tag = element.tag.removeprefix(f"{namespace}}}")
         header = root.find("header")
         version = "?" if header is None else f"{header.get('revMajor', '?')}.{header.get('revMinor', '?')}"
         self.report.contents.append(f"OpenDRIVE {version[:12]}")
@@ -385,9 +406,21 @@ class _Reader:
             self.report.doubt(
                 f"{left_count} of {len(roads)} roads have left-hand traffic, the others right-hand traffic"
             )
-        self.report.contents.append(
-            f"rule of the road: {'left' if 2 * left_count > len(roads) else 'right'}-hand traffic"
-        )
+        self.left_hand = 2 * left_count > len(roads)
+        self.report.contents.append(f"rule of the road: {'left' if self.left_hand else 'right'}-hand traffic")
+
+    def turn_on_red(self, roads: list[Element]) -> bool:
+        """Return whether turns to the near side on red are allowed."""
+        codes = [
+            signal.get("country", "").strip().lower()
+            for road in roads
+            for signal in road.findall("signals/signal")
+            if signal.get("country", "").strip().lower() not in ("", "opendrive")
+        ]
+        country = max(sorted(set(codes)), key=codes.count, default="")
+        is_allowed = not self.left_hand and COUNTRIES.get(country, country) in ("", "us") and country not in GERMAN
+        self.report.contents.append(f"turns to the near side on red: {'' if is_allowed else 'not '}allowed")
+        return is_allowed
 
     def find_origin(self, root: Element, roads: list[Element]) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return what is subtracted from the file's coordinates, and what its header adds to them."""
@@ -396,17 +429,12 @@ class _Reader:
             location = f"road {road.get('id')}"
             for geometry in road.findall("planView/geometry"):
                 points.append((self.number(geometry, "x", location), self.number(geometry, "y", location)))
-        shift = (0.0, 0.0)
-        if points:
-            low, high = ([pick(axis) for axis in zip(*points, strict=True)] for pick in (min, max))
-            if max(map(abs, (*low, *high))) > FAR:
-                shift = (float(round(0.5 * (low[0] + high[0]))), float(round(0.5 * (low[1] + high[1]))))
-                self.report.contents.append(f"origin shifted to ({shift[0]:.0f}, {shift[1]:.0f})")
-            extent = max(high[0] - shift[0], high[1] - shift[1], shift[0] - low[0], shift[1] - low[1])
-            if extent > MAX_EXTENT:
-                self.fail(
-                    "<OpenDRIVE>", f"its roads lie {extent:.0f} m from their middle, the limit is {MAX_EXTENT:.0f} m"
-                )
+        shift = _shift(points)
+        if shift != (0.0, 0.0):
+            self.report.contents.append(f"origin shifted to ({shift[0]:.0f}, {shift[1]:.0f})")
+        extent = max((max(abs(x - shift[0]), abs(y - shift[1])) for x, y in points), default=0.0)
+        if extent > MAX_EXTENT:
+            self.fail("<OpenDRIVE>", f"its roads lie {extent:.0f} m from their middle, the limit is {MAX_EXTENT:.0f} m")
         offset = (0.0, 0.0)
         element = root.find("header/offset")
         if element is not None:
@@ -460,9 +488,11 @@ class _Reader:
         if not geometries:
             self.fail(location, "<planView> has no <geometry>")
         pieces = [self.piece(geometry, location) for geometry in geometries]
-        starts = [piece.s for piece in pieces]
-        if abs(starts[0]) > 1e-3 or starts != sorted(starts):
-            self.fail(location, f"its <geometry> elements are not in order from s=0 (the first has s={starts[0]:g})")
+        if any(after.s < before.s for before, after in pairwise(pieces)):
+            self.report.doubt("the <geometry> elements of a road are not in order; they are sorted", location)
+            pieces.sort(key=lambda piece: piece.s)
+        if abs(pieces[0].s) > 1e-3:
+            self.fail(location, f"its <geometry> elements do not begin at s=0 (the first has s={pieces[0].s:g})")
         return tuple(pieces)
 
     def piece(self, geometry: Element, location: str) -> PlanPiece:
@@ -481,7 +511,14 @@ class _Reader:
             values = (self.number(shape, "curvStart", location), self.number(shape, "curvEnd", location))
         elif shape.tag == "poly3":
             kind = CURVE
-            values = (0.0, 1.0, 0.0, 0.0, *(self.number(shape, name, location) for name in "abcd"), 0.0)
+            values = (
+                0.0,
+                1.0,
+                0.0,
+                0.0,
+                *(self.number(shape, name, location, limit=MAX_COEFFICIENT) for name in "abcd"),
+                0.0,
+            )
         elif shape.tag == "paramPoly3":
             kind = CURVE
             range_name = shape.get("pRange", "normalized")
@@ -489,16 +526,18 @@ class _Reader:
                 self.report.doubt("pRange is neither arcLength nor normalized; normalized is taken", location)
             coefficients = [f"{letter}{axis}" for axis in "UV" for letter in "abcd"]
             end = length if range_name == "arcLength" else 1.0
-            values = (*(self.number(shape, name, location) for name in coefficients), max(end, 1e-9))
-        if kind == CLOTHOID and max(map(abs, values)) > MAX_CURVATURE:
-            self.fail(location, f"its curvature is beyond {MAX_CURVATURE:g} 1/m")
+            numbers = [self.number(shape, name, location, limit=MAX_COEFFICIENT) for name in coefficients]
+            values = (*numbers, max(end, 1e-9))
+        if kind == CLOTHOID and max(map(abs, values)) * length > MAX_TURN:
+            self.fail(location, f"a <geometry> turns by more than {MAX_TURN:g} rad")
         return PlanPiece(s, x - self.shift[0], y - self.shift[1], heading, length, kind, values)
 
     def cubics(self, elements: Iterable[Element], start: str, location: str) -> tuple[Cubic, ...]:
         """Return polynomials in order of their starts."""
         rows: list[Cubic] = []
         for element in elements:
-            position, a, b, c, d = (self.number(element, name, location) for name in (start, *"abcd"))
+            position = self.number(element, start, location)
+            a, b, c, d = (self.number(element, name, location, limit=MAX_COEFFICIENT) for name in "abcd")
             rows.append((position, a, b, c, d))
         if rows != sorted(rows, key=lambda row: row[0]):
             self.report.doubt("polynomials of a road are not in order; they are sorted", location)
@@ -574,8 +613,13 @@ class _Reader:
                     if lane_id == 0:
                         centre_mark = marking
                         continue
-                    if (lane_id > 0) != (side_name == "left") or lane_id in lanes:
-                        self.fail(location, f"lane {lane_id} is on the wrong side or there twice")
+                    if lane_id in lanes:
+                        self.fail(location, f"lane {lane_id} is there twice")
+                    if (lane_id > 0) != (side_name == "left"):
+                        self.report.doubt(
+                            f"a lane is listed under <{side_name}>; its id says that it is on the other side",
+                            f"{location}, lane {lane_id}",
+                        )
                     lanes[lane_id] = self.lane(lane, lane_id, marking, location, left_hand=left_hand)
             valid_limits = [value for position, value in limits if position <= starts[index] + middle]
             result.append(
@@ -768,6 +812,54 @@ def read_network(path: Path, report: ImportReport | None = None) -> Network:
         MapError: The file is invalid; the message names file and element.
     """
     return _Reader(path, ImportReport(str(path)) if report is None else report).network()
+
+
+def local_coordinates(xodr: bytes) -> bytes:
+    """Return an OpenDRIVE text with the coordinates of the town that is made from it.
+
+    It is the same text, unless the origin is shifted; its header then has the shift as its offset.
+    """
+    from xml.etree import ElementTree
+
+    root = _without_namespace(parse_xml(xodr))
+    shift = _shift([(float(place.get("x", "0")), float(place.get("y", "0"))) for place in root.findall(_PLAN)])
+    if shift == (0.0, 0.0):
+        return xodr
+    for path in (_PLAN, ".//positionInertial"):
+        for place in root.findall(path):
+            for name, value in zip("xy", shift, strict=True):
+                place.set(name, repr(float(place.get(name, "0")) - value))
+    header = root.find("header")
+    if header is None:
+        header = ElementTree.Element("header")
+        root.insert(0, header)
+    offset = header.find("offset")
+    if offset is None:
+        offset = ElementTree.SubElement(header, "offset", x="0", y="0", z="0", hdg="0")
+    for name, value in zip("xy", shift, strict=True):
+        offset.set(name, repr(float(offset.get(name, "0")) + value))
+    text: bytes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text
+
+
+def _without_namespace(root: Element) -> Element:
+    """Return a tree with the namespace of its root removed from its tags."""
+    namespace, brace, _ = root.tag.rpartition("}")
+    if brace:
+        for element in root.iter():
+            if isinstance(element.tag, str):
+                element.tag = element.tag.removeprefix(f"{namespace}}}")
+    return root
+
+
+def _shift(points: list[tuple[float, float]]) -> tuple[float, float]:
+    """Return what is subtracted from coordinates: the middle of the points in whole metres if they are far away."""
+    if not points:
+        return 0.0, 0.0
+    low, high = ([pick(axis) for axis in zip(*points, strict=True)] for pick in (min, max))
+    if max(map(abs, (*low, *high))) <= FAR:
+        return 0.0, 0.0
+    return float(round(0.5 * (low[0] + high[0]))), float(round(0.5 * (low[1] + high[1])))
 
 
 def _split_at_contacts(roads: dict[int, MapRoad]) -> dict[int, MapRoad]:
