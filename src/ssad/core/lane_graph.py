@@ -18,6 +18,7 @@ from ssad.core.safeio import load_npz, save_npz
 from ssad.core.types import F32, F64, I32, U8, Bool, LaneType, array_dtypes
 
 FORMAT = 1  # of the .npz file
+TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
 
 

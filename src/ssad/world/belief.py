@@ -12,10 +12,9 @@ import numpy.typing as npt
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
 from ssad.core.geometry import to_local
-from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_graph import TURN, LaneGraph
 from ssad.core.rotations import wrap_angle, wrap_scalar
 from ssad.core.types import F32, F64, I32, AgentKind, Bool, LaneType, SignalState
-from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, TurnRank
 from ssad.world.kernels.shared import BRIDGE

@@ -11,7 +11,7 @@ import warp as wp
 
 from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
-from ssad.core.lane_graph import LaneGraph, Marking, SignKind
+from ssad.core.lane_graph import TURN, LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, PhaseCondition, Roads, TurnRank, array_types
 from ssad.world.kernels.shared import BRIDGE
@@ -25,7 +25,6 @@ BEFORE = 15  # points of a route before a junction between which its stop line l
 GREEN, YELLOW, ALL_RED = 12.0, 3.0, 1.0  # s of a signal phase
 ON_AND_ON = 1000.0  # m that a lane goes on beyond the end of a route
 FADE = 30  # m over which a lane that ends is led back to the route
-TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 
 
 @dataclass(frozen=True)

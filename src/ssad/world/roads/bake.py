@@ -179,7 +179,7 @@ def _shapes(network: Network, keys: list[Key], samples: LaneSamples, report: Imp
             report.doubt(f"a lane is wider than {WIDE:g} m or has no finite shape; it is left out", _place(keys[index]))
         elif kind != LaneType.NONE:
             limit = f"narrower than {NARROW:g} m" if widest[index] < NARROW else f"shorter than {SHORT:g} m"
-            report.omit(f"lanes of kind {kind.name.lower()} that are {limit}", _place(keys[index]))
+            report.note(f"{kind.name.lower()} lanes {limit} are passed over", _place(keys[index]))
     for index in np.flatnonzero(samples.folded).tolist():
         if _lane(network, keys[index]).kind == LaneType.DRIVING:
             report.doubt("a drivable lane runs backwards, inside the centre of its curve", _place(keys[index]))
