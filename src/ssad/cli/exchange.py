@@ -66,12 +66,13 @@ def import_map(
 ) -> None:
     """Import an OpenDRIVE map (1.4 to 1.8) as a town; say what came in, what was left out, and what is doubtful.
 
-    A page with this report and a picture from above is written beside the town.
+    A page with this report and a picture from above is written too.
     """
     from ssad.core.import_report import ImportReport
     from ssad.core.safeio import home_folder
     from ssad.world.roads import import_map as bake
     from ssad.world.roads import load_town, town_names
+    from ssad.world.roads.import_page import import_page_path
 
     town_name = name or file.stem
     if town_names().get(town_name) == "built-in":
@@ -89,7 +90,7 @@ def import_map(
     print(f"town {town_name}: {len(load_town(town_name).kind)} lanes, written to {path}")
     for line in report.lines():
         print(line)
-    print(f"a picture from above is in {path.with_suffix('.html')}")
+    print(f"a picture from above is in {import_page_path(home_folder(), town_name)}")
 
 
 def import_routes(

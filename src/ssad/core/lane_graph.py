@@ -310,10 +310,10 @@ def _check(graph: LaneGraph) -> None:
         value = getattr(graph, array_name)
         is_partition = value.shape == (rows + 1,) and len(value) > 0 and value[0] == 0 and value[-1] == total
         require(bool(is_partition and (np.diff(value) >= 0).all()), f"{array_name} does not partition its rows")
+    require(array_lengths["L"] > 0, "it has no lane")
     for array_name, rows in (("origin", 2), ("left_hand", 1), ("turn_on_red", 1)):
         require(getattr(graph, array_name).shape == (rows,), f"{array_name} does not have {rows} rows")
     require(bool(np.isfinite(graph.origin).all()), "origin holds a number that is not finite")
-    require(array_lengths["L"] > 0, "it has no lane")
     require(bool((np.diff(graph.offset) >= 2).all()), "a lane has fewer than two points")
     for array_name, low, high in (
         ("left", -1, array_lengths["L"]),

@@ -16,7 +16,7 @@ from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
-from ssad.world.roads.import_page import import_page
+from ssad.world.roads.import_page import import_page, import_page_path
 from ssad.world.roads.lane_links import Key, LaneLinks
 from ssad.world.roads.lane_sampling import LaneSampler, LaneSamples
 from ssad.world.roads.signals import Approaches, place_signals, place_signs
@@ -93,8 +93,8 @@ def import_map(
 ) -> Path:
     """Bake an OpenDRIVE file into HOME/towns/NAME.npz, atomically.
 
-    A copy of the file is stored beside it, with the coordinates of the town, and a page with the report and a picture
-    from above.
+    A copy of the file is stored beside it, with the coordinates of the town. A page with the report and a picture from
+    above is written to HOME/imports/NAME.html.
 
     Args:
         path: The file; a town that is baked already (.npz) is copied.
@@ -133,7 +133,7 @@ def import_map(
         write_atomic(target.with_suffix(".xodr"), xodr_bytes if is_baked else local_coordinates(xodr_bytes))
     else:
         target.with_suffix(".xodr").unlink(missing_ok=True)  # remove the source of an earlier map of this name
-    write_atomic(target.with_suffix(".html"), import_page(graph, account))
+    write_atomic(import_page_path(home, town_name), import_page(graph, account))
     return target
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,11 @@ COLOURS = {
 }
 WIDTH = 1200  # pixels
 MARGIN = 10.0  # m
+
+
+def import_page_path(home: Path, town: str) -> Path:
+    """Return the path of the page on the import of a town."""
+    return Path(home) / "imports" / f"{town}.html"
 
 
 def import_page(graph: LaneGraph, report: ImportReport) -> str:
