@@ -37,7 +37,7 @@ from ssad.recorders.target_images import (
     MIN_VISIBLE_SHARE,
     SECONDS,
     TARGET,
-    _body_of_target,
+    _add_target_body,
     record_target_images,
     recorded_views,
 )
@@ -371,7 +371,7 @@ def test_the_named_target_is_the_same_metal_everywhere() -> None:
     found = []
     for key in ("one", "another"):
         objects = SceneObjects(0.1, (key,))
-        body = _body_of_target(objects, target)
+        body = _add_target_body(objects, target)
         found.append(objects.meshes[body.meshes[0]])
         assert body.paint == target.colour
         assert body.size == target.full_size
