@@ -567,7 +567,7 @@ def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: EpisodeTrace)
     times = [s.time for s in found]
     assert times[:4] == sorted(times[:4])
     assert len(set(times)) == len(times)
-    way = sorted(s.about["way"] for s in found)
+    way = sorted(s.description["way"] for s in found)
     assert min(np.diff(way)) >= 1.0 - 0.011
     assert shots(float(market.driven[-1])) == []
 
