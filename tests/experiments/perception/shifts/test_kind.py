@@ -295,7 +295,7 @@ def test_where_none_is_given_a_data_set_is_recorded(
         def __exit__(self, *error: object) -> None:
             pass
 
-    replace_name(monkeypatch, "Live", Bar)
+    replace_name(monkeypatch, "LiveProgress", Bar)
     Detection().prepare(plan_of(recorded={"scenes": 5}), tmp_path, resources)
     assert bars == [(("recording", 10, 0), "scenes")]
 
