@@ -11,16 +11,24 @@ from ssad.scenarios.dynamic.search.box import Box
 
 
 class Corners:
-    """Corners of the box first, then points drawn evenly; it learns nothing."""
+    """Corners of the box first, then points drawn evenly; it learns nothing.
+
+    Args:
+        bases: Scenarios to start from.
+        seeds: Seed of the search in each.
+        budget: Proposals for each.
+        margin: Distance of the corners from the limits, as a share of the ranges; in a suite
+            `example-corners?margin=0.1`.
+    """
 
     name = "example-corners"
 
-    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int, margin: float = 0.0) -> None:
         self._points = []
         for base, seed in zip(bases, seeds, strict=True):
             box = Box.of(base.scenario)
             draw = generator("example corners", seed)
-            corners = [list(map(float, corner)) for corner in product((0, 1), repeat=min(box.dimension, 6))]
+            corners = [list(map(float, corner)) for corner in product((margin, 1 - margin), repeat=min(box.dimension, 6))]
             corners = [corner + [0.5] * (box.dimension - len(corner)) for corner in corners]
             order = draw.permutation(len(corners))
             points = [corners[k] for k in order] + draw.random((budget, box.dimension)).tolist()
